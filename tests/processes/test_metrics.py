@@ -23,19 +23,21 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from trirail.config import SIM, Config
 from trirail.errors import ServiceError
-from trirail.processes.health import NOT_RUNNING, SILENT, Health, Running
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
-from trirail.processes.measured import (
-    KINDS_OF_FAULT,
-    SETTLE_BOUNDS,
-    Histogram,
-    Measurements,
-    Meter,
-    RecorderMeasured,
-    ServiceMeasured,
-)
 from trirail.processes.metrics import ServiceMetrics
 from trirail.processes.metrics_server import MetricsServer
+from trirail.processes.monitoring import (
+    KINDS_OF_FAULT,
+    NOT_RUNNING,
+    SETTLE_BOUNDS,
+    SILENT,
+    Health,
+    Histogram,
+    Meter,
+    RecorderMeasured,
+    Running,
+    ServiceMeasured,
+)
 from trirail.processes.process import MEASURED
 from trirail.processes.publications import StateMaker
 from trirail.processes.zenoh_links import InUse
@@ -134,13 +136,13 @@ def health() -> tuple[Health, Heartbeats, list[float]]:
 
 def exposed(service: ServiceMeasured | None, recorder: RecorderMeasured | None) -> str:
     """What Prometheus reads."""
-    measured = Measurements()
+    looked, _, _ = health()
     if service is not None:
-        measured.store("gateway", service)
+        looked.store("gateway", msgspec.to_builtins(service))
     if recorder is not None:
-        measured.store("recorder", recorder)
+        looked.store("recorder", msgspec.to_builtins(recorder))
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(ServiceMetrics("demo", "0.1", health()[0], measured))
+    registry.register(ServiceMetrics("demo", "0.1", looked))
     return generate_latest(registry).decode()
 
 
@@ -205,7 +207,7 @@ def test_a_supervisor_that_is_held_up_or_ending_is_told() -> None:
     assert looked.troubles()["supervisor"] == "no sign of life"
     looked.poll(ALL_UP)
     assert not looked.troubles()["supervisor"]
-    looked.end()
+    looked.end(ALL_UP)
     assert looked.troubles()["supervisor"] == "the service is ending"
 
 
@@ -216,7 +218,7 @@ def served(config: Config, **telemetry: object) -> tuple[Config, MetricsServer, 
     changed = msgspec.structs.replace(config.telemetry, metrics_port=free_port(), **telemetry)
     config = msgspec.structs.replace(config, telemetry=changed)
     looked, _, _ = health()
-    return config, MetricsServer(config, looked, Measurements()), looked
+    return config, MetricsServer(config, looked), looked
 
 
 def get(url: str, context: ssl.SSLContext | None = None) -> tuple[int, str]:
@@ -279,7 +281,7 @@ def test_connections_that_say_nothing_keep_nobody_out(local: tuple[str, Health])
 def test_a_port_that_is_taken_is_told_with_the_remedy() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         telemetry = msgspec.structs.replace(CONFIG.telemetry, metrics_port=taken.getsockname()[1])
-        server = MetricsServer(msgspec.structs.replace(CONFIG, telemetry=telemetry), health()[0], Measurements())
+        server = MetricsServer(msgspec.structs.replace(CONFIG, telemetry=telemetry), health()[0])
         with pytest.raises(ServiceError, match=r"set telemetry\.metrics_port to a free port"), server:
             pass
 

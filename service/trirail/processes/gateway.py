@@ -22,7 +22,7 @@ from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox
 from trirail.processes.incoming import Incoming
 from trirail.processes.loop_death import LoopDeath
-from trirail.processes.measured import Meter
+from trirail.processes.monitoring import Meter
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications, StateMaker, info
 from trirail.processes.realtime import give_back

@@ -12,8 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 from trirail_drivers.interface import NAMES
 
-from trirail.processes.health import Health, Running
-from trirail.processes.measured import Histogram, Measurements, ServiceMeasured
+from trirail.processes.monitoring import Health, Histogram, Running, ServiceMeasured
 from trirail.processes.zenoh_links import InUse
 from trirail.wire.vocabulary import MODES
 
@@ -27,11 +26,10 @@ TICKS: Final = os.sysconf("SC_CLK_TCK")
 class ServiceMetrics(Collector):
     """All metrics of a service."""
 
-    def __init__(self, robot: str, version: str, health: Health, measured: Measurements) -> None:
+    def __init__(self, robot: str, version: str, health: Health) -> None:
         self._robot = robot
         self._version = version
         self._health = health
-        self._measured = measured
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric; what has not been measured yet is left out."""
@@ -39,12 +37,12 @@ class ServiceMetrics(Collector):
         info.add_metric([self._robot, self._version], 1.0)
         yield info
         yield from self._processes()
-        if (service := self._measured.service) is not None:
+        if (service := self._health.service) is not None:
             yield from _loop(service)
             yield from _goals(service)
             yield from _can(service)
             yield from _use(service.use)
-        if (recorder := self._measured.recorder) is not None:
+        if (recorder := self._health.recorder) is not None:
             lost = _counter("recorder_lost_batches", "Batches that are missing, by where they should be.", ["sink"])
             lost.add_metric(["file"], recorder.lost)
             lost.add_metric(["live"], recorder.skipped)
@@ -68,7 +66,7 @@ class ServiceMetrics(Collector):
                 busy.add_metric([name], used[1])
         yield from (restarts, memory, busy)
         age = _gauge("measurement_age_seconds", "How old the metrics are that a process measures.", ["process"])
-        for name, seconds in self._measured.ages().items():
+        for name, seconds in self._health.ages().items():
             age.add_metric([name], seconds)
         yield age
 

@@ -23,9 +23,8 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 
 from trirail.config import Config, metrics_url
 from trirail.errors import ServiceError
-from trirail.processes.health import Health
-from trirail.processes.measured import Measurements
 from trirail.processes.metrics import ServiceMetrics
+from trirail.processes.monitoring import Health
 from trirail.telemetry.provenance import software
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials, with_role
@@ -41,13 +40,12 @@ _Start = Callable[..., Any]
 class MetricsServer:
     """Serves while the context lasts. Raises ServiceError where the port is taken or a certificate is no good."""
 
-    def __init__(self, config: Config, health: Health, measured: Measurements) -> None:
+    def __init__(self, config: Config, health: Health) -> None:
         telemetry = config.telemetry
         self._address = telemetry.metrics_address, telemetry.metrics_port
         self._health = health
-        self._measured = measured
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(ServiceMetrics(config.robot.name, software().trirail, health, measured))
+        registry.register(ServiceMetrics(config.robot.name, software().trirail, health))
         self._metrics = make_wsgi_app(registry)
         self._tls: ssl.SSLContext | None = None
         if config.zenoh.tls is not None and metrics_url(config).startswith("https:"):
@@ -79,7 +77,7 @@ class MetricsServer:
                 fit = not any(troubles.values())
                 status = HTTPStatus.OK if fit else HTTPStatus.SERVICE_UNAVAILABLE
                 processes = {name: trouble or "ok" for name, trouble in troubles.items()}
-                service = self._measured.service
+                service = self._health.service
                 warnings = service.warnings if service is not None else ()
                 return _say(start, status, {"ok": fit, "processes": processes, "warnings": warnings})
         return _say(start, HTTPStatus.NOT_FOUND, {"error": "there are /metrics and /healthz"})

@@ -17,7 +17,7 @@ import msgspec
 from trirail.config import Config
 from trirail.processes.heartbeats import Heart
 from trirail.processes.loop_death import LoopDeath
-from trirail.processes.measured import TOLD_EVERY, RecorderMeasured
+from trirail.processes.monitoring import TOLD_EVERY, RecorderMeasured
 from trirail.processes.realtime import give_back
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import Standing

@@ -14,8 +14,8 @@ from typing import Any
 from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.processes.compiling import Progress
-from trirail.processes.health import Monitor, Running
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
+from trirail.processes.monitoring import Health, Running, metrics_server
 from trirail.processes.operating_system import Signals, Watchdog, notify
 from trirail.processes.process import Order
 from trirail.processes.realtime import give_back
@@ -90,7 +90,7 @@ class Supervisor:
         self._watches = {
             name: HangWatch(self._heartbeats.of(name), seconds, TURN) for name, seconds in self._patience.items()
         }
-        self._monitor = Monitor(config, self._heartbeats, TURN)
+        self._health = Health(self._heartbeats, config.period, TURN)
         self._watchdog = Watchdog([self._heartbeats.of(name) for name in WATCHED_BY_SYSTEMD])
         self._next_turn = 0.0
         self._went_on = 0.0
@@ -113,7 +113,7 @@ class Supervisor:
             self._parent = WarmParent(self._order, Path(folder), self._heartbeats, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
-                with self._monitor:  # it may have a thread
+                with metrics_server(self._order.config, self._health):  # it may have a thread
                     self._run_children(up, signals)
             finally:
                 self._parent.close()
@@ -187,7 +187,7 @@ class Supervisor:
                 child.kill_hung(START_WITHIN)
             elif self._up and child.process.pid is None and now - child.began > FORKS_WITHIN:
                 self._parent.kill_hung(FORKS_WITHIN)
-        self._monitor.poll({name: self._running(name) for name in self._names})
+        self._health.poll({name: self._running(name) for name in self._names})
         for name, watch in self._watches.items():
             watched = self._children.get(name)
             if watched is not None and watched.process.pid is not None and watch.hangs(watched.process.pid):
@@ -265,7 +265,7 @@ class Supervisor:
         while child.happened:
             self._tell(child.happened.pop(0))
         while child.measured:
-            self._monitor.store(child.name, child.measured.pop(0))
+            self._health.store(child.name, child.measured.pop(0))
 
     def _forget(self, child: ChildProcess) -> None:
         while child.listen():
@@ -278,7 +278,7 @@ class Supervisor:
     def _end(self) -> None:
         """End the loop first, so that the others can tell of it; then those. Planner and drives have nothing to say."""
         notify("STOPPING=1")
-        self._monitor.end({name: self._running(name) for name in self._names})
+        self._health.end({name: self._running(name) for name in self._names})
         for child in self._children.values():
             if child.process.pid is None:
                 child.process.kill()

@@ -1,16 +1,25 @@
-"""What gateway and recorder measure for the metrics: totals since the loop began, told once a second."""
+"""What gateway and recorder measure, and whether each process does its work: the supervisor keeps it for who watches.
+
+Measured are totals since the loop began, told once a second. The supervisor looks at all processes once in each of its
+turns; who asks does so in a thread of its own, so that a supervisor that is held up itself, by its output for one, is
+told as well.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from trirail.config import Config
+from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.zenoh_links import InUse
+from trirail.wire.decoding import converted, prepare
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 
@@ -93,28 +102,6 @@ class RecorderMeasured(Struct, frozen=True):
     """Cycles that the recorder itself was too slow for."""
 
 
-class Measurements:
-    """What gateway and recorder told last, and when."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._told: dict[str, float] = {}
-        self.service: ServiceMeasured | None = None
-        self.recorder: RecorderMeasured | None = None
-
-    def store(self, process: str, measured: ServiceMeasured | RecorderMeasured) -> None:
-        """Keep what a process told."""
-        if isinstance(measured, ServiceMeasured):
-            self.service = measured
-        else:
-            self.recorder = measured
-        self._told[process] = self._clock()
-
-    def ages(self) -> dict[str, float]:
-        """Return how old it is, by process [s]."""
-        return {name: self._clock() - told for name, told in self._told.items()}
-
-
 class Meter:
     """Counts what passes the gateway; one that is started again counts the cycles anew, and is told the past events."""
 
@@ -169,3 +156,93 @@ class Meter:
                 warnings=warnings,
             )
         )
+
+
+MEASURED_BY: Final = {"gateway": ServiceMeasured, "recorder": RecorderMeasured}
+"""What each process measures."""
+prepare(*MEASURED_BY.values())
+
+SILENT: Final = 3.0
+"""A process is told as frozen that has given no sign of life for so long [s]; most have been killed for it by then."""
+LEAST_CYCLES: Final = 3
+"""So many cycles the loop may take for a sign of life, however long they are."""
+
+
+class Running(NamedTuple):
+    """What the supervisor knows of a process."""
+
+    pid: int | None
+    """None where there is none."""
+    ready: bool
+    """Whether it has said that it is up."""
+    restarts: int
+    """How often it was started again."""
+
+
+NOT_RUNNING: Final = Running(None, ready=False, restarts=0)
+
+
+class Health:
+    """The newest look at every process, and what they measured last; any thread may ask."""
+
+    def __init__(
+        self, heartbeats: Heartbeats, period: float, turn: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._clock = clock
+        self._looked = clock()
+        self._ending = False
+        silent = dict.fromkeys(PROCESSES, SILENT) | {"loop": max(SILENT, LEAST_CYCLES * period)}
+        self._watches = {name: Watch(heartbeats.of(name), round(silent[name] / turn)) for name in PROCESSES}
+        self.processes: Mapping[str, Running] = dict.fromkeys(PROCESSES, NOT_RUNNING)
+        """What was known of each at the newest look."""
+        self._troubles: Mapping[str, str] = dict.fromkeys(PROCESSES, "starting")
+        self._told: dict[str, float] = {}
+        self.service: ServiceMeasured | None = None
+        self.recorder: RecorderMeasured | None = None
+
+    def poll(self, processes: Mapping[str, Running]) -> None:
+        """Look at all of them, in every turn of the supervisor's."""
+        self._troubles = {name: self._trouble(name, running) for name, running in processes.items()}
+        self.processes = processes
+        self._looked = self._clock()
+
+    def end(self, processes: Mapping[str, Running]) -> None:
+        """Look for the last time: the service is ending."""
+        self.poll(processes)
+        self._ending = True
+
+    def store(self, process: str, content: Mapping[str, Any]) -> None:
+        """Keep what a process has measured."""
+        measured = converted(content, MEASURED_BY[process])
+        if isinstance(measured, ServiceMeasured):
+            self.service = measured
+        else:
+            self.recorder = measured
+        self._told[process] = self._clock()
+
+    def ages(self) -> dict[str, float]:
+        """Return how old that is, by process [s]."""
+        return {name: self._clock() - told for name, told in self._told.items()}
+
+    def troubles(self) -> dict[str, str]:
+        """Return what is wrong, by process, "" for nothing; the supervisor is one of them."""
+        held_up = self._clock() - self._looked > SILENT
+        supervisor = "the service is ending" if self._ending else "no sign of life" if held_up else ""
+        return {**self._troubles, "supervisor": supervisor}
+
+    def _trouble(self, name: str, running: Running) -> str:
+        silent = name in self._watches and self._watches[name].silent()
+        if running.pid is None:
+            return "not running"
+        if not running.ready:
+            return "starting"
+        return "no sign of life" if silent else ""
+
+
+def metrics_server(config: Config, health: Health) -> AbstractContextManager[object]:
+    """Return what serves it while the context lasts; nothing where [telemetry] metrics_port is not given."""
+    if not config.telemetry.metrics_port:
+        return nullcontext()
+    from trirail.processes.metrics_server import MetricsServer
+
+    return MetricsServer(config, health)
