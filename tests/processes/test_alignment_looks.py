@@ -8,10 +8,10 @@ import pytest
 from conftest import Rig
 from hypothesis import given
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.alignment_looks import BURST, RATE, Looks, in_words
 from trirail.processes.incoming import Incoming
+from trirail.processes.requests import LOOKS, LOOKS_PER_SECOND, Looks
 from trirail.wire import boundary
-from trirail.wire.looks import WELL, AlignmentLook
+from trirail.wire.looks import WELL, AlignmentLook, in_words
 from trirail.wire.packets import Looked
 from trirail.wire.text import printable
 from wire.looks import LARGEST, looks
@@ -57,15 +57,15 @@ LOOK = AlignmentLook("a", "check", 1)
 
 def test_who_sends_too_many_is_refused_until_he_has_waited_and_others_are_not() -> None:
     asked = Asked()
-    for _ in range(BURST):
+    for _ in range(LOOKS):
         asked.take(LOOK)
     with pytest.raises(RefusedError) as refused:
         asked.take(LOOK)
     assert refused.value.code is RefusalCode.BUSY
     asked.take(LOOK, "trirail/demo/alignment/bob")
-    asked.now += 1.5 / RATE
+    asked.now += 1.5 / LOOKS_PER_SECOND
     asked.take(LOOK)
-    assert [sent.user for sent in asked.sent] == ["ann"] * BURST + ["bob", "ann"]
+    assert [sent.user for sent in asked.sent] == ["ann"] * LOOKS + ["bob", "ann"]
 
 
 def test_what_the_loop_does_not_take_is_refused() -> None:

@@ -17,7 +17,6 @@ import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
-from trirail.processes.alignment_looks import Looks
 from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox
 from trirail.processes.incoming import Incoming
@@ -27,7 +26,7 @@ from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications, StateMaker, info
 from trirail.processes.realtime import give_back
 from trirail.processes.replies import Refusals, Replies
-from trirail.processes.requests import CommandReader, Requests
+from trirail.processes.requests import CommandReader, Looks, Requests
 from trirail.processes.session_guard import Guard
 from trirail.processes.zenoh_links import Crowding, RouterLinks
 from trirail.wire import boundary, zenoh_session

@@ -1,4 +1,4 @@
-"""What clients ask of the loop: goals by turns, commands at once, each answered exactly once.
+"""What clients ask of the loop, goals by turns and commands at once, each answered exactly once; and what they tell it.
 
 A command that stops the robot is carried out even where it cannot be read.
 """
@@ -13,11 +13,12 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import msgspec
+from msgspec import structs
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.inbox import Inbox
-from trirail.processes.incoming import Backlog, Incoming
+from trirail.processes.incoming import Backlog, Incoming, Pace
 from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies
@@ -25,8 +26,9 @@ from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal
 from trirail.wire.links import PacketLink
+from trirail.wire.looks import WELL, AlignmentLook, in_words
 from trirail.wire.messages import CommandReply, ErrorReply
-from trirail.wire.packets import CommandRequest, GoalRequest, message
+from trirail.wire.packets import CommandRequest, GoalRequest, Looked, message
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
@@ -43,6 +45,8 @@ UNDER_WAY_OF_ALL = 64
 """Likewise, of all users."""
 REPLY_WITHIN = 15.0
 """A command that the loop has not carried out by then is answered with an error [s]."""
+LOOKS, LOOKS_PER_SECOND = 50, 20.0
+"""Looks of one user that pass at once, and then a second: three times what an alignment without a camera has."""
 
 
 class _Waiting(NamedTuple):
@@ -241,3 +245,26 @@ class CommandReader:
             backlog.withdraw_coming(goal, reason, incoming.number)
         if name.stops and goal is None and (name.everybodys or self._states.lease in (None, user)):
             backlog.withdraw_all(reason, incoming.number)
+
+
+class Looks:
+    """What clients tell of their alignments: `send` gives it to the loop, which makes an event of each look."""
+
+    def __init__(self, robot: str, send: Callable[[Looked], bool], clock: Callable[[], float] = time.monotonic) -> None:
+        self._prefix = zenoh_session.key(robot, "alignment")
+        self._send = send
+        self._clock = clock
+        self._pace = Pace(LOOKS, LOOKS_PER_SECOND)
+
+    def forward(self, incoming: Incoming) -> AlignmentLook:
+        """Pass a look on, and return it. Raises RefusedError."""
+        (user,) = boundary.names(incoming.key, self._prefix, ("user",))
+        sent: AlignmentLook = incoming.content(AlignmentLook, "not a look of an alignment")
+        look = structs.replace(sent, words=quoted(sent.words))
+        now = self._clock()
+        if self._pace.wait(user, now) > 0.0:
+            raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks a second: send fewer")
+        self._pace.count(user, now)
+        if not self._send(Looked(user, "info" if look.end in WELL else "warning", in_words(look), look)):
+            raise RefusedError(RefusalCode.BUSY, "the loop takes no more now: send it again")
+        return look

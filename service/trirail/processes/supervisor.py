@@ -15,7 +15,7 @@ from trirail.config import Config
 from trirail.errors import ServiceError
 from trirail.processes.compiling import Progress
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
-from trirail.processes.monitoring import Health, Running, metrics_server
+from trirail.processes.monitoring import LEAST_CYCLES, Health, Running, metrics_server
 from trirail.processes.operating_system import Signals, Watchdog, notify
 from trirail.processes.process import Order
 from trirail.processes.realtime import give_back
@@ -53,8 +53,6 @@ SILENT = 0.7
 """A process that could have given signs of life for so long and gave none hangs, and is killed [s]."""
 RECORDER_SILENT = 5.0
 """The same of the recorder, which may wait for a disk: nothing that moves depends on it [s]."""
-LEAST_CYCLES = 3
-"""So many cycles the loop may take for a sign of life, however long they are."""
 RETRY = 10.0
 """How long it is waited before any more, for recorder and planner; the gateway's are the service's end [s]."""
 

@@ -94,3 +94,24 @@ class AlignmentLook(Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+
+def in_words(look: AlignmentLook) -> str:
+    """Return a look as a line for people."""
+    said = f"{look.purpose} {look.id}, look {look.number}: {_marks(look)}"
+    if look.correction is not None:
+        x, y, phi = look.correction
+        said += f"; corrects by x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {phi * 1e6:.1f} µrad"
+    if look.noise is not None:
+        said += f"; residual {look.noise:.3f} pixel"
+    if look.end is not None:
+        said += f"; {look.end} after {look.seconds:.2f} s"
+    return said + (f": {look.words}" if look.words else "")
+
+
+def _marks(look: AlignmentLook) -> str:
+    if not look.marks:
+        return "no marks"
+    if look.error is None:
+        return ", ".join(f"{mark.name} ({mark.pixel[0]:.2f}, {mark.pixel[1]:.2f})" for mark in look.marks)
+    return f"{look.error.worst * 1e6:.2f} µm and {look.error.turn * 1e6:.1f} µrad to go"
