@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import can
 from trirail_drivers import config
@@ -26,6 +26,13 @@ ENABLED: Final = (PowerState.OPERATION_ENABLED,) * 3
 
 AnyDevice = TypeVar("AnyDevice", bound=SimulatedDevice)
 AnyDriver = TypeVar("AnyDriver", bound=DriveGroup)
+AnyRig = TypeVar("AnyRig")
+
+
+class Closing(Protocol):
+    """Gives back a rig that it is given; its drives are closed at the end of the test."""
+
+    def __call__(self, rig: AnyRig, /) -> AnyRig: ...
 
 
 # ---------------------------------------------------------------------- one drive

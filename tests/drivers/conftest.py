@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
-from rigs import DriverRig
+from rigs import Closing, DriverRig
 
 
 @pytest.fixture
-def rigs() -> Iterator[list[Any]]:
-    """A list for whatever has drives, which are closed at the end of the test."""
-    made: list[Any] = []
-    yield made
-    for rig in made:
-        rig.drives.close()
+def closing() -> Iterator[Closing]:
+    """Gives back what it is given, whatever has drives; these are closed at the end of the test."""
+    with ExitStack() as kept:
+
+        def closing(rig: Any) -> Any:
+            kept.callback(rig.drives.close)
+            return rig
+
+        yield closing
 
 
 @pytest.fixture

@@ -5,25 +5,24 @@ from __future__ import annotations
 import pytest
 from drivers.foreign import Habits
 from drivers.test_foreign import PERIOD, Rig
+from rigs import Closing
 from trirail_drivers.errors import DriveError
 
 Key = tuple[int, int]
 MASTER = 126
 
 
-def test_a_drive_that_takes_8_ms_only_is_refused_with_the_rate_that_it_has(rigs: list[Rig]) -> None:
+def test_a_drive_that_takes_8_ms_only_is_refused_with_the_rate_that_it_has(closing: Closing) -> None:
     refuses = {(0x60C2, 1): lambda value: value != 8, (0x60C2, 2): lambda exponent: exponent != -3}
-    rig = Rig("elmo_gold", Habits(values={(0x60C2, 1): 8, (0x60C2, 2): -3}, refuses=refuses))
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold", Habits(values={(0x60C2, 1): 8, (0x60C2, 2): -3}, refuses=refuses)))
     with pytest.raises(DriveError, match=r"60C2:0\d .*; it holds 8 ms: say loop\.rate_hz = 125") as refused:
         rig.drives.configure(PERIOD)
     assert str(refused.value).endswith("; drive B: the same; drive C: the same")
     rig.drives.configure(0.008)
 
 
-def test_what_is_found_of_one_drive_does_not_hide_what_is_found_of_another(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold")
-    rigs.append(rig)
+def test_what_is_found_of_one_drive_does_not_hide_what_is_found_of_another(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold"))
     a, b, c = rig.nodes
     a.put(0x1000, 0x191)
     for node in (b, c):
@@ -37,9 +36,8 @@ def test_what_is_found_of_one_drive_does_not_hide_what_is_found_of_another(rigs:
     assert all(index == 0x6040 for node in rig.nodes for index, *_ in node.written)
 
 
-def test_an_emcy_that_is_switched_off_is_not_told_as_the_predefined_one(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(values={(0x1014, 0): 0x8000_0081}, access={(0x1014, 0): "ro"}))
-    rigs.append(rig)
+def test_an_emcy_that_is_switched_off_is_not_told_as_the_predefined_one(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(values={(0x1014, 0): 0x8000_0081}, access={(0x1014, 0): "ro"})))
     rig.ready()
     (said,) = [line for line in rig.warnings if "1014" in line and "drive A" in line]
     assert "its EMCY is switched off" in said
@@ -48,16 +46,14 @@ def test_an_emcy_that_is_switched_off_is_not_told_as_the_predefined_one(rigs: li
     rig.enable()
 
 
-def test_an_emcy_that_is_switched_off_is_switched_on(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(values={(0x1014, 0): 0x8000_0081}, access={(0x1014, 0): "rw"}))
-    rigs.append(rig)
+def test_an_emcy_that_is_switched_off_is_switched_on(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(values={(0x1014, 0): 0x8000_0081}, access={(0x1014, 0): "rw"})))
     rig.ready()
     assert [node.value(0x1014) for node in rig.nodes] == [0x80 + node.node for node in rig.nodes]
 
 
-def test_an_event_timer_that_is_read_only_keeps_the_statuswords_pdo(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(access={(0x1800, 5): "ro"}, values={(0x1800, 5): 0}))
-    rigs.append(rig)
+def test_an_event_timer_that_is_read_only_keeps_the_statuswords_pdo(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(access={(0x1800, 5): "ro"}, values={(0x1800, 5): 0})))
     rig.ready()
     for node in rig.nodes:
         assert node.value(0x1800, 1) & 0x8000_07FF == 0x180 + node.node
@@ -85,10 +81,9 @@ ANOTHER = 5 << 16 | 1000
     ids=["watches another", "read-only", "all taken", "it watches this service already", "free"],
 )
 def test_the_entry_of_1016_that_is_free_watches_this_service(
-    rigs: list[Rig], held: dict[Key, int], access: dict[Key, str], used: int
+    closing: Closing, held: dict[Key, int], access: dict[Key, str], used: int
 ) -> None:
-    rig = Rig("elmo_gold", Habits(more=SECOND, values={(0x1016, 0): 2, **held}, access=access))
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold", Habits(more=SECOND, values={(0x1016, 0): 2, **held}, access=access)))
     rig.ready()
     for node in rig.nodes:
         watched = {entry: node.value(0x1016, entry) for entry in (1, 2)}
@@ -96,13 +91,12 @@ def test_the_entry_of_1016_that_is_free_watches_this_service(
         assert watched[3 - used] == held.get((0x1016, 3 - used), 0)
 
 
-def test_a_mapping_that_fits_with_another_transmission_type_says_so(rigs: list[Rig]) -> None:
+def test_a_mapping_that_fits_with_another_transmission_type_says_so(closing: Closing) -> None:
     values = {
         (0x1400, 1): 0x201, (0x1600, 0): 1, (0x1600, 1): 0x6040_0010,
         (0x1401, 1): 0x301, (0x1401, 2): 255, (0x1601, 0): 1, (0x1601, 1): 0x607A_0020,
     }  # fmt: skip
-    rig = Rig("elmo_gold", Habits(fixed_pdos=True, values=values, access={(0x1401, 2): "ro"}))
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold", Habits(fixed_pdos=True, values=values, access={(0x1401, 2): "ro"})))
     said = r"1601 = 607A0020h, which fits, but its transmission type 1401:02 stays 255; wanted 1"
     with pytest.raises(DriveError, match=said):
         rig.drives.configure(PERIOD)

@@ -14,6 +14,7 @@ import pytest
 from drivers.foreign import ForeignDrive, Habits, Truth, three
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs import Closing
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.cia402.drives import Cia402
@@ -108,9 +109,8 @@ class Rig:
 
 
 @pytest.mark.parametrize("name", MAKES)
-def test_a_drive_moves_as_fast_as_it_is_told(rigs: list[Rig], name: str) -> None:
-    rig = Rig(name)
-    rigs.append(rig)
+def test_a_drive_moves_as_fast_as_it_is_told(closing: Closing, name: str) -> None:
+    rig = closing(Rig(name))
     rig.ready()
     assert {node.mode for node in rig.nodes} == {MAKES[name].mode}
     rig.enable()
@@ -131,9 +131,8 @@ ACTIONS = {0x6040, 0x60C4}
 
 
 @pytest.mark.parametrize("name", MAKES)
-def test_a_drive_that_is_set_up_is_only_read_and_nothing_is_ever_stored_in_it(rigs: list[Rig], name: str) -> None:
-    rig = Rig(name)
-    rigs.append(rig)
+def test_a_drive_that_is_set_up_is_only_read_and_nothing_is_ever_stored_in_it(closing: Closing, name: str) -> None:
+    rig = closing(Rig(name))
     rig.ready()
     for node in rig.nodes:
         assert {index for index, *_ in node.written} - ACTIONS
@@ -180,18 +179,16 @@ def test_the_table_of_objects_is_that_of_the_guide() -> None:
     ],
 )
 def test_what_a_drive_lacks_or_contradicts_is_refused_by_name(
-    rigs: list[Rig], name: str, keys: dict[str, Any], said: str
+    closing: Closing, name: str, keys: dict[str, Any], said: str
 ) -> None:
-    rig = Rig(name, **keys)
-    rigs.append(rig)
+    rig = closing(Rig(name, **keys))
     with pytest.raises(DriveError, match=said):
         rig.ready()
     assert all(index == 0x6040 for node in rig.nodes for index, *_ in node.written)
 
 
-def test_a_drive_with_neither_mode_is_refused_by_6502(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(values={(0x6502, 0): 0x2D}))
-    rigs.append(rig)
+def test_a_drive_with_neither_mode_is_refused_by_6502(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(values={(0x6502, 0): 0x2D})))
     with pytest.raises(DriveError, match=r"6502:00 \(supported drive modes\) is 0000002D: neither"):
         rig.ready()
 
@@ -214,12 +211,11 @@ def test_a_drive_with_neither_mode_is_refused_by_6502(rigs: list[Rig]) -> None:
     ],
 )
 def test_what_another_master_has_left_in_a_drive_does_not_disturb_the_cycle(
-    rigs: list[Rig], left: tuple[int, int, int, str, int, bool], values: dict[tuple[int, int], int]
+    closing: Closing, left: tuple[int, int, int, str, int, bool], values: dict[tuple[int, int], int]
 ) -> None:
     """Seen with lely-core's slave: objects that the dictionaries of real drives have, as a master with a SYNC of
     another kind would leave them."""
-    rig = Rig("elmo_gold", Habits(more=(left,), values=values))
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold", Habits(more=(left,), values=values)))
     rig.ready()
     rig.enable()
     for _ in range(100):
@@ -235,23 +231,20 @@ def test_what_another_master_has_left_in_a_drive_does_not_disturb_the_cycle(
 
 
 @pytest.mark.parametrize("index", [0x1005, 0x1007, 0x1019])
-def test_a_drive_that_keeps_a_sync_of_another_kind_is_refused(rigs: list[Rig], index: int) -> None:
+def test_a_drive_that_keeps_a_sync_of_another_kind_is_refused(closing: Closing, index: int) -> None:
     kind = 5 if index == 0x1019 else 7
-    rig = Rig("elmo_gold", Habits(without=frozenset({index}), more=((index, 0, kind, "ro", 0x81, False),)))
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold", Habits(without=frozenset({index}), more=((index, 0, kind, "ro", 0x81, False),))))
     with pytest.raises(DriveError, match=f"drive A: object {index:04X}:00 .* and stays; wanted 0"):
         rig.ready()
 
 
-def test_a_drive_that_answers_no_guarding_is_not_watched_by_it(rigs: list[Rig]) -> None:
-    rig = Rig("technosoft_ipos", Habits(answers_guarding=False))
-    rigs.append(rig)
+def test_a_drive_that_answers_no_guarding_is_not_watched_by_it(closing: Closing) -> None:
+    rig = closing(Rig("technosoft_ipos", Habits(answers_guarding=False)))
     before = [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes]
     with pytest.raises(DriveError, match="drive A lacks protections: 1016, its watch on this service"):
         rig.ready()
     assert [(node.value(0x100C), node.value(0x100D)) for node in rig.nodes] == before
-    rig = Rig("technosoft_ipos", Habits(answers_guarding=False), accept_without=("1016",))
-    rigs.append(rig)
+    rig = closing(Rig("technosoft_ipos", Habits(answers_guarding=False), accept_without=("1016",)))
     rig.ready()
     rig.enable()
     rig.move(0.05, 60)
@@ -294,10 +287,9 @@ def test_late_answers_to_earlier_requests_are_not_taken_for_others(late: list[by
     assert rig.feedback.fault is None
 
 
-def test_an_answer_against_the_rules_is_not_told_as_silence(rigs: list[Rig], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_against_the_rules_is_not_told_as_silence(closing: Closing, monkeypatch: pytest.MonkeyPatch) -> None:
     """A segment whose toggle bit is wrong (CiA 301, 7.2.4.3.6)."""
-    rig = Rig("elmo_gold")
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold"))
     served = rig.nodes[0].local.sdo
     answer: Callable[[bytes], None] = served.send_response
 
@@ -361,43 +353,42 @@ UNITS = [
 ]
 
 
-def test_the_factors_6096_and_6097_go_as_makers_have_them(rigs: list[Rig]) -> None:
-    """Beckhoff's AX8000 as it comes: 2^20 counts a turn, velocities in 0.0001 rpm, accelerations in degrees/s²."""
-    factors = {(0x6096, 1): 600_000, (0x6096, 2): 2**20, (0x6097, 1): 360, (0x6097, 2): 600_000}
-    truth = Truth(2**20 * TURNS, 60e4 * TURNS, 360 * TURNS)
-    rig = Rig("elmo_gold", Habits(values=factors), truth, counts_per_metre=truth.position)
-    rigs.append(rig)
-    rig.ready()
-    rig.enable()
-    rig.move(0.1, 150)
-    for node, commanded in zip(rig.nodes, rig.commanded, strict=True):
-        assert commanded - node.servo.position == pytest.approx(0.1 * PERIOD, abs=5e-5)
-        assert node.value(0x6085) / truth.acceleration == pytest.approx(2.0, rel=1e-3)
-
-
-@pytest.mark.parametrize(("position", "velocity", "acceleration", "truth"), UNITS)
-def test_a_tenth_of_a_metre_a_second_is_that_in_every_unit(
-    rigs: list[Rig], position: int, velocity: int, acceleration: int, truth: Truth
-) -> None:
-    values = {(0x60A8, 0): position, (0x60A9, 0): velocity, (0x60AA, 0): acceleration}
-    turns = TURNS if truth.position == COUNTS else None
-    rig = Rig(
-        "maxon_epos4_compact50_5",
-        Habits(values=values),
-        truth,
-        counts_per_metre=truth.position,
-        revolutions_per_metre=turns,
-    )
-    rigs.append(rig)
+def assert_a_tenth_of_a_metre_a_second(rig: Rig, truth: Truth, within: float) -> None:
+    """Assert that drives go as they are told, and that the ramp of a quick stop is right but for a share of it."""
     rig.ready()
     rig.enable()
     rig.move(0.1, 150)
     for node, commanded in zip(rig.nodes, rig.commanded, strict=True):
         # A velocity offset of 1 rpm is a step of 0.08 mm/s; in the wrong unit the lag would be millimetres.
         assert commanded - node.servo.position == pytest.approx(0.1 * PERIOD, abs=5e-5)
-        assert node.value(0x6085) / truth.acceleration == pytest.approx(
-            2.0, rel=0.3 if truth.acceleration == 1.0 else 0.01
+        assert node.value(0x6085) / truth.acceleration == pytest.approx(2.0, rel=within)
+
+
+def test_the_factors_6096_and_6097_go_as_makers_have_them(closing: Closing) -> None:
+    """Beckhoff's AX8000 as it comes: 2^20 counts a turn, velocities in 0.0001 rpm, accelerations in degrees/s²."""
+    factors = {(0x6096, 1): 600_000, (0x6096, 2): 2**20, (0x6097, 1): 360, (0x6097, 2): 600_000}
+    truth = Truth(2**20 * TURNS, 60e4 * TURNS, 360 * TURNS)
+    rig = closing(Rig("elmo_gold", Habits(values=factors), truth, counts_per_metre=truth.position))
+    assert_a_tenth_of_a_metre_a_second(rig, truth, 1e-3)
+
+
+@pytest.mark.parametrize(("position", "velocity", "acceleration", "truth"), UNITS)
+def test_a_tenth_of_a_metre_a_second_is_that_in_every_unit(
+    closing: Closing, position: int, velocity: int, acceleration: int, truth: Truth
+) -> None:
+    values = {(0x60A8, 0): position, (0x60A9, 0): velocity, (0x60AA, 0): acceleration}
+    turns = TURNS if truth.position == COUNTS else None
+    rig = closing(
+        Rig(
+            "maxon_epos4_compact50_5",
+            Habits(values=values),
+            truth,
+            counts_per_metre=truth.position,
+            revolutions_per_metre=turns,
         )
+    )
+    assert_a_tenth_of_a_metre_a_second(rig, truth, 0.3 if truth.acceleration == 1.0 else 0.01)
+    for node in rig.nodes:
         assert node.value(0x6065) / truth.position == pytest.approx(0.005, rel=1e-3)
     rig.drives.quick_stop()
     at = [node.servo.position for node in rig.nodes]
@@ -409,23 +400,21 @@ def test_a_tenth_of_a_metre_a_second_is_that_in_every_unit(
         assert node.servo.position - place == pytest.approx(0.1**2 / 2 / 2.0, abs=1e-3)
 
 
-def test_a_unit_that_nobody_says_of_a_metre_is_set_to_counts(rigs: list[Rig]) -> None:
-    rig = Rig("maxon_epos4_compact50_5", None, IN_COUNTS, revolutions_per_metre=None)
-    rigs.append(rig)
+def test_a_unit_that_nobody_says_of_a_metre_is_set_to_counts(closing: Closing) -> None:
+    rig = closing(Rig("maxon_epos4_compact50_5", None, IN_COUNTS, revolutions_per_metre=None))
     rig.ready()
     assert [(node.value(0x60A9), node.value(0x60AA)) for node in rig.nodes] == [(0x00B5_0300, 0x00B5_5700)] * 3
     assert rig.nodes[0].value(0x6085) == round(2.0 * COUNTS)
 
 
-def test_a_unit_that_cannot_be_set_and_that_nobody_says_is_refused(rigs: list[Rig]) -> None:
+def test_a_unit_that_cannot_be_set_and_that_nobody_says_is_refused(closing: Closing) -> None:
     refuses = {(0x60A9, 0): lambda value: value & 0xFFFFFF != 0xB44700}
-    rig = Rig("maxon_epos4_compact50_5", Habits(refuses=refuses), revolutions_per_metre=None)
-    rigs.append(rig)
+    rig = closing(Rig("maxon_epos4_compact50_5", Habits(refuses=refuses), revolutions_per_metre=None))
     with pytest.raises(DriveError, match=r"object 60A9 is rev/min and cannot be set .*say drives.A.rev"):
         rig.ready()
 
 
-def test_drives_whose_fixed_identifiers_are_the_same_are_refused(rigs: list[Rig]) -> None:
+def test_drives_whose_fixed_identifiers_are_the_same_are_refused(closing: Closing) -> None:
     """All three as node 1 has them by default: one setpoint would move them all."""
     values = {
         (0x1600, 0): 1,
@@ -435,8 +424,7 @@ def test_drives_whose_fixed_identifiers_are_the_same_are_refused(rigs: list[Rig]
         (0x1A01, 0): 1,
         (0x1A01, 1): 0x6064_0020,
     }
-    rig = Rig("elmo_gold", Habits(fixed_pdos=True, values=values), rebased=False)
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold", Habits(fixed_pdos=True, values=values), rebased=False))
     with pytest.raises(
         DriveError, match=r"drives A and B: both have a PDO with identifier \d+h that cannot be changed"
     ):
@@ -444,10 +432,9 @@ def test_drives_whose_fixed_identifiers_are_the_same_are_refused(rigs: list[Rig]
 
 
 @pytest.mark.parametrize("name", MAKES)
-def test_dictionaries_whose_identifiers_are_those_of_node_1(rigs: list[Rig], name: str) -> None:
+def test_dictionaries_whose_identifiers_are_those_of_node_1(closing: Closing, name: str) -> None:
     """They can be written; an EMCY that cannot is taken at the predefined identifier."""
-    rig = Rig(name, rebased=False)
-    rigs.append(rig)
+    rig = closing(Rig(name, rebased=False))
     rig.ready()
     rig.enable()
     rig.move(0.1, 20)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from drivers.foreign import Habits
 from drivers.test_foreign import MAKES, Rig
+from rigs import Closing
 from trirail_drivers.errors import DriveError
 
 FIXED = {(0x1600, 0): 0, (0x1601, 0): 1, (0x1601, 1): 0x60FF_0020}
@@ -12,9 +13,8 @@ FIXED = {(0x1600, 0): 0, (0x1601, 0): 1, (0x1601, 1): 0x60FF_0020}
 
 
 @pytest.mark.parametrize("name", MAKES)
-def test_no_pdo_is_on_but_those_that_are_used_and_none_of_them_waits(rigs: list[Rig], name: str) -> None:
-    rig = Rig(name)
-    rigs.append(rig)
+def test_no_pdo_is_on_but_those_that_are_used_and_none_of_them_waits(closing: Closing, name: str) -> None:
+    rig = closing(Rig(name))
     rig.ready()
     for node, axis in zip(rig.nodes, rig.drives._axes, strict=True):
         way = axis.way
@@ -24,9 +24,8 @@ def test_no_pdo_is_on_but_those_that_are_used_and_none_of_them_waits(rigs: list[
         assert [node.value(index, 3) for index in on if index >= 0x1800] == [0] * (1 + (way.status is not None))
 
 
-def test_a_statusword_that_may_be_held_back_is_taken_from_beside_the_position(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(values={(0x1800, 3): 1000}, access={(0x1800, 3): "ro"}))
-    rigs.append(rig)
+def test_a_statusword_that_may_be_held_back_is_taken_from_beside_the_position(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(values={(0x1800, 3): 1000}, access={(0x1800, 3): "ro"})))
     rig.ready()
     for axis in rig.drives._axes:
         assert axis.way.feedback.has_status
@@ -35,8 +34,7 @@ def test_a_statusword_that_may_be_held_back_is_taken_from_beside_the_position(ri
     rig.enable()
 
 
-def test_a_fixed_mapping_that_does_not_fit_is_refused_by_its_object(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(fixed_pdos=True, values=FIXED))
-    rigs.append(rig)
+def test_a_fixed_mapping_that_does_not_fit_is_refused_by_its_object(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(fixed_pdos=True, values=FIXED)))
     with pytest.raises(DriveError, match=r"drive A: object 1601 .*no PDO fits setpoints 607A: it has 1601 = 60FF0020h"):
         rig.ready()

@@ -10,6 +10,7 @@ from drivers.foreign import Habits
 from drivers.test_foreign import PERIOD, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs import Closing
 from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.cia402 import inspection
@@ -38,9 +39,8 @@ def test_a_value_of_every_type_is_written_and_read_back(kind: str, data: st.Data
         rig.drives.close()
 
 
-def test_it_is_written_before_mapping_and_only_where_it_differs(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE, ObjectWrite(0x2090, 7, "i32", "as it is", sub=1)))
-    rigs.append(rig)
+def test_it_is_written_before_mapping_and_only_where_it_differs(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE, ObjectWrite(0x2090, 7, "i32", "as it is", sub=1))))
     rig.ready()
     for node in rig.nodes:
         written = [index for index, *_ in node.written]
@@ -48,9 +48,8 @@ def test_it_is_written_before_mapping_and_only_where_it_differs(rigs: list[Rig])
         assert 0x2090 not in written
 
 
-def test_it_is_shown_with_its_reason(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE,))
-    rigs.append(rig)
+def test_it_is_shown_with_its_reason(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE,)))
     for each in inspection.inspect(rig.wires, rig.config, PERIOD, rig.clock, apply=False):
         (shown,) = [found for found in each["differences"] if found["object"] == "208E:00"]
         assert (shown["found"], shown["wanted"], shown["why"]) == ("0", "256", BRAKE.why)
@@ -74,9 +73,8 @@ def test_it_is_shown_with_its_reason(rigs: list[Rig]) -> None:
         ),
     ],
 )
-def test_what_the_drive_cannot_take_is_refused(rigs: list[Rig], habits: Habits, write: ObjectWrite, said: str) -> None:
-    rig = Rig("elmo_gold", habits, write=(write,))
-    rigs.append(rig)
+def test_what_the_drive_cannot_take_is_refused(closing: Closing, habits: Habits, write: ObjectWrite, said: str) -> None:
+    rig = closing(Rig("elmo_gold", habits, write=(write,)))
     with pytest.raises(DriveError, match=said):
         rig.drives.configure(PERIOD)
 
@@ -93,11 +91,10 @@ def test_what_the_drive_cannot_take_is_refused(rigs: list[Rig], habits: Habits, 
     ],
 )  # fmt: skip
 def test_node_id_and_bitrate_are_refused_by_their_makers_numbers(
-    rigs: list[Rig], vendor: int, index: int, refused: bool
+    closing: Closing, vendor: int, index: int, refused: bool
 ) -> None:
     habits = Habits(more=((index, 0, 5, "rw", 1, False),), values={(0x1018, 1): vendor})
-    rig = Rig("elmo_gold", habits, write=(ObjectWrite(index, 5, "u8", "x"),))
-    rigs.append(rig)
+    rig = closing(Rig("elmo_gold", habits, write=(ObjectWrite(index, 5, "u8", "x"),)))
     if refused:
         with pytest.raises(DriveError, match=rf"object {index:04X}:00 changes node id or bitrate"):
             rig.drives.configure(PERIOD)
@@ -107,9 +104,8 @@ def test_node_id_and_bitrate_are_refused_by_their_makers_numbers(
         assert [node.value(index) for node in rig.nodes] == [5] * 3
 
 
-def test_a_value_that_does_not_stick_is_refused(rigs: list[Rig]) -> None:
-    rig = Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE,))
-    rigs.append(rig)
+def test_a_value_that_does_not_stick_is_refused(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(more=ROWS), write=(BRAKE,)))
     keep: Any = rig.nodes[1].local.set_data
 
     def set_data(index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:

@@ -12,6 +12,7 @@ import pytest
 from drivers.test_odrive import CONFIG, PERIOD, Rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from rigs import Closing
 from trirail.config import SIM, load
 from trirail.config.loading import everything
 from trirail.errors import ConfigError
@@ -113,10 +114,9 @@ def test_a_setting_that_is_not_as_it_must_be_is_refused_or_accepted_and_told(
     ],
 )
 def test_each_is_said_with_what_is_wanted_and_how_to_accept_it(
-    rigs: list[Rig], path: str, value: float, said: str
+    closing: Closing, path: str, value: float, said: str
 ) -> None:
-    rig = Rig()
-    rigs.append(rig)
+    rig = closing(Rig())
     rig.devices[1].settings[path] = value
     with pytest.raises(DriveError) as refused:
         rig.drives.configure(PERIOD)
@@ -126,9 +126,8 @@ def test_each_is_said_with_what_is_wanted_and_how_to_accept_it(
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.0005, 2.9 * PERIOD])
-def test_a_watchdog_that_ends_motion_is_refused_whatever_is_accepted(rigs: list[Rig], seconds: float) -> None:
-    rig = Rig(accepting(*PROTECTIONS))
-    rigs.append(rig)
+def test_a_watchdog_that_ends_motion_is_refused_whatever_is_accepted(closing: Closing, seconds: float) -> None:
+    rig = closing(Rig(accepting(*PROTECTIONS)))
     rig.devices[2].settings[WATCHDOG_TIMEOUT] = seconds
     with pytest.raises(DriveError, match=r"drive C: axis0\.config\.watchdog_timeout is .* less than 3 cycles"):
         rig.drives.configure(PERIOD)
@@ -154,9 +153,8 @@ def test_a_firmware_that_nobody_knows_is_a_missing_protection(firmware: tuple[in
             rig.drives.close()
 
 
-def test_a_development_version_is_none_that_is_known(rigs: list[Rig]) -> None:
-    rig = Rig()
-    rigs.append(rig)
+def test_a_development_version_is_none_that_is_known(closing: Closing) -> None:
+    rig = closing(Rig())
     rig.devices[0].version = rig.devices[0].version._replace(unreleased=True)
     with pytest.raises(DriveError, match="drive A lacks protections: endpoints"):
         rig.drives.configure(PERIOD)
@@ -185,13 +183,12 @@ def with_file(path: Path) -> Any:
 
 
 def test_a_users_own_table_makes_a_firmware_known(
-    rigs: list[Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    closing: Closing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "flat_endpoints.json").write_text(table(UNKNOWN, {WATCHDOG: 999}))
     own = flat_endpoints.read("A", tmp_path / "flat_endpoints.json")
     monkeypatch.setattr("trirail_drivers.simulated.odrive.KNOWN", (own,))  # such a drive numbers them so
-    rig = Rig(with_file(tmp_path / "flat_endpoints.json"))
-    rigs.append(rig)
+    rig = closing(Rig(with_file(tmp_path / "flat_endpoints.json")))
     for device in rig.devices:
         device.version = UNKNOWN
     rig.drives.configure(PERIOD)
@@ -213,13 +210,12 @@ def test_a_users_own_table_makes_a_firmware_known(
     ],
 )
 def test_a_table_that_is_none_or_another_drives_is_refused(
-    rigs: list[Rig], tmp_path: Path, content: str | None, said: str
+    closing: Closing, tmp_path: Path, content: str | None, said: str
 ) -> None:
     path = tmp_path / "flat_endpoints.json"
     if content is not None:
         path.write_text(content)
-    rig = Rig(with_file(path))
-    rigs.append(rig)
+    rig = closing(Rig(with_file(path)))
     for device in rig.devices:
         device.version = UNKNOWN
     with pytest.raises(DriveError, match=rf"drives\.A\.endpoints: .*{said}"):
@@ -238,10 +234,9 @@ def test_a_table_that_is_not_there_is_told_by_the_doctor_and_refused_of_other_dr
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3])
-def test_an_answer_that_is_lost_is_asked_for_again(rigs: list[Rig], lost: int) -> None:
+def test_an_answer_that_is_lost_is_asked_for_again(closing: Closing, lost: int) -> None:
     """Three times in sdo_timeout; then the drive does not answer."""
-    rig = Rig()
-    rigs.append(rig)
+    rig = closing(Rig())
     device, left = rig.devices[1], [lost]
     keep = device._handlers[cansimple.RX_SDO]
 

@@ -63,6 +63,18 @@ class PdoParameters(NamedTuple):
         return (self.cob_id or 0) & _IDENTIFIER
 
 
+class _Wanted(NamedTuple):
+    """What a PDO is to become."""
+
+    cob_id: int
+    kind: int
+    entries: tuple[int, ...]
+    timer: tuple[int, int] | None
+    """Subindex and value of its event timer, where that is to change."""
+    inhibit: tuple[int, int] | None
+    """Likewise, of its inhibit time."""
+
+
 class Pdos:
     """The PDOs of one drive."""
 
@@ -154,8 +166,9 @@ class Pdos:
             if not await self._travels(entry, sending):
                 return None
         noted = len(self._drive.found)
-        await self._note(found, cob_id, kind, entries, timer, inhibit)
-        kept = await self._try_to_map(found, cob_id, kind, entries, timer, inhibit)
+        wanted = _Wanted(cob_id, kind, entries, timer, inhibit)
+        await self._note(found, wanted)
+        kept = await self._try_to_map(found, wanted)
         if kept is None:
             del self._drive.found[noted:]
         else:
@@ -174,15 +187,8 @@ class Pdos:
             return await remote.peek(index, subindex) is not None
         return await remote.may_be_written(index, subindex)
 
-    async def _try_to_map(
-        self,
-        found: PdoParameters,
-        cob_id: int,
-        kind: int,
-        entries: tuple[int, ...],
-        timer: tuple[int, int] | None,
-        inhibit: tuple[int, int] | None,
-    ) -> int | None:
+    async def _try_to_map(self, found: PdoParameters, wanted: _Wanted) -> int | None:
+        cob_id, kind, entries, timer, inhibit = wanted
         index, write, becomes = found.at, self._remote.write, self._remote.becomes
         fixed = False
         try:
@@ -247,15 +253,8 @@ class Pdos:
             return None
         return subindex, value
 
-    async def _note(
-        self,
-        found: PdoParameters,
-        cob_id: int,
-        kind: int,
-        entries: tuple[int, ...],
-        timer: tuple[int, int] | None,
-        inhibit: tuple[int, int] | None,
-    ) -> None:
+    async def _note(self, found: PdoParameters, wanted: _Wanted) -> None:
+        cob_id, kind, entries, timer, inhibit = wanted
         note, look = self._drive.note, self._remote.peek
         if not found.valid or found.identifier != cob_id & _IDENTIFIER:
             note((found.at, 1), found.cob_id, cob_id, "the PDO's identifier")

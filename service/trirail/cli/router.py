@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from msgspec import Meta, Struct
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.config import UserName, Zenoh, check_reach, explain
+from trirail.config import UserName, Zenoh, check_reach, explain, toml_tables
 from trirail.errors import ConfigError, RefusedError, ServiceError
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.access import router_access_control
@@ -60,9 +59,7 @@ def load(path: Path) -> RouterConfig:
         raise ConfigError(str(error)) from error
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    if config.zenoh.tls is not None:
-        tls = msgspec.structs.replace(config.zenoh.tls, directory=str(path.parent / config.zenoh.tls.directory))
-        config = msgspec.structs.replace(config, zenoh=msgspec.structs.replace(config.zenoh, tls=tls))
+    config = msgspec.structs.replace(config, zenoh=config.zenoh.beside(path.parent))
     if not config.all_robots:
         raise ConfigError(f"{path}: robots, routers: name one robot at least")
     named = Counter([*config.all_robots, *config.routers, *config.zenoh.users])
@@ -72,12 +69,7 @@ def load(path: Path) -> RouterConfig:
 
 
 def _parsed(text: str) -> RouterConfig:
-    try:
-        raw = tomllib.loads(text)
-    except RecursionError as error:
-        raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
-    except ValueError as error:
-        raise ConfigError(f"not TOML: {error}") from error
+    raw = toml_tables(text)
     try:
         return converted(raw, RouterConfig)
     except msgspec.ValidationError as error:

@@ -2,7 +2,7 @@
 
 from trirail.config.explained import Mistake, explain, overlap
 from trirail.config.impossible import check_as_built
-from trirail.config.loading import SIM, Findings, everything, load, parse
+from trirail.config.loading import SIM, Findings, everything, load, parse, toml_tables
 from trirail.config.network_checks import check_reach
 from trirail.config.tables import (
     BASE,
@@ -58,4 +58,5 @@ __all__ = [
     "overlap",
     "parse",
     "room",
+    "toml_tables",
 ]

@@ -37,7 +37,7 @@ def load(path: Path) -> Config:
 
 def parse(text: str) -> Config:
     """Read a configuration from TOML. Raises ConfigError."""
-    config, wrong = repaired(_tables(text))
+    config, wrong = repaired(toml_tables(text))
     _refuse(wrong)
     check(config)
     return config
@@ -78,12 +78,12 @@ def _read(path: Path) -> tuple[Config, list[Mistake]]:
     except FileError as error:
         without_path = str(error).removeprefix(f"{path}: ")
         raise ConfigError(f"{without_path}; `trirail config copy sim` gives one to start from") from error
-    config, wrong = repaired(_tables(text))
+    config, wrong = repaired(toml_tables(text))
     return _beside(path, config, wrong), wrong
 
 
-def _tables(text: str) -> dict[str, Any]:
-    """Read TOML."""
+def toml_tables(text: str) -> dict[str, Any]:
+    """Read TOML. Raises ConfigError."""
     try:
         raw = tomllib.loads(text)
         for _ in leaves(raw):
@@ -102,10 +102,6 @@ def _beside(path: Path, config: Config, wrong: list[Mistake]) -> Config:
         named = {key: getattr(drive, key) for key in ("eds", "endpoints")}
         found = {key: str(path.parent / file) for key, file in named.items() if file is not None}
         drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(drive, **found)})
-    zenoh = config.zenoh
-    if zenoh.tls is not None:
-        tls = msgspec.structs.replace(zenoh.tls, directory=str(path.parent / zenoh.tls.directory))
-        zenoh = msgspec.structs.replace(zenoh, tls=tls)
     correction = config.correction
     if correction.map is not None and correction.as_built is None:
         file = path.parent / correction.map
@@ -113,4 +109,4 @@ def _beside(path: Path, config: Config, wrong: list[Mistake]) -> Config:
             correction = msgspec.structs.replace(correction, map=str(file), as_built=as_built.read(file))
         except ConfigError as error:
             wrong.append(Mistake("correction.map", f"correction.map: {error}"))
-    return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction)
+    return msgspec.structs.replace(config, drives=drives, zenoh=config.zenoh.beside(path.parent), correction=correction)

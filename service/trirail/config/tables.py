@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import Annotated, Literal, cast
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
 from trirail_drivers.interface import NAMES, Triple
 
@@ -270,6 +271,12 @@ class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
     users: dict[UserName, Role] = {}
     """The role of each user, whose name is the common name of his certificate: a viewer sees all and may stop, an
     operator also moves the robot, a maintainer also resets and homes."""
+
+    def beside(self, folder: Path) -> Zenoh:
+        """Return it with the certificates' folder as it is called from here, where the file is in `folder`."""
+        if self.tls is None:
+            return self
+        return structs.replace(self, tls=structs.replace(self.tls, directory=str(folder / self.tls.directory)))
 
 
 class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
