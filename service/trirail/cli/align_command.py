@@ -35,9 +35,6 @@ def calibrate(
     lens: Literal["affine", "perspective", "radial"] = "affine",
     centre: tuple[float, float] | None = None,
     approach: notation.PoseWay = notation.AT_REST,
-    looks: int = 1,
-    wait: float = 0.0,
-    speed: notation.Share = 1.0,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
@@ -62,12 +59,6 @@ def calibrate(
         Of a radial lens: the pixel U V on its axis, the middle of the picture for most.
     approach
         How far beyond each place to go first, X Y PHI, so that backlash is always on the same side.
-    looks
-        Pictures at each place.
-    wait
-        How long the cameras take to show what is [s].
-    speed
-        Fraction of full speed, above 0 and up to 1.
     """
     from trirail.alignment.procedure import calibration_by_moves, mean_look, moves_for
     from trirail.client import calibration_file
@@ -81,9 +72,9 @@ def calibrate(
     moves = moves_for(lens, by, notation.radians(angle, False))
     with source.open_source() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
-        wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), looks, _approach(approach))
-        found = drive(robot, look, _printed(wishes, service, len(moves) + 1), speed, wait)
-        targets = dict(drive(robot, look, mean_look(looks), speed, wait).marks)
+        wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
+        found = drive(robot, look, _printed(wishes, service, len(moves) + 1), source.speed, source.wait)
+        targets = dict(drive(robot, look, mean_look(source.looks), source.speed, source.wait).marks)
     calibration_file.write(file, service.robot, found, targets)
     if service.json:
         terminal.json({"file": str(file), "targets": targets, "calibration": msgspec.to_builtins(found)})
@@ -102,9 +93,6 @@ def run(
     corrections: int = 3,
     distance_ppm: float = 1000.0,
     approach: notation.PoseWay = notation.AT_REST,
-    looks: int = 1,
-    wait: float = 0.0,
-    speed: notation.Share = 1.0,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
@@ -124,12 +112,6 @@ def run(
         By how much the marks' distance may differ from their targets'.
     approach
         As at the calibration: how far beyond each place to go first, X Y PHI.
-    looks
-        Pictures a measurement.
-    wait
-        How long the cameras take to show what is [s].
-    speed
-        Fraction of full speed, above 0 and up to 1.
     """
     from trirail.alignment.procedure import Task, align
     from trirail.client import calibration_file
@@ -144,11 +126,11 @@ def run(
         notation.radians(angle, False),
         corrections,
         distance_ppm * 1e-6,
-        looks,
+        source.looks,
         _approach(approach),
     )
     with source.open_source() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
-        found = drive(robot, look, _printed(align(task), service), speed, wait)
+        found = drive(robot, look, _printed(align(task), service), source.speed, source.wait)
     if found.confirmed != kept.calibration.confirmed:
         known = msgspec.structs.replace(kept.calibration, confirmed=found.confirmed)
         calibration_file.write(file, kept.robot, known, kept.targets, kept.made)
@@ -166,9 +148,6 @@ def check(
     *,
     distance_ppm: float = 1000.0,
     moves: Annotated[bool, Flag] = False,
-    looks: int = 1,
-    wait: float = 0.0,
-    speed: notation.Share = 1.0,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
@@ -184,12 +163,6 @@ def check(
         By how much the marks' distance may differ from their targets'.
     moves
         Make the calibration's moves again, with any part, and compare the cameras with how they were then.
-    looks
-        Pictures of a measurement, or at each place.
-    wait
-        How long the cameras take to show what is [s].
-    speed
-        Fraction of full speed, above 0 and up to 1.
     """
     from trirail.alignment.changes import view_changes
     from trirail.alignment.procedure import Task, calibration_again, look_only
@@ -197,14 +170,14 @@ def check(
     from trirail.client.client import Robot
 
     kept = _kept(file, service)
-    task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=looks)
+    task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
     with source.open_source() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
         if moves:
-            again = calibration_again(kept.calibration, looks)
-            now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), speed, wait)
+            again = calibration_again(kept.calibration, source.looks)
+            now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), source.speed, source.wait)
             changes = view_changes(kept.calibration, now)
         else:
-            found = drive(robot, look, look_only(task), speed, wait)
+            found = drive(robot, look, look_only(task), source.speed, source.wait)
     if moves:
         if service.json:
             terminal.json({"views": [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]})

@@ -1,4 +1,4 @@
-"""Options of `trirail align` that say where marks are from."""
+"""Options of `trirail align` that say where marks are from, and how they are looked at."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from trirail.cli import mark_source
+from trirail.cli import mark_source, notation
 from trirail.errors import TrirailError
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class MarkSource:
-    """Where the marks are from: one of --program, --pictures and --camera."""
+    """Where the marks are from, one of --program, --pictures and --camera, and how they are looked at."""
 
     program: str | None = None
     'A program that prints a line of JSON, {"mark": [u, v], …} in pixels, for each line that it reads.'
@@ -35,6 +35,12 @@ class MarkSource:
     "Its size in pixels: a disc's diameter, a cross's bars, a corner's sides."
     turn: float = 0.0
     "By what angle it is turned in the picture, from u to v, in degrees."
+    looks: int = 1
+    "Pictures of a measurement, or at each place."
+    wait: float = 0.0
+    "How long the cameras take to show what is [s]."
+    speed: notation.Share = 1.0
+    "Fraction of full speed, above 0 and up to 1."
 
     @contextlib.contextmanager
     def open_source(self) -> Iterator[mark_source.Source]:
