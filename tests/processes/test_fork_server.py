@@ -1,4 +1,4 @@
-"""The warm parent: what a child has of it, what is compiled where, and who ends with whom."""
+"""The fork server: what a child has of it, what is compiled where, and who ends with whom."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import servers
 from trirail.config import SIM, load
-from trirail.processes import warm_parent
+from trirail.processes import forked_processes
+from trirail.processes.child_process import Order
+from trirail.processes.forked_processes import UNTOLD, ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.process import Order
-from trirail.processes.warm_parent import UNTOLD, ChildProcess, WarmParent
 from trirail.wire import links
 
 SERVER = """
@@ -72,7 +72,7 @@ class Parent:
         self.heartbeats = Heartbeats.create()
         sockets = [listening.fileno() for listening in self.listening]
         self.children: list[ChildProcess] = []
-        self.warm = WarmParent(Order(load(SIM), None), folder, self.heartbeats, sockets)
+        self.warm = ForkServerLink(Order(load(SIM), None), folder, self.heartbeats, sockets)
 
     def child(self, name: str, record: str | None = None) -> ChildProcess:
         self.children.append(ChildProcess(self.warm, name, record))
@@ -100,7 +100,7 @@ class Parent:
 @pytest.fixture
 def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parent]:
     (tmp_path / "kept").touch()
-    monkeypatch.setattr(warm_parent, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
+    monkeypatch.setattr(forked_processes, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
     made = Parent(tmp_path)
     try:
         yield made

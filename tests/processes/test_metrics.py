@@ -23,6 +23,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from trirail.config import SIM, Config
 from trirail.errors import ServiceError
+from trirail.processes.child_process import MEASURED
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.metrics import ServiceMetrics
 from trirail.processes.metrics_server import MetricsServer
@@ -38,7 +39,6 @@ from trirail.processes.monitoring import (
     Running,
     ServiceMeasured,
 )
-from trirail.processes.process import MEASURED
 from trirail.processes.publications import StateMaker
 from trirail.processes.zenoh_links import InUse
 from trirail.telemetry.sinks import free_port

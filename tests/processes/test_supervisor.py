@@ -11,7 +11,7 @@ from msgspec import structs
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.kinematics.compiled import FUNCTIONS
-from trirail.processes import supervisor, warm_parent
+from trirail.processes import forked_processes, supervisor
 
 pytestmark = pytest.mark.long
 
@@ -61,7 +61,7 @@ SERVING = "ready(); beat_until(lambda: heartbeats.of('loop').count); beat_until(
 @pytest.fixture
 def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the supervisor says. Its children do what is written in files of their name and number."""
-    monkeypatch.setattr(warm_parent, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
+    monkeypatch.setattr(forked_processes, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
     monkeypatch.setattr(supervisor, "END_WITHIN", 0.5)
     return []
 

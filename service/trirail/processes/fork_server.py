@@ -1,4 +1,4 @@
-"""The warm parent: imports what the service's processes need, once, and forks them from itself.
+"""The fork server: imports what the service's processes need, once, and forks them from itself.
 
 It is forked itself, from the supervisor before that has a thread, so that what both need is in memory once. On its
 control, a SEQPACKET socket, it takes requests to fork (`Fork`, with the descriptor on which the child speaks) and says
@@ -25,8 +25,8 @@ import msgspec
 from msgspec import structs
 
 from trirail.processes import compiling
+from trirail.processes.child_process import Child, Order, run
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.process import Child, Order, run
 from trirail.processes.realtime import die_with_parent, name_process
 from trirail.wire.decoding import decoded, prepare
 

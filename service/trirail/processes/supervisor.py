@@ -13,14 +13,14 @@ from typing import Any
 
 from trirail.config import Config
 from trirail.errors import ServiceError
+from trirail.processes.child_process import Order
 from trirail.processes.compiling import Progress
+from trirail.processes.forked_processes import ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
 from trirail.processes.monitoring import LEAST_CYCLES, Health, Running, metrics_server
 from trirail.processes.operating_system import Signals, Watchdog, notify
-from trirail.processes.process import Order
 from trirail.processes.realtime import give_back
 from trirail.processes.sockets import raise_descriptor_limit
-from trirail.processes.warm_parent import ChildProcess, WarmParent
 from trirail.wire import links
 from trirail.wire.messages import Event, Level
 
@@ -108,7 +108,7 @@ class Supervisor:
             self._listening = [links.listen(Path(folder, name)) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
             sockets = [listening.fileno() for listening in self._listening]
-            self._parent = WarmParent(self._order, Path(folder), self._heartbeats, sockets)
+            self._parent = ForkServerLink(self._order, Path(folder), self._heartbeats, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
                 with metrics_server(self._order.config, self._health):  # it may have a thread

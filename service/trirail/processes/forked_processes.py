@@ -16,9 +16,9 @@ from typing import Any
 
 import msgspec
 
+from trirail.processes.child_process import COMPILING, HAPPENED, MEASURED, Order
 from trirail.processes.fork_server import LARGEST, MATHEMATICS, OF_TERMINAL, Ended, Fork, Forked, Inheritance, fork
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.process import COMPILING, HAPPENED, MEASURED, Order
 from trirail.wire.decoding import converted, decoded, prepare
 from trirail.wire.messages import Event
 
@@ -51,7 +51,7 @@ class ServerProcess:
             os.kill(self._pid, signal.SIGKILL)
 
 
-class WarmParent:
+class ForkServerLink:
     """Starts the fork server, asks it for children, and hears how they end. Its process may have no other thread."""
 
     def __init__(self, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int]) -> None:
@@ -139,7 +139,7 @@ class WarmParent:
 class ForkedProcess:
     """A child of the fork server: what Popen is for one's own child."""
 
-    def __init__(self, parent: WarmParent, name: str) -> None:
+    def __init__(self, parent: ForkServerLink, name: str) -> None:
         self.name = name
         self._parent = parent
         self._pidfd: int | None = None
@@ -211,7 +211,7 @@ def hung(silent: float) -> str:
 class ChildProcess:
     """A child process, and a pipe on which it says that it is ready and whose end is its end."""
 
-    def __init__(self, parent: WarmParent, name: str, record: str | None) -> None:
+    def __init__(self, parent: ForkServerLink, name: str, record: str | None) -> None:
         self.name = name
         self.began = time.monotonic()
         self.compiling: list[str] = []
