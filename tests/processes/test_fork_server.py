@@ -82,7 +82,7 @@ class Parent:
         """Wait until a child is up, and return what it said."""
         watched: list[Any] = [child.pipe, self.warm]
         deadline = time.monotonic() + WITHIN
-        while child.ready_with is None or child.process.pid is None:
+        while child.ready_with is None or child.pid is None:
             heard, _, _ = select.select(watched, [], [], deadline - time.monotonic())
             assert heard
             self.warm.hear()
@@ -93,7 +93,7 @@ class Parent:
 
     def until_over(self, child: ChildProcess) -> str:
         """Wait until a child has ended, and return how."""
-        assert child.process.wait(time.monotonic() + WITHIN)
+        assert child.wait(time.monotonic() + WITHIN)
         return child.how
 
 
@@ -147,26 +147,26 @@ def test_how_a_child_ends_is_told_and_another_takes_its_place(does: str, how: st
     (parent.folder / "gateway").unlink()
     second = parent.child("gateway")
     parent.until_said(second)
-    assert second.process.pid != first.process.pid
+    assert second.pid != first.pid
 
 
 def test_a_signal_that_comes_before_a_child_handles_it_is_not_lost(parent: Parent) -> None:
     child = parent.child("gateway")
-    while child.process.pid is None:
+    while child.pid is None:
         select.select([parent.warm], [], [], WITHIN)
         parent.warm.hear()
-    child.process.send_signal(signal.SIGTERM)
+    child.send_signal(signal.SIGTERM)
     assert parent.until_over(child) == "killed by SIGTERM"
 
 
 def test_a_child_that_has_not_been_forked_can_be_killed(parent: Parent) -> None:
     child = parent.child("loop")
-    child.process.kill()
-    assert child.process.wait(time.monotonic())
-    assert child.process.returncode == 0
+    child.kill()
+    assert child.wait(time.monotonic())
+    assert child.returncode == 0
     other = parent.child("gateway")
     parent.until_said(other)  # so the loop has been forked, and been killed
-    assert child.process.pid is not None
+    assert child.pid is not None
 
 
 def test_what_is_not_kept_is_compiled_by_a_child_before_who_needs_it_is_forked(parent: Parent) -> None:
@@ -202,8 +202,8 @@ def test_a_compiler_that_dies_is_the_end_of_who_needs_it(parent: Parent) -> None
 def test_loop_drives_and_planner_end_with_their_parent(name: str, parent: Parent) -> None:
     child = parent.child(name)
     parent.until_said(child)
-    assert child.process.pid is not None
-    pidfd = os.pidfd_open(child.process.pid)
+    assert child.pid is not None
+    pidfd = os.pidfd_open(child.pid)
     parent.warm.close()
     ended, _, _ = select.select([pidfd], [], [], WITHIN)
     os.close(pidfd)
@@ -217,7 +217,7 @@ def test_a_dead_parent_is_told_and_so_are_its_children(parent: Parent) -> None:
     assert parent.until_over(child) == "its parent does not say how"
     assert parent.warm.gone
     assert parent.warm.how() == "killed by SIGKILL"
-    assert parent.child("gateway").process.returncode == UNTOLD
+    assert parent.child("gateway").returncode == UNTOLD
 
 
 def test_how_a_child_ended_is_told_also_where_its_parent_is_importing(parent: Parent) -> None:
@@ -237,5 +237,5 @@ def test_a_frozen_parent_is_waited_for_once(parent: Parent) -> None:
     assert parent.until_over(children[0]) == "its parent does not say how"
     assert parent.warm.tells_within == 0.0
     for child in children[1:]:
-        child.process.kill()
+        child.kill()
         assert parent.until_over(child) == "its parent does not say how"

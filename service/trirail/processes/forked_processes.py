@@ -62,7 +62,7 @@ class ForkServerLink:
         with theirs:
             self._process = ServerProcess(Inheritance(theirs, order, runtime, heartbeats, sockets))
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        self._asked: dict[int, ForkedProcess] = {}
+        self._asked: dict[int, ChildProcess] = {}
         self._numbers = 0
         self._hung_for = 0.0
         self.tells_within = IMPORTS_WITHIN
@@ -74,15 +74,14 @@ class ForkServerLink:
         """For select and its like."""
         return self._control.fileno()
 
-    def fork(self, name: str, record: str | None, voice: int) -> ForkedProcess:
+    def fork(self, child: ChildProcess, record: str | None, voice: int) -> None:
         """Ask for a child that speaks on the descriptor `voice`."""
         self._numbers += 1
-        process = self._asked[self._numbers] = ForkedProcess(self, name)
+        self._asked[self._numbers] = child
         try:
-            socket.send_fds(self._control, [msgspec.json.encode(Fork(self._numbers, name, record))], [voice])
+            socket.send_fds(self._control, [msgspec.json.encode(Fork(self._numbers, child.name, record))], [voice])
         except OSError:
             self._lost()
-        return process
 
     def hear(self) -> None:
         """Take what it says, or that it has ended, if there is something."""
@@ -97,12 +96,12 @@ class ForkServerLink:
             return
         said: Forked | Ended = decoded(packet, Forked | Ended)
         if isinstance(said, Forked):
-            process = self._asked[said.number]
-            process.begun(said.pid, *descriptors)
-            if process.name in MATHEMATICS:
+            child = self._asked[said.number]
+            child.forked(said.pid, *descriptors)
+            if child.name in MATHEMATICS:
                 self.tells_within = TELLS_WITHIN
         else:
-            self._asked.pop(said.number).over(said.code)
+            self._asked.pop(said.number).ended(said.code)
 
     def speaks(self) -> bool:
         """Wait until it says something; False where it does not, and then it is not waited for again."""
@@ -112,8 +111,7 @@ class ForkServerLink:
 
     def how(self) -> str:
         """How it ended, for people."""
-        code = self._process.wait()
-        return hung(self._hung_for) if self._hung_for and code == -signal.SIGKILL else how_ended(code)
+        return how_ended(self._process.wait(), self._hung_for)
 
     def kill(self) -> None:
         """Kill it: the loop, if there is one, stops the robot and ends."""
@@ -132,14 +130,14 @@ class ForkServerLink:
 
     def _lost(self) -> None:
         self.gone = True
-        for process in self._asked.values():
-            process.orphaned()
+        for child in self._asked.values():
+            child.orphaned()
 
 
-class ForkedProcess:
-    """A child of the fork server: what Popen is for one's own child."""
+class ChildProcess:
+    """A child of the fork server, as Popen has one's own; and a pipe on which it speaks and whose end is its end."""
 
-    def __init__(self, parent: ForkServerLink, name: str) -> None:
+    def __init__(self, parent: ForkServerLink, name: str, record: str | None) -> None:
         self.name = name
         self._parent = parent
         self._pidfd: int | None = None
@@ -149,14 +147,25 @@ class ForkedProcess:
         """None before it has been forked."""
         self.returncode: int | None = None
         """None before its end; as Popen has it."""
+        self.began = time.monotonic()
+        self.compiling: list[str] = []
+        self.happened: list[Event] = []
+        self.measured: list[dict[str, Any]] = []
+        self._begun_line = b""
+        self.ready_with: dict[str, Any] | None = None
+        self._hung_for = 0.0
+        self.pipe, write = os.pipe()
+        os.set_blocking(self.pipe, False)
+        parent.fork(self, record, write)
+        os.close(write)
 
-    def begun(self, pid: int, pidfd: int) -> None:
+    def forked(self, pid: int, pidfd: int) -> None:
         """It has been forked."""
         self.pid, self._pidfd = pid, pidfd
         if self._killed:
             self.send_signal(signal.SIGKILL)
 
-    def over(self, code: int) -> None:
+    def ended(self, code: int) -> None:
         """It has ended."""
         self.returncode = code
         if self._pidfd is not None:
@@ -166,7 +175,7 @@ class ForkedProcess:
     def orphaned(self) -> None:
         """Its parent has ended before it, and nobody will tell how it does."""
         if self.pid is None and self.returncode is None:
-            self.over(UNTOLD)
+            self.ended(UNTOLD)
 
     def send_signal(self, number: int) -> None:
         """Send a signal."""
@@ -192,38 +201,8 @@ class ForkedProcess:
             if self._parent.fileno() in ready:
                 self._parent.hear()
             elif self._parent.gone or not self._parent.speaks():
-                self.over(UNTOLD)  # it has ended, and its parent does not say how
+                self.ended(UNTOLD)  # it has ended, and its parent does not say how
         return True
-
-
-def how_ended(code: int) -> str:
-    """Return how a process ended, for people, by its exit code as Popen has it."""
-    if code == UNTOLD:
-        return "its parent does not say how"
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-
-
-def hung(silent: float) -> str:
-    """Return how a process ended that had given no sign of life for so long [s], for people."""
-    return f"no sign of life for {silent:g} s, so it was killed"
-
-
-class ChildProcess:
-    """A child process, and a pipe on which it says that it is ready and whose end is its end."""
-
-    def __init__(self, parent: ForkServerLink, name: str, record: str | None) -> None:
-        self.name = name
-        self.began = time.monotonic()
-        self.compiling: list[str] = []
-        self.happened: list[Event] = []
-        self.measured: list[dict[str, Any]] = []
-        self._begun_line = b""
-        self.ready_with: dict[str, Any] | None = None
-        self._hung_for = 0.0
-        self.pipe, write = os.pipe()
-        os.set_blocking(self.pipe, False)
-        self.process = parent.fork(name, record, write)
-        os.close(write)
 
     def listen(self) -> bool:
         """Read what the child says; False once it has ended."""
@@ -247,12 +226,23 @@ class ChildProcess:
     def kill_hung(self, silent: float) -> None:
         """Kill it for having given no sign of life for so long [s]; SIGTERM would wait, if it is stopped."""
         self._hung_for = silent
-        self.process.kill()
+        self.kill()
 
     @property
     def how(self) -> str:
         """How it ended, for people."""
-        code = self.process.returncode
-        if self._hung_for and code == -signal.SIGKILL:
-            return hung(self._hung_for)
-        return how_ended(code) if code else "another process sent it SIGTERM"
+        code = self.returncode
+        return how_ended(code, self._hung_for) if code else "another process sent it SIGTERM"
+
+
+def how_ended(code: int, hung_for: float) -> str:
+    """Return how a process ended, for people.
+
+    `code` is its exit code as Popen has it; `hung_for` how long it had given no sign of life when it was killed for
+    that, 0 where it was not [s].
+    """
+    if hung_for and code == -signal.SIGKILL:
+        return f"no sign of life for {hung_for:g} s, so it was killed"
+    if code == UNTOLD:
+        return "its parent does not say how"
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

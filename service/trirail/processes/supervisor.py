@@ -180,34 +180,34 @@ class Supervisor:
         self._next_turn = now + TURN
         for child in self._children.values():
             if child.ready_with is None and now - max(child.began, self._went_on) > START_WITHIN:
-                if child.process.pid is None:
+                if child.pid is None:
                     self._parent.kill()
                 child.kill_hung(START_WITHIN)
-            elif self._up and child.process.pid is None and now - child.began > FORKS_WITHIN:
+            elif self._up and child.pid is None and now - child.began > FORKS_WITHIN:
                 self._parent.kill_hung(FORKS_WITHIN)
         self._health.poll({name: self._running(name) for name in self._names})
         for name, watch in self._watches.items():
             watched = self._children.get(name)
-            if watched is not None and watched.process.pid is not None and watch.hangs(watched.process.pid):
+            if watched is not None and watched.pid is not None and watch.hangs(watched.pid):
                 watched.kill_hung(self._patience[name])
 
     def _running(self, name: str) -> Running:
         child, restarts = self._children.get(name), self._started[name] - 1
         if child is None:
             return Running(None, ready=False, restarts=restarts)
-        return Running(child.process.pid, child.ready_with is not None, restarts)
+        return Running(child.pid, child.ready_with is not None, restarts)
 
     def _on_end(self, child: ChildProcess) -> None:
         """Decide what the end of a process means."""
         self._forget(child)
-        child.process.wait(time.monotonic() + END_WITHIN)
+        child.wait(time.monotonic() + END_WITHIN)
         if child.name != "loop" and self._loop_is_ending():
             return  # so it has ended as well, as it should
-        said_why = child.process.returncode == os.EX_CONFIG
+        said_why = child.returncode == os.EX_CONFIG
         name, restarts = child.name, self._restarts[child.name]
         if name == "loop":
             self._turned = child.ready_with is not None
-            if child.process.returncode == 0:
+            if child.returncode == 0:
                 consequence = "it has stopped the robot and disabled the drives"
             elif self._turned:
                 consequence = "the drives stop by their own watchdogs"
@@ -219,7 +219,7 @@ class Supervisor:
             self._fail("" if said_why else f"the {name} could not start ({child.how})")
             return
         if name == "drives":
-            if child.process.returncode:  # else the loop has let go of them, and its own end is what is told
+            if child.returncode:  # else the loop has let go of them, and its own end is what is told
                 self._say(f"the simulated drives have died ({child.how}): {CONSEQUENCES[name]}", "error")
             return
         now = time.monotonic()
@@ -278,11 +278,11 @@ class Supervisor:
         notify("STOPPING=1")
         self._health.end({name: self._running(name) for name in self._names})
         for child in self._children.values():
-            if child.process.pid is None:
-                child.process.kill()
+            if child.pid is None:
+                child.kill()
         if loop := self._children.get("loop"):
-            loop.process.send_signal(signal.SIGTERM)
-            if not loop.process.wait(time.monotonic() + END_WITHIN):
+            loop.send_signal(signal.SIGTERM)
+            if not loop.wait(time.monotonic() + END_WITHIN):
                 self._kill_unwilling(loop)
             self._turned = self._turned or loop.ready_with is not None
         for name in ("planner", "drives"):  # they keep nothing, and may be frozen or in their start
@@ -294,14 +294,14 @@ class Supervisor:
         by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)
         asked = by_itself + END_WITHIN
         for child in list(self._children.values()):
-            if not child.process.wait(by_itself):
-                child.process.send_signal(signal.SIGTERM)
+            if not child.wait(by_itself):
+                child.send_signal(signal.SIGTERM)
         for child in list(self._children.values()):
-            if not child.process.wait(asked):
+            if not child.wait(asked):
                 self._kill_unwilling(child)
                 self._failed = True
             # In a start that is interrupted, the SIGTERM may come before they have said what it is to do.
-            self._failed = self._failed or (self._turned and child.process.returncode != 0)
+            self._failed = self._failed or (self._turned and child.returncode != 0)
             self._forget(child)
 
     def _kill_unwilling(self, child: ChildProcess) -> None:
@@ -309,8 +309,8 @@ class Supervisor:
         self._kill(child)
 
     def _kill(self, child: ChildProcess) -> None:
-        child.process.kill()
-        child.process.wait(time.monotonic() + END_WITHIN)
+        child.kill()
+        child.wait(time.monotonic() + END_WITHIN)
 
 
 def _runtime_folder() -> tempfile.TemporaryDirectory[str]:
