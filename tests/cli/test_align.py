@@ -85,11 +85,17 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     [
         ("echo nonsense", "wanted is"),
         ("true", "has ended with exit code 0"),
+        ("sleep 60", "no line in 0.05 s: does it flush what it prints"),
         ("/no/such/program", "cannot run"),
         ("""echo '{"left": [1, "a"]}'""", "wanted is"),
     ],
 )
-def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(program: str, words: str) -> None:
+def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(
+    program: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if program.startswith("sleep"):
+        monkeypatch.setattr(mark_source, "NEWER_WITHIN", 0.05)
+
     def look() -> None:
         with mark_source.program(program) as (ask, _):
             ask()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import select
 import shlex
 import subprocess
 import time
@@ -26,7 +27,7 @@ LINE = dict[str, tuple[float, float]]
 prepare(LINE)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 NEWER_WITHIN, WRITTEN_WITHIN, POLL = 30.0, 1.0, 0.02
-"""How long newer pictures are waited for, how long one may take to be written, and how often it is looked [s]."""
+"""How long a line or newer pictures are waited for, how long one may take to be written, how often it is looked [s]."""
 ENDS_WITHIN = 5.0
 """How long a program may take to end when it is told to [s]."""
 INSTALL = "pip install 'trirail[vision]'"
@@ -59,7 +60,7 @@ class Source(NamedTuple):
 def program(command: str) -> Iterator[Source]:
     """Run a program that prints a line of JSON, {"mark": [u, v], …} [pixel], for each line that it reads.
 
-    Raises TrirailError where it cannot be run, ends, or prints something else.
+    Raises TrirailError where it cannot be run, ends, or prints something else, or nothing within NEWER_WITHIN seconds.
     """
     try:
         # In a group of its own: Ctrl-C is for this program, which ends that one.
@@ -74,6 +75,8 @@ def program(command: str) -> Iterator[Source]:
         with contextlib.suppress(BrokenPipeError):  # it has ended, and may have said something before
             stdin.write("look\n")
             stdin.flush()
+        if not select.select([stdout], [], [], NEWER_WITHIN)[0]:
+            raise TrirailError(f"{command!r} has printed no line in {NEWER_WITHIN:g} s: does it flush what it prints?")
         line = stdout.readline()
         if not line:
             code = process.wait(ENDS_WITHIN)
