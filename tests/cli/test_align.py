@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import queue
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -83,11 +85,17 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     [
         ("echo nonsense", "wanted is"),
         ("true", "has ended with exit code 0"),
+        ("sleep 60", "no line in 0.05 s: does it flush what it prints"),
         ("/no/such/program", "cannot run"),
         ("""echo '{"left": [1, "a"]}'""", "wanted is"),
     ],
 )
-def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(program: str, words: str) -> None:
+def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(
+    program: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if program.startswith("sleep"):
+        monkeypatch.setattr(mark_source, "NEWER_WITHIN", 0.05)
+
     def look() -> None:
         with mark_source.program(program) as (ask, _):
             ask()
@@ -96,21 +104,55 @@ def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(program: str
         look()
 
 
-def test_marks_of_pictures_are_found_and_older_pictures_are_not_taken(
+def test_marks_of_pictures_are_of_those_that_were_written_since_they_were_asked_for(tmp_path: Path) -> None:
+    """What takes the pictures goes on while the robot moves: one of them was there before the look, and is too old."""
+    cv2 = pytest.importorskip("cv2")
+    moved, ended = threading.Event(), threading.Event()
+    taken: queue.SimpleQueue[float] = queue.SimpleQueue()
+    standing = threading.Lock()
+
+    def take_pictures() -> None:
+        while not ended.is_set():
+            with standing:
+                x = 1e-4 if moved.is_set() else 0.0
+                cv2.imwrite(str(tmp_path / ".left.png"), drawn({"m": (0.0, 0.0)}, (x, 0.0, 0.0)))
+                (tmp_path / ".left.png").rename(tmp_path / "left.png")
+            taken.put(x)
+
+    camera = threading.Thread(target=take_pictures)
+    camera.start()
+    try:
+        taken.get(timeout=WITHIN)
+        with mark_source.folder(tmp_path, MarkShape("disc", 40.0), 0.0) as (look, _):
+            assert look() == {"left": pytest.approx((160.0, 120.0), abs=0.05)}
+            while not taken.empty():
+                taken.get()
+            taken.get(timeout=WITHIN)  # newer than that look, and the robot has not moved yet
+            with standing:
+                moved.set()
+            assert look() == {"left": pytest.approx((185.0, 120.0), abs=0.05)}
+    finally:
+        ended.set()
+        camera.join()
+
+
+def test_pictures_that_are_not_taken_anew_or_are_none_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cv2 = pytest.importorskip("cv2")
     monkeypatch.setattr(mark_source, "NEWER_WITHIN", 0.1)
-    view = CameraView((0.0, 0.0), (160.0, 120.0), ((2.5e5, 0.0), (0.0, -2.5e5)))
-    camera = SimulatedCamera(view, {"m": DrawnMark(MarkShape("cross", 200e-6), (1e-4, 0.0))}, 320, 240, noise=1.0)
-    picture = camera.picture(lambda _: (0.0, 0.0, 0.0), 0.0, np.random.default_rng(0))
-    cv2.imwrite(str(tmp_path / "left.png"), picture)
+    monkeypatch.setattr(mark_source, "WRITTEN_WITHIN", 0.1)
+    cv2.imwrite(str(tmp_path / "left.png"), np.full((240, 320), 90, np.uint8))
     with mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _):
-        assert look() == {"left": pytest.approx((185.0, 120.0), abs=0.05)}
+        assert look() == {}
         with pytest.raises(TrirailError, match="no newer pictures"):
             look()
-        cv2.imwrite(str(tmp_path / "left.png"), np.full_like(picture, 90))
-        assert look() == {}
+    (tmp_path / "left.png").write_bytes(b"cut off")
+    with (
+        mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _),
+        pytest.raises(TrirailError, match=r"write it as \.left\.png and rename it"),
+    ):
+        look()
 
 
 def drawn(places: dict[str, Pair], pose: Triple = (0.0, 0.0, 0.0)) -> NDArray[np.uint8]:

@@ -143,6 +143,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         ("live_mb = 64", "live_mb = 0", "telemetry.live_mb = 0: expected float >= 1.0"),
         ("l0 = 0.3", "l0 = nan", "geometry.l0 = nan: it must be a finite number"),
         ("l0 = 0.3", "l0 = -0.3", "geometry.l0 = -0.3: expected float >= 0.001"),
+        ("l0 = 0.3", "l0 = '0.3'", "geometry.l0 = '0.3': expected float, got str"),
         ("l0 = 0.3", "", "give either l0 (the symmetric robot) or three [[geometry.leg]] tables"),
         (
             "following_error = 0.004",

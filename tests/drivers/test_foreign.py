@@ -144,10 +144,14 @@ def test_a_drive_that_is_set_up_is_only_read_and_nothing_is_ever_stored_in_it(cl
         assert again == ({0x1401, 0x1601} if name == "ros2_cia402_slave" else set()), "a mapping that it refuses"
 
 
-def test_the_table_of_objects_is_that_of_the_guide() -> None:
+def test_the_tables_of_objects_are_those_of_the_guide() -> None:
     guide = (Path(__file__).parents[2] / "drivers" / "README.md").read_text()
-    rows = re.findall(r"^\| ([0-9A-F]{4}(?::\d\d)?) \| (\w+) \| (.+?): (.+) \| (.+) \|$", guide, re.MULTILINE)
-    assert rows == [(key, use.need, use.name, use.purpose, use.without) for key, use in USES.items()]
+    for need in ("protection", "replaceable"):
+        table = guide.partition(f"| {need} | what for | without it |")[2].partition("\n\n")[0]
+        rows = re.findall(r"^\| ([0-9A-F]{4}(?::\d\d)?) (.+) \| (.+) \| (.+) \|$", table, re.MULTILINE)
+        assert rows == [(key, use.name, use.purpose, use.without) for key, use in USES.items() if use.need == need]
+    needed = guide.partition("- *Needed*")[2].partition("\n- ")[0]
+    assert set(re.findall(r"\b\d[0-9A-F]{3}\b", needed)) == {key for key, use in USES.items() if use.need == "needed"}
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from control.test_control import PERIOD, assert_within_limits
 from control_rig import CONFIG, ControlRig
@@ -57,6 +59,24 @@ def test_one_that_is_sent_in_motion_is_told_to_wait(rig: ControlRig) -> None:
     answer = refusal(rig.send("g2", TrajectoryGoal(points)))
     assert answer.code == "wrong_start"
     assert "the robot moves: send the trajectory when it stands" in answer.message
+
+
+@given(st.floats(0.03, 0.4), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3))
+def test_one_that_is_too_fast_is_accepted_in_the_time_that_its_refusal_names(
+    duration: float, x: float, y: float, phi: float
+) -> None:
+    rig = ControlRig()
+    rig.enable()
+
+    def within(seconds: float) -> TrajectoryGoal:
+        return TrajectoryGoal((TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(seconds, x, y, phi)))
+
+    answer = rig.send("g1", within(duration))
+    if isinstance(answer, Accepted):
+        return
+    named = re.search(r"let it take ([0-9.]+) s", refusal(answer).message)
+    assert named
+    assert isinstance(rig.send("g2", within(float(named[1]))), Accepted)
 
 
 SPEED = st.floats(-0.5, 0.5)

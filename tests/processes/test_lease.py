@@ -135,7 +135,8 @@ def test_it_is_taken_over_by_those_who_may_and_both_are_told(service: Service) -
         ]
 
 
-def test_from_the_command_line(service: Service) -> None:
+@pytest.mark.parametrize(("ending", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_from_the_command_line(service: Service, ending: signal.Signals, code: int) -> None:
     def call(*arguments: object) -> subprocess.CompletedProcess[str]:
         return trirail(*arguments, locator=service.locator)
 
@@ -150,8 +151,13 @@ def test_from_the_command_line(service: Service) -> None:
             assert call("enable").returncode == 0
             assert call("goto", 0.01, 0, 0, "--wait").returncode == 0
             assert "held by" in call("status").stdout
-            holder.send_signal(signal.SIGINT)
-            assert holder.wait(20) == 0
+            holder.send_signal(ending)
+            while ending == signal.SIGTERM and holder.poll() is None:  # again and again, into the way out
+                holder.send_signal(ending)
+                threading.Event().wait(0.001)
+            assert holder.wait(20) == code
+            assert holder.stderr is not None
+            assert holder.stderr.read() == ""
         finally:
             holder.kill()
     assert "held by" not in call("status").stdout

@@ -33,7 +33,7 @@ def calibrate(
     angle: notation.Angle = "1deg",
     one_camera: Annotated[bool, Flag] = False,
     lens: Literal["affine", "perspective", "radial"] = "affine",
-    centre: tuple[float, float] | None = None,
+    centre: Annotated[tuple[float, float] | None, Flag] = None,
     approach: notation.PoseWay = notation.AT_REST,
     source: MarkSource = PROGRAM,
     service: Service = HERE,
@@ -48,9 +48,9 @@ def calibrate(
     file
         Where to keep it.
     by
-        How far to move along x and y, each both ways.
+        How far to move along x and y, each both ways [m], or with a unit: 0.5mm.
     angle
-        How far to turn, both ways.
+        How far to turn, both ways [rad], or with a unit.
     one_camera
         The program's marks are all seen by one camera; else each has a camera, or a place of one, of its own.
     lens
@@ -58,7 +58,7 @@ def calibrate(
     centre
         Of a radial lens: the pixel U V on its axis, the middle of the picture for most.
     approach
-        How far beyond each place to go first, X Y PHI, so that backlash is always on the same side.
+        How far beyond each place to go first, X Y PHI [m, rad], so that backlash is always on the same side.
     """
     from trirail.alignment.procedure import calibration_by_moves, mean_look, moves_for
     from trirail.client import calibration_file
@@ -103,9 +103,9 @@ def run(
     file
         The calibration, from `trirail align calibrate`.
     tolerance
-        How far a mark may be from its target.
+        How far a mark may be from its target [m], or with a unit: 2um.
     angle
-        By what angle the part may be turned; 24 µrad are 5 arcsec.
+        By what angle the part may be turned [rad], or with a unit; 24 µrad are 5 arcsec.
     corrections
         How many may be made.
     distance_ppm

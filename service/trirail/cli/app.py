@@ -268,7 +268,8 @@ class Terminated(BaseException):
     """Somebody told this process to end: what a command holds is let go of on the way out, as at Ctrl-C."""
 
 
-def _terminated(_signal: int, _frame: FrameType | None) -> None:
+def _terminated(number: int, _frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)  # timeout(1) sends it twice, into the way out
     raise Terminated
 
 

@@ -34,7 +34,7 @@ def commission(
     out: Path | None = None,
     report: Path | None = None,
     yes: Annotated[bool, Flag] = False,
-    fault: Annotated[tuple[str, ...], Parameter(negative="", consume_multiple=False)] = (),
+    fault: Annotated[tuple[str, ...], Parameter(negative="", show_default=False, consume_multiple=False)] = (),
     json: Annotated[bool, Flag] = False,
 ) -> int:
     """Guide through the first hour with drives.

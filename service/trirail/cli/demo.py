@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
 from trirail.cli.config_commands import shipped_file
 from trirail.cli.terminal import out, percentiles, plain
@@ -116,12 +116,7 @@ def run_align(record: Path | None) -> int:
 
 
 def _tour(robot: Robot, stages: Sequence[Stage]) -> Iterator[_Row]:
-    columns = (
-        TextColumn("{task.description:28}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
+    columns = TextColumn("{task.description:28}"), MofNCompleteColumn(), TextColumn("{task.fields[note]}")
     with Progress(*columns, console=out) as progress:
         task = progress.add_task("the tour", total=len(stages), note="")
         for number, stage in enumerate(stages, 1):
@@ -133,7 +128,7 @@ def _tour(robot: Robot, stages: Sequence[Stage]) -> Iterator[_Row]:
             else:
                 for state in robot.states(2.0):
                     x, y, phi = state.pose
-                    pose = f"x {x * 1e3:9.4f} mm  y {y * 1e3:9.4f} mm  φ {math.degrees(phi):9.4f}°"
+                    pose = f"x {x * 1e3:8.3f} mm  y {y * 1e3:8.3f} mm  φ {math.degrees(phi):8.3f}°"
                     progress.update(task, description=stage.name, note=pose)
                     if goal.result or time.monotonic() - began > GOAL_WITHIN:
                         break

@@ -21,7 +21,12 @@ Folder = Annotated[Path, Parameter(name="--folder")]
 Days = Annotated[float, Parameter(validator=lambda _kind, days: _check_days(days))]
 Addresses = Annotated[
     tuple[str, ...],
-    Parameter(consume_multiple=True, negative="", validator=lambda _kind, addresses: _check_hosts(addresses)),
+    Parameter(
+        consume_multiple=True,
+        negative="",
+        show_default=False,
+        validator=lambda _kind, addresses: _check_hosts(addresses),
+    ),
 ]
 HERE = Path("keys")
 LOCAL = ("localhost", "127.0.0.1", "::1")

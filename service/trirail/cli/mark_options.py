@@ -24,9 +24,9 @@ class MarkSource:
     'A program that prints a line of JSON, {"mark": [u, v], …} in pixels, for each line that it reads.'
     pictures: Path | None = None
     "A folder with the newest picture for each mark, as left.png."
-    camera: Annotated[tuple[str, ...], Parameter(negative="")] = ()
+    camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     "MARK=DEVICE, a camera's number or address for OpenCV, as left=0; again for another mark."
-    window: Annotated[tuple[str, ...], Parameter(negative="")] = ()
+    window: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """MARK=U,V,WIDTH,HEIGHT, the part of its picture in which a mark is, in pixels, where one picture shows several;
     with --pictures as MARK=PICTURE:U,V,WIDTH,HEIGHT."""
     shape: Literal["cross", "disc", "corner"] = "cross"

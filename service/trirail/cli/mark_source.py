@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import select
 import shlex
 import subprocess
 import time
@@ -25,8 +26,8 @@ Look = Callable[[], "Marks"]
 LINE = dict[str, tuple[float, float]]
 prepare(LINE)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
-NEWER_WITHIN, POLL = 30.0, 0.02
-"""How long newer pictures are waited for, and how often it is looked [s]."""
+NEWER_WITHIN, WRITTEN_WITHIN, POLL = 30.0, 1.0, 0.02
+"""How long a line or newer pictures are waited for, how long one may take to be written, how often it is looked [s]."""
 ENDS_WITHIN = 5.0
 """How long a program may take to end when it is told to [s]."""
 INSTALL = "pip install 'trirail[vision]'"
@@ -59,7 +60,7 @@ class Source(NamedTuple):
 def program(command: str) -> Iterator[Source]:
     """Run a program that prints a line of JSON, {"mark": [u, v], …} [pixel], for each line that it reads.
 
-    Raises TrirailError where it cannot be run, ends, or prints something else.
+    Raises TrirailError where it cannot be run, ends, or prints something else, or nothing within NEWER_WITHIN seconds.
     """
     try:
         # In a group of its own: Ctrl-C is for this program, which ends that one.
@@ -74,6 +75,8 @@ def program(command: str) -> Iterator[Source]:
         with contextlib.suppress(BrokenPipeError):  # it has ended, and may have said something before
             stdin.write("look\n")
             stdin.flush()
+        if not select.select([stdout], [], [], NEWER_WITHIN)[0]:
+            raise TrirailError(f"{command!r} has printed no line in {NEWER_WITHIN:g} s: does it flush what it prints?")
         line = stdout.readline()
         if not line:
             code = process.wait(ENDS_WITHIN)
@@ -105,22 +108,23 @@ def folder(
     """Find marks in the newest pictures of a folder: of each mark the picture named after it, as left.png.
 
     With `windows` each of their marks is found there instead. What takes the pictures replaces them: each look but the
-    first waits until all are newer than at the one before. Raises TrirailError, also where none comes within
-    NEWER_WITHIN seconds.
+    first waits until all have been written anew since it was asked for, as the one from before may show the robot in
+    motion. Raises TrirailError, also where none comes within NEWER_WITHIN seconds.
     """
     cv2 = _opencv()
     if not path.is_dir():
         raise TrirailError(f"{path}: no folder; one is wanted with a picture for each mark, as left.png")
 
-    seen: dict[Path, int] = {}
+    used: set[Path] = set()
 
     def look() -> Marks:
         deadline = time.monotonic() + NEWER_WITHIN
-        while seen and any(each.exists() and each.stat().st_mtime_ns <= at for each, at in seen.items()):
+        asked = {each: _written(each) for each in used}
+        while any(_written(each) <= at for each, at in asked.items()):
             if time.monotonic() > deadline:
                 raise TrirailError(f"{path}: no newer pictures within {NEWER_WITHIN:g} s: does what takes them run?")
             time.sleep(POLL)
-        pictures = {each.stem: each for each in sorted(path.iterdir()) if each.suffix.lower() in PICTURES}
+        pictures = {each.stem: each for each in sorted(path.glob("[!.]*")) if each.suffix.lower() in PICTURES}
         if not pictures:
             raise TrirailError(f"{path}: no picture in it; wanted is one for each mark, as left.png")
         wanted = windows or {name: MarkWindow(name) for name in pictures}
@@ -130,10 +134,12 @@ def folder(
                 raise TrirailError(
                     f"{path}: no picture {window.picture} for mark {name}; there are {', '.join(pictures)}"
                 )
-            grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-            if grey is None:
-                raise TrirailError(f"{file}: no picture that OpenCV reads; is it written while it is read?")
-            seen[file] = file.stat().st_mtime_ns
+            whole_by = time.monotonic() + WRITTEN_WITHIN
+            while (grey := cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) is None:
+                if time.monotonic() > whole_by:
+                    raise TrirailError(f"{file}: no picture that OpenCV reads; write it as .{file.name} and rename it")
+                time.sleep(POLL)
+            used.add(file)
             marks.update(_marks(name, grey, window, shape, turn))
         return marks
 
@@ -195,6 +201,14 @@ def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.mon
         capture.grab()
     read, frame = capture.read()
     return frame if read else None
+
+
+def _written(file: Path) -> int:
+    """Return when a file was last written [ns]; 0 where it is not there."""
+    try:
+        return file.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _marks(name: str, grey: Any, window: MarkWindow, shape: MarkShape, turn: float) -> dict[str, tuple[float, float]]:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from trirail.client.client import Robot
 
-Flag = Parameter(negative="")
+Flag = Parameter(negative="", show_default=False)
 """An option without a value, that has no opposite."""
 
 

@@ -14,7 +14,7 @@ from trirail.cli.robot_commands import show
 def panel(
     *,
     port: int | None = None,
-    open_: Annotated[bool, Parameter(name="--open", negative="")] = False,
+    open_: Annotated[bool, Parameter(name="--open", negative="", show_default=False)] = False,
     service: Service = HERE,
 ) -> int:
     """Serve the operator's page to browsers on this machine.

@@ -156,7 +156,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
         TaskProgressColumn(),
         TextColumn("{task.fields[left]}"),
     )
-    with Progress(*columns, console=out, transient=True, disable=not show) as progress:
+    with Progress(*columns, console=out, transient=True, disable=not (show and out.is_terminal)) as progress:
         task = progress.add_task(plain(title) + notes(goal.reply), total=1.0, left="")
 
         def until_its_end() -> Result:

@@ -119,7 +119,7 @@ def _explained(error: str, raw: dict[str, Any], kind: Any) -> tuple[Place, str]:
         enum = _type_at(place, kind)
         values = [str(each) for each in enum] if enum is Role else get_args(enum)
         return place, f"{said}: allowed are {', '.join(map(repr, values))}"
-    return place, f"{said}: {what[0].lower()}{what[1:].replace('`', '')}"
+    return place, f"{said}: {what[0].lower()}{what[1:].replace('`', '').replace(' | null', '')}"  # TOML has no null
 
 
 def _repair(place: Place, tables: Any) -> None:

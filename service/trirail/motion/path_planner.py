@@ -199,15 +199,16 @@ class PathPlanner:
         slower = excess(worst)
         if slower <= 1.0:
             return Plan(path)
+        path, slower = self._slowed(path, slower, start.pose)
         if not stretch:
             raise RefusedError(
                 RefusalCode.TOO_FAST,
                 f"the trajectory is {slower:.3g} times too fast for {fastest(worst)}: "
-                f'let it take {slower * path.duration:.3g} s, or send it with "stretch": true',
+                f"let it take {math.ceil(1e3 * path.duration) / 1e3:.10g} s, "
+                'or send it with "stretch": true, trirail follow --stretch',
                 value=slower,
                 limit=1.0,
             )
-        path, slower = self._slowed(path, slower, start.pose)
         return Plan(path, slower)
 
     def to_velocity(self, start: MotionState, velocity: Sequence[float]) -> Path:
