@@ -69,6 +69,8 @@ class Service:
             "missed_positions = 100 ": "missed_positions = 1000 ",
             "heartbeat = 0.1": "heartbeat = 1.0",
             "gateway_timeout = 0.3": "gateway_timeout = 1.0",
+            "\nfollowing_error = 0.004": "\nfollowing_error = 0.3",
+            "\nfollowing_error = 0.005": "\nfollowing_error = 0.4",
             'directory = "recordings"': f'directory = "{folder}/recordings"',
             **changes,
         }.items():
