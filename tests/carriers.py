@@ -77,7 +77,7 @@ class FarEnd:
 
     def __init__(self, carrier: socket.socket) -> None:
         self.socket = carrier
-        self.socket.settimeout(5.0)
+        self.socket.settimeout(60.0)
 
     def send(self, identifier: int, data: bytes = b"", length: int | None = None) -> None:
         """Put a frame on the bus; `identifier` with its flags."""

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import msgspec
 from control_rig import CONFIG
+from ports import free_port
 from trirail.cli.key_folder import AUTHORITY_KEY, KeyFolder
 from trirail.config import Config, Tls, Zenoh
-from trirail.telemetry.sinks import free_port
 from trirail.wire.certificates import Pair, authority, issue
 from trirail.wire.stop_protocol import stop_address
 from trirail.wire.vocabulary import Role

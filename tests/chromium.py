@@ -18,11 +18,11 @@ from typing import Any
 
 import pytest
 from PIL import Image
+from waiting import WITHIN
 
 FLAGS = ["--headless=new", "--no-sandbox", "--window-size=1280,800", "--remote-debugging-pipe"]
 # The web viewer needs WebGL: Mesa's software renderer through ANGLE does without a graphics card.
 WEBGL = ["--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
-WITHIN = 20.0
 KEYS = {"Enter": "\r", "Space": " "}
 needs_chromium = pytest.mark.skipif(
     shutil.which("chromium") is None, reason="no chromium: make ci-packages installs it on Debian"
@@ -222,4 +222,4 @@ def chromium(program: str, profile: Path, flags: Sequence[str] = WEBGL) -> Itera
             yield Page(Pipe(to_browser, from_browser))
     finally:
         browser.terminate()
-        browser.wait(20)
+        browser.wait(WITHIN)

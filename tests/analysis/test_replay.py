@@ -72,7 +72,7 @@ def session(folder: Path) -> Path:
             for _ in range(STEPS):
                 with contextlib.suppress(RefusedError):
                     act(robot, choice)
-                for _, _ in zip(range(choice.randrange(12)), robot.states(5.0), strict=False):
+                for _, _ in zip(range(choice.randrange(12)), robot.states(60.0), strict=False):
                     pass  # some 20 ms for each state
             then()
         while True:  # the drives take their time to stand
@@ -131,7 +131,7 @@ def test_a_corrected_session_comes_out_the_same_without_the_maps_file(tmp_path: 
         assert robot.info().correction is not None
         robot.enable()
         for x in (0.03, -0.02, 0.01):
-            assert robot.move_to(x=x, y=-x, phi=x).wait(20.0).outcome == "done"
+            assert robot.move_to(x=x, y=-x, phi=x).wait(60.0).outcome == "done"
         until(robot, lambda state: state.pose == pytest.approx((0.01, -0.01, 0.01), abs=1e-4))
         assert own_service.end(service) == 0
     (tmp_path / "as_built.toml").unlink()

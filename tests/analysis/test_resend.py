@@ -21,6 +21,7 @@ from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Stop
+from waiting import WITHIN, wait_until
 
 
 class Heard:
@@ -65,7 +66,7 @@ class Talking:
     def __init__(self) -> None:
         self.told = threading.Event()
 
-    def events(self, timeout: float) -> Iterator[Event]:
+    def events(self, history: bool, timeout: float) -> Iterator[Event]:
         for seq in itertools.count(1):
             yield Event(seq, 0.0, seq, 0.0, "service", "info", "", goal=f"{timeout}")
             self.told.set()
@@ -82,11 +83,26 @@ def test_listening_ends_with_its_context_though_something_happens_all_the_time()
 
     def listen() -> None:
         with _Heard(cast("Robot", talking)).listening():
-            assert talking.told.wait(10.0)
+            assert talking.told.wait(WITHIN)
         ended.set()
 
     threading.Thread(target=listen, daemon=True).start()
-    assert ended.wait(10.0)
+    assert ended.wait(WITHIN)
+
+
+class Late(Talking):
+    """One who tells that a motion has begun while nobody listens, whenever he is asked to tell the past as well."""
+
+    def events(self, history: bool, timeout: float) -> Iterator[Event]:
+        if history and self.told.is_set():
+            yield Event(1, 0.0, 7, 0.0, "mode", "info", "", goal="g")
+        self.told.set()
+
+
+def test_what_is_told_before_it_listens_or_between_two_silences_is_heard() -> None:
+    heard = _Heard(cast("Robot", Late()))
+    with heard.listening():
+        wait_until(lambda: heard.began == {"g": 7})
 
 
 ODD = ["g", "my goal", "goal of ann", "moving: goal x of", "done: ", "ü: ∅"]

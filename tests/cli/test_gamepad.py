@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.cli import pendant
 from trirail.cli.gamepad import QUIET, Button, Code, EventType, Gamepad, Pad, StickRange, is_gamepad
+from trirail.client import held_jog
 from trirail.errors import ServiceError
 from waiting import wait_until
 
@@ -55,6 +56,11 @@ class Hand:
             self.pad.apply(event, self.operator.now)
         pendant.follow(self.operator.pendant, self.pad, self.operator.now)
         self.operator.pendant.tick(self.operator.now)
+
+
+@pytest.fixture(autouse=True)
+def slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(held_jog, "TIMEOUT", 2.0)  # the pendant's clock is the operator's, the robot's is not
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.cli.keyboard import keys
 from trirail.cli.pendant import REPEAT, Pendant
+from trirail.client import held_jog
 from waiting import wait_until
 
 TOP = (0.25, 0.25, 1.5)
@@ -61,7 +62,8 @@ class Operator:
 
 
 @pytest.fixture
-def operator() -> Iterator[Operator]:
+def operator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Operator]:
+    monkeypatch.setattr(held_jog, "TIMEOUT", 2.0)  # the pendant's clock is the operator's, the robot's is not
     made = Operator()
     yield made
     made.pendant.close()

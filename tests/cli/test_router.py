@@ -16,22 +16,22 @@ import pytest
 import zenoh
 from certificates import ROLES, user
 from control_rig import CONFIG
+from ports import free_port
 from trirail.cli import router, router_command
 from trirail.cli.key_folder import KeyFolder
 from trirail.cli.router import RouterConfig
 from trirail.config import Config, Tls, Zenoh
 from trirail.errors import ConfigError, ServiceError
 from trirail.processes.session_guard import Guard
-from trirail.telemetry.sinks import free_port
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.vocabulary import Role
+from waiting import WITHIN
 
 pytestmark = pytest.mark.long
 
 ROBOTS = ("demo", "other")
 LOCAL = ("127.0.0.1", "localhost")
-WITHIN = 20.0
 
 
 class Net(NamedTuple):
@@ -94,7 +94,7 @@ def heard(subscriber: object, publish: object) -> str:
 
 
 def answers(session: zenoh.Session, key: str) -> list[bytes]:
-    return [bytes(reply.ok.payload) for reply in session.get(key, timeout=5.0) if reply.ok]
+    return [bytes(reply.ok.payload) for reply in session.get(key, timeout=WITHIN) if reply.ok]
 
 
 def until_answered(session: zenoh.Session, key: str) -> bytes:

@@ -20,12 +20,12 @@ import pytest
 import screenshot
 from chromium import chromium, needs_chromium
 from PIL import Image
+from ports import free_port
 from rerun.chunk import Chunk, RrdReader
 from trirail.cli import view
 from trirail.config import SIM, load
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.sinks import free_port
 from trirail.wire.endpoints import is_local
 from waiting import wait_until
 
@@ -101,7 +101,7 @@ def trirail_view(*arguments: object) -> Iterator[str]:
             yield msgspec.json.decode(process.stdout.readline())["url"]
         finally:
             process.send_signal(signal.SIGTERM)
-            code = process.wait(20)
+            code = process.wait(WITHIN)
     assert code == 0
 
 

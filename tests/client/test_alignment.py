@@ -45,7 +45,7 @@ def to_go(event: Event) -> dict[str, object]:
 def test_one_correction_with_a_thread(locator: str) -> None:
     with Robot("demo", locator) as robot:
         robot.enable()
-        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(60.0)
         calibration = robot.calibrate_camera(lambda: seen(PART, robot.state().pose))
         targets = seen(PART, (0.0, 0.0, 0.0))
         lying = part_at(PART, ERROR)
@@ -73,7 +73,7 @@ def test_one_correction_in_an_event_loop_with_a_camera_that_is_waited_for(locato
     async def work() -> None:
         async with AsyncRobot("demo", locator) as robot:
             await robot.enable()
-            await (await robot.move_to(x=0.0, y=0.0, phi=0.0)).wait(30.0)
+            await (await robot.move_to(x=0.0, y=0.0, phi=0.0)).wait(60.0)
             part = dict(PART)
 
             async def look() -> dict[str, Pair]:
@@ -95,7 +95,7 @@ def test_without_a_calibration_one_is_made_first(locator: str) -> None:
     targets = seen(PART, (0.0, 0.0, 0.0))
     with Robot("demo", locator) as robot:
         robot.enable()
-        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(60.0)
         found = robot.align(lambda: seen(part, robot.state().pose), targets, tolerance=2e-5, angle=1e-3)
         assert found.reached
         assert len(found.corrections) == 1
@@ -105,7 +105,7 @@ def test_without_a_calibration_one_is_made_first(locator: str) -> None:
 def test_what_look_raises_ends_it_and_a_correction_out_of_reach_is_refused(locator: str) -> None:
     with Robot("demo", locator) as robot:
         robot.enable()
-        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(60.0)
         calibration = robot.calibrate_camera(lambda: seen(PART, robot.state().pose))
         targets = seen(PART, (0.0, 0.0, 0.0))
         with pytest.raises(ZeroDivisionError):
@@ -131,14 +131,14 @@ def test_ctrl_c_in_a_motion_stops_the_robot(locator: str) -> None:
 
     def interrupt() -> None:
         with Robot("demo", locator) as other:
-            for state in other.states(20.0):
+            for state in other.states(60.0):
                 if state.mode == Mode.MOVING and abs(state.pose[0]) > 1e-3:
                     break
         signal.pthread_kill(main, signal.SIGINT)
 
     with Robot("demo", locator) as robot:
         robot.enable()
-        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
+        robot.move_to(x=0.0, y=0.0, phi=0.0).wait(60.0)
         thread = threading.Thread(target=interrupt)
         thread.start()
         with pytest.raises(KeyboardInterrupt):

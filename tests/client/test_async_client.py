@@ -27,8 +27,7 @@ from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply
 from trirail.wire.state import State
-
-WITHIN = 20.0
+from waiting import WITHIN
 
 
 def public(kind: type) -> list[str]:

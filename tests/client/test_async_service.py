@@ -14,16 +14,16 @@ from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.records import unpack
 from trirail.wire.state import State
 from trirail.wire.vocabulary import Role
+from waiting import WITHIN
 
 pytestmark = pytest.mark.slow
 
-WITHIN = 30.0
 Work = Callable[[AsyncRobot], Awaitable[None]]
 
 
 def run(locator: str, work: Work) -> None:
     async def main() -> None:
-        async with asyncio.timeout(WITHIN), AsyncRobot("demo", locator, user="ann") as robot:
+        async with asyncio.timeout(5 * WITHIN), AsyncRobot("demo", locator, user="ann") as robot:
             await robot.enable()
             assert (await (await robot.move_to(x=0.0, y=0.0, phi=0.0)).wait()).outcome == "done"
             await work(robot)
@@ -62,7 +62,7 @@ def test_a_session(locator: str) -> None:
         assert "corner" not in await robot.poses()
         with refused_as(RefusalCode.OUT_OF_WORKSPACE):
             await robot.move_to(x=0.5, y=0.0, phi=0.0)
-        goal = await robot.move_to(x=0.1, y=0.0, phi=0.0, speed=0.2)
+        goal = await robot.move_to(x=0.1, y=0.0, phi=0.0, speed=0.01)
         await robot.pause()
         await robot.resume()
         await robot.override(50)
@@ -74,7 +74,7 @@ def test_a_session(locator: str) -> None:
         with robot.records(lambda batch: batches.append(len(unpack(batch)))):
             await until(robot, lambda _: sum(batches) > 100)
         missing: set[str | None] = {"first", "second"}
-        async for event in robot.events(history=True, timeout=20.0):
+        async for event in robot.events(history=True, timeout=WITHIN):
             missing -= {event.id} if event.outcome == "done" else set()
             if not missing:
                 break
@@ -87,9 +87,9 @@ def test_a_session(locator: str) -> None:
 
 def test_a_jog_lasts_while_its_context_does(locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
-        async with robot.jog(x=0.02, timeout=3.0) as jog:
-            await until(robot, lambda state: state.pose[0] > 0.01)
-        assert (await robot.state()).pose[0] < 0.03  # it brakes where the context is left, not a time-out later
+        async with robot.jog(x=0.002, timeout=10.0) as jog:
+            await until(robot, lambda state: state.pose[0] > 0.001)
+        assert (await robot.state()).pose[0] < 0.012  # it brakes where the context is left, not a time-out later
         assert jog.result is not None
         assert jog.result.outcome == "done"
         await until(robot, lambda state: not any(state.commanded.pose_velocity))
@@ -104,8 +104,8 @@ def test_a_jog_lasts_while_its_context_does(locator: str) -> None:
 def test_a_lease_is_kept_by_a_task_and_given_back(locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
         async with AsyncRobot("demo", locator, user="bob") as bob:
-            async with robot.lease(timeout=0.5) as lease:
-                assert not await lease.wait(1.5)  # three time-outs long: it is kept
+            async with robot.lease(timeout=2.0) as lease:
+                assert not await lease.wait(3.0)  # longer than a time-out: it is kept
                 with refused_as(RefusalCode.LEASED):
                     await bob.move_to(x=0.01, y=0.0, phi=0.0)
                 assert (await (await robot.move_to(x=0.01, y=0.0, phi=0.0)).wait()).outcome == "done"
@@ -117,7 +117,7 @@ def test_a_lease_is_kept_by_a_task_and_given_back(locator: str) -> None:
 def test_a_task_that_is_cancelled_while_it_jogs_moves_nothing_any_more(locator: str) -> None:
     async def work(robot: AsyncRobot) -> None:
         async def jog() -> None:
-            async with robot.jog(x=0.02):
+            async with robot.jog(x=0.02, timeout=5.0):
                 await asyncio.Event().wait()
 
         jogging = asyncio.create_task(jog())

@@ -18,6 +18,7 @@ from trirail.client.client import GoalHandle, Robot
 from trirail.errors import RefusalCode, ServiceError
 from trirail.wire.messages import Event
 from trirail.wire.zenoh_session import open_service
+from waiting import WITHIN
 
 TIMEOUT = 0.3
 NEWEST = Event(seq=7, t=0.0, cycle=0, time=5.0, kind="service", level="info", message="the newest there is")
@@ -83,14 +84,15 @@ def test_a_call_ends_by_its_timeout_whatever_arrives(
         ended.set()
 
     threading.Thread(target=run, daemon=True).start()
-    assert ended.wait(10.0), "it waits for ever"
+    assert ended.wait(WITHIN), "it waits for ever"
     assert raised == [error]
 
 
 def test_events_are_told_once_and_in_order_whatever_comes_again(noisy: Robot) -> None:
-    told = [event.seq for event in noisy.events(timeout=TIMEOUT)]
-    assert told == sorted(set(told))
-    assert told[-1] == NEWEST.seq
+    told: list[int] = []
+    while NEWEST.seq not in told:
+        told = [event.seq for event in itertools.islice(noisy.events(timeout=TIMEOUT), 10)]
+        assert told == sorted(set(told))
 
 
 def test_a_service_that_does_not_answer_in_time_is_told_as_that(

@@ -20,6 +20,7 @@ from trirail.cli.app import app
 from trirail.client.fleet import SILENT, Attention, Fleet, Member
 from trirail.wire import zenoh_session
 from trirail.wire.state import RobotSummary
+from waiting import wait_until
 
 OK = RobotSummary("holding", None, None, 80.0, 0, 0.01, "0.1.0")
 FAULT = msgspec.structs.replace(OK, mode="fault", fault="drive B: EMCY 8700")
@@ -44,13 +45,12 @@ def hub(tmp_path: Path) -> Iterator[tuple[str, zenoh.Session]]:
 
 def until(condition: object, publish: object) -> None:
     """Publish until something holds."""
-    enough = threading.Event()
-    for _ in range(200):
+
+    def holds() -> bool:
         publish()  # type: ignore[operator]
-        if condition():  # type: ignore[operator]
-            return
-        enough.wait(0.05)
-    raise AssertionError("not within 10 s")
+        return condition()  # type: ignore[operator,no-any-return]
+
+    wait_until(holds, pause=0.05)
 
 
 def test_who_needs_somebody_stands_first(hub: tuple[str, zenoh.Session]) -> None:
@@ -92,7 +92,7 @@ def test_one_look_as_json(
     publisher = threading.Thread(target=publish)
     publisher.start()
     try:
-        monkeypatch.setattr(fleet_command, "LOOK", 1.0)
+        monkeypatch.setattr(fleet_command, "LOOK", 3.0)
         words = ["fleet", "--connect", locator, "--json"]
         assert app(words, exit_on_error=False, result_action="return_value") == 0
     finally:

@@ -7,11 +7,14 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from panel.fake_robot import FakeRobot
-from trirail.client.held_jog import TIMEOUT, HeldJog
+from trirail.client import held_jog
+from trirail.client.held_jog import HeldJog
 from trirail.errors import RefusalCode, RefusedError
-from waiting import wait_until
+from waiting import WITHIN, wait_until
 
 RIGHT = (0.01, 0.0, 0.0)
+TIMEOUT = 1.0
+"""Long enough for signs of life on a busy machine [s]."""
 
 
 class Hand:
@@ -27,16 +30,17 @@ class Hand:
         return [goal.x for goal in self.robot.sent]
 
     def hold(self, until: Callable[[], bool]) -> None:
-        """Give signs, four in a time-out, until something holds."""
-        deadline = time.monotonic() + 20.0
+        """Give signs, many in a time-out, until something holds."""
+        deadline = time.monotonic() + WITHIN
         while not until():
             assert time.monotonic() < deadline
             self.jog.hold(RIGHT)
-            time.sleep(TIMEOUT / 4)
+            time.sleep(TIMEOUT / 20)
 
 
 @pytest.fixture
-def hand() -> Iterator[Hand]:
+def hand(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hand]:
+    monkeypatch.setattr(held_jog, "TIMEOUT", TIMEOUT)
     hand = Hand()
     yield hand
     hand.jog.close()

@@ -12,6 +12,7 @@ from trirail.client.lease import SIGNS, Lease
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, ReleaseLease
+from waiting import WITHIN
 
 OVER = RefusedError(RefusalCode.LEASE_OVER, "it is over")
 
@@ -31,7 +32,7 @@ class Service:
         return CommandReply(name, self.mode, 0)
 
     def next(self) -> tuple[Command, bytes]:
-        return self.asked.get(timeout=20.0)
+        return self.asked.get(timeout=WITHIN)
 
     def lease(self, **how: bool) -> Lease:
         return Lease(self.command, force=how.get("force", False), timeout=0.1)
@@ -70,7 +71,7 @@ def test_each_lease_has_an_id_of_its_own() -> None:
 def test_entering_returns_when_what_others_had_under_way_stands() -> None:
     service = Service("stopping")
     with service.lease():
-        asked = [service.next()[0] for _ in range(2)]
+        asked = {service.next()[0] for _ in range(service.asked.qsize())}
     assert Command.STOP in asked
 
 
@@ -80,7 +81,7 @@ def test_what_ends_it_is_kept_and_nothing_is_asked_any_more(error: Exception) ->
     with service.lease() as lease:
         assert lease.lost is None
         service.refusal = error
-        assert lease.wait(20.0)
+        assert lease.wait(WITHIN)
         assert lease.lost is error
     assert {service.next()[0] for _ in range(service.asked.qsize())} == {Command.ACQUIRE}
 
@@ -91,7 +92,7 @@ def test_who_does_not_get_it_keeps_nothing_up() -> None:
     before = threading.active_count()
     with refused_as(RefusalCode.LEASED), service.lease():
         raise AssertionError
-    assert threading.active_count() == before
+    assert threading.active_count() <= before  # of other tests some may end meanwhile
     assert service.asked.qsize() == 1
 
 

@@ -133,6 +133,7 @@ def test_what_has_not_settled_is_seen_where_it_is(lag: float, step: float, waite
 
 
 def test_records_of_a_time_are_waited_for_and_those_that_are_gone_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_as_built, "COMES_WITHIN", 60.0)
     stage = StageAsBuilt(ROBOT)
     timer = threading.Timer(0.05, lambda: stage.add_records(records(np.zeros((10, 3)), 5.0)))
     timer.start()

@@ -88,6 +88,18 @@ def test_following_error_is_to_the_setpoint_that_was_due_at_the_sync_of_the_posi
     assert measured.following_error == pytest.approx(expected, abs=1e-15)
 
 
+def test_a_position_that_is_older_than_the_setpoints_that_are_kept_is_compared_with_none_of_them() -> None:
+    """As of drives that a busy machine has kept waiting, where missed_positions lets them: it is no fault of theirs."""
+    limit = CONFIG.limits.slider.following_error
+    measured, step = Measured(ROBOT.packed(), PERIOD, STEP, limit), 0.9 * limit
+    measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
+    for age in range(30):
+        measured.record["commanded_position"] = ((age + 1) * step, 0.0, 0.0)
+        assert measured.update(Feedback((0.0, 0.0, 0.0), ON, None, age=(age, 0, 0))) == 0
+        assert measured.following_error == (0.0, 0.0, 0.0)
+    assert measured.update(Feedback((0.0, 0.0, 0.0), ON, None)) == 1
+
+
 @pytest.mark.parametrize("index", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_following_error_is_beyond_its_limit_when_it_is_more(index: int, sign: float) -> None:

@@ -31,6 +31,7 @@ from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
 from trirail_drivers.simulated.faults import Faults
+from waiting import WITHIN
 
 pytestmark = pytest.mark.long
 
@@ -560,12 +561,15 @@ def test_a_stock_canopen_master_homes_the_simulated_drive(method: int) -> None:
     try:
         node = BaseNode402(5, str(SERVO))  # type: ignore[no-untyped-call]
         network.add_node(node)
+        node.sdo.RESPONSE_TIMEOUT = WITHIN
+        for name in ("SWITCH_OP_MODE", "SWITCH_STATE_FINAL", "SWITCH_STATE_SINGLE"):
+            setattr(node, f"TIMEOUT_{name}", WITHIN)  # a busy machine may take its time
         node.sdo[0x6098].raw = method
         node.sdo[0x6099][1].raw = 50_000
         node.sdo[0x6099][2].raw = 10_000
         node.sdo[0x609A].raw = 2_000_000
         node.state = "SWITCH ON DISABLED"
-        assert node.homing(timeout=20)  # type: ignore[no-untyped-call]
+        assert node.homing(timeout=WITHIN)  # type: ignore[no-untyped-call]
         assert node.sdo[0x6041].raw & 0x3400 == 0x1400
         assert node.op_mode == "HOMING"
         assert node.sdo[0x6064].raw <= 0  # behind the edge; how far is up to how often the machine lets it move

@@ -155,7 +155,7 @@ def test_no_thread_is_left_by_the_set_up() -> None:
     before = threading.active_count()
     rig = SlowRig("elmo_gold", lambda _: Slowness())
     rig.ready()
-    assert threading.active_count() == before
+    assert threading.active_count() <= before  # of other tests some may end meanwhile
     rig.drives.close()
 
 

@@ -15,7 +15,7 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.errors import BusError
 
 ROOT = Path(__file__).parents[2]
-WAIT = 5.0
+WAIT = 60.0
 """Longest wait for a frame that has to come [s]."""
 
 

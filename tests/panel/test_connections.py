@@ -27,7 +27,7 @@ from websockets.sync.client import ClientConnection, connect
 
 pytestmark = pytest.mark.long
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 
 
 class Served(NamedTuple):

@@ -20,6 +20,7 @@ from panel.fake_robot import FakeRobot
 from trirail.errors import ServiceError
 from trirail.panel.guard import refused
 from trirail.panel.server import LONGEST, Panel
+from waiting import WITHIN
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -83,7 +84,7 @@ def panel() -> Iterator[Panel]:
 
 def ask(panel: Panel, path: str, **headers: str) -> http.client.HTTPResponse:
     parts = urlsplit(panel.url)
-    connection = http.client.HTTPConnection(str(parts.hostname), parts.port, timeout=10.0)
+    connection = http.client.HTTPConnection(str(parts.hostname), parts.port, timeout=WITHIN)
     connection.request("GET", path, headers=headers)
     return connection.getresponse()
 
@@ -177,7 +178,7 @@ def test_what_is_no_message_is_refused_and_the_tab_goes_on(panel: Panel, message
         opened.send('{"do": "command", "name": "pause"}')
         said: list[str] = []
         while not said or "done" not in said[-1]:
-            said.append(str(opened.recv(10.0)))
+            said.append(str(opened.recv(WITHIN)))
     assert any("not a message of this page" in text for text in said)
 
 
@@ -188,11 +189,11 @@ def test_a_tab_keeps_the_lease_while_it_is_open_and_no_longer(end: str) -> None:
 
         def done(name: str) -> None:
             opened.send(f'{{"do": "command", "name": "{name}"}}')
-            while f'"done","to":"{name}"' not in (said := str(opened.recv(10.0))):
+            while f'"done","to":"{name}"' not in (said := str(opened.recv(WITHIN))):
                 assert "refused" not in said
 
         done("acquire")
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + WITHIN
         while robot.commands.count("acquire") < 4:  # signs of life, by nobody at the page
             assert time.monotonic() < deadline
             time.sleep(0.002)
@@ -213,7 +214,7 @@ def test_a_tab_keeps_the_lease_while_it_is_open_and_no_longer(end: str) -> None:
 def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, caplog: pytest.LogCaptureFixture) -> None:
     before = set(threading.enumerate())
     opened = connect(socket_of(panel), legacy=True)
-    opened.recv(10.0)
+    opened.recv(WITHIN)
     serving = [thread for thread in threading.enumerate() if thread not in before and thread.name == "connection"]
     assert serving
     if end == "cut off":
@@ -223,7 +224,7 @@ def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, cap
     else:
         opened.close()
     for thread in serving:
-        thread.join(20.0)
+        thread.join(WITHIN)
         assert not thread.is_alive()
     assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == []
 

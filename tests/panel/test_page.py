@@ -15,10 +15,10 @@ from panel.fake_robot import FakeRobot
 from trirail.client.held_jog import TIMEOUT
 from trirail.errors import RefusalCode, RefusedError
 from trirail.panel.server import Panel
+from waiting import WITHIN
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
 
-WITHIN = 20.0
 SHOWN = "document.body.dataset.contact === 'yes'"
 SIZES = {"desk": (1280, 800, False), "phone": (390, 844, True), "small phone": (375, 667, True)}
 
@@ -88,12 +88,14 @@ def test_the_robot_moves_while_a_button_is_held(enabled: Page, robot: FakeRobot)
 )
 def test_keys_jog_while_they_are_down(enabled: Page, robot: FakeRobot, key: str, axis: int, sign: int) -> None:
     enabled.key_down(key)
-    until(lambda: robot.velocity[axis] * sign > 0.0, "it moves that way")
-    assert [value != 0.0 for value in robot.velocity] == [k == axis for k in range(3)]
+    until(lambda: bool(robot.sent), "it moves")
+    moved = (robot.sent[0].x, robot.sent[0].y, robot.sent[0].phi)
+    assert [math.copysign(1.0, value) if value else 0.0 for value in moved] == [sign * (k == axis) for k in range(3)]
     enabled.key_up(key)
     stands(robot)
 
 
+@pytest.mark.usefixtures("slow_hand")
 def test_two_buttons_at_once_are_one_jog_and_each_ends_by_itself(enabled: Page, robot: FakeRobot) -> None:
     enabled.key_down("ArrowRight")
     moves(robot)
@@ -115,6 +117,7 @@ def test_a_finger_holds_and_what_takes_the_touch_away_lets_go(enabled: Page, rob
         stands(robot)
 
 
+@pytest.mark.usefixtures("slow_hand")
 @pytest.mark.parametrize(
     "gone",
     [
@@ -180,6 +183,7 @@ def test_a_tab_that_is_closed_lets_go(browser: Page, enabled: Page, panel: Panel
     stands(robot)
 
 
+@pytest.mark.usefixtures("slow_hand")
 def test_a_jog_that_the_robot_has_ended_begins_again_only_by_a_new_press(enabled: Page, robot: FakeRobot) -> None:
     enabled.press("[data-axis=x][data-sign='1']")
     moves(robot)
@@ -196,6 +200,7 @@ def test_a_jog_that_the_robot_has_ended_begins_again_only_by_a_new_press(enabled
     enabled.let_go()
 
 
+@pytest.mark.usefixtures("slow_hand")
 def test_the_speed_is_chosen_by_slider_and_keys(enabled: Page, robot: FakeRobot) -> None:
     found = []
     for key in ("", "-", "+", "+"):
@@ -342,22 +347,26 @@ def test_the_last_alignment_is_shown_with_what_each_mark_had_to_go(page: Page, r
     later.close()
 
 
+@pytest.mark.usefixtures("slow_hand")
 def test_the_last_minutes_are_drawn_and_a_silent_time_is_a_gap(enabled: Page, robot: FakeRobot) -> None:
     enabled.click("[data-view=charts]")
     assert enabled.evaluate("document.querySelector('#mechanism').hasAttribute('hidden')")
     assert enabled.evaluate("document.querySelectorAll('#charts canvas').length") == 4
     enabled.key_down("ArrowRight")
     moves(robot)
-    time.sleep(0.5)
-    enabled.key_up("ArrowRight")
     rows = "(await import('./panel.js')).charts.rows"
-    drawn = enabled.evaluate(f"(async () => {rows})()")
-    assert len(drawn) > 3
-    assert drawn[-1][0] > drawn[0][0] + 2.0
+
+    def drawn_so_far() -> list[Any]:
+        found: list[Any] = enabled.evaluate(f"(async () => {rows})()")
+        return found
+
+    until(lambda: len(drawn_so_far()) > 3 and drawn_so_far()[-1][0] > drawn_so_far()[0][0] + 2.0, "the way is drawn")
+    enabled.key_up("ArrowRight")
+    drawn = drawn_so_far()
     assert drawn[-1][1:3] == pytest.approx([5.0, math.degrees(0.1)])
     robot.silent.set()
     enabled.until("document.querySelector('#mode-name').textContent === 'no contact'")
-    assert enabled.evaluate(f"(async () => {rows})()")[-1] == [None] * 7
+    assert drawn_so_far()[-1] == [None] * 7
     robot.silent.clear()
 
 
@@ -419,6 +428,7 @@ def test_a_pose_is_dragged_on_the_drawing_and_moves_nothing_before_it_is_told(en
     assert robot.pose == pytest.approx((before[0] + 0.02, before[1] + 0.01, before[2]), abs=1e-6)
 
 
+@pytest.mark.usefixtures("slow_hand")
 @pytest.mark.parametrize(
     ("button", "by"),
     [("[data-axis=x][data-sign='1']", (1e-4, 0, 0)), ("[data-axis=phi][data-sign='-1']", (0, 0, -math.radians(0.1)))],

@@ -22,10 +22,12 @@ from processes.test_service import (
     service,
     until,
 )
+from processes.test_service import told as told_by
 from trirail.processes.supervisor import CHILDREN_WITH_DRIVES
 from trirail.telemetry.reading import Recording, read
 from trirail.wire.messages import Event
 from trirail.wire.vocabulary import MODES, Mode
+from waiting import WITHIN
 
 __all__ = ["service"]
 
@@ -46,15 +48,22 @@ def outcomes(recorded: Recording) -> list[tuple[str | None, str | None]]:
     return [(event.id, event.outcome) for event in events(recorded) if event.outcome is not None]
 
 
-def test_a_frozen_gateway_is_a_controlled_stop_and_is_replaced(service: Service) -> None:
+def test_a_frozen_gateway_is_a_controlled_stop_and_is_replaced(tmp_path: Path) -> None:
+    usual = "gateway_timeout = 0.3"  # so that the loop is the first to notice
+    with Service(tmp_path, **{usual: usual}) as service:
+        service.wait_up()
+        frozen_and_replaced(service)
+
+
+def frozen_and_replaced(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)
         os.kill(service.child("gateway"), signal.SIGSTOP)
         service.wait_said("the gateway has died (no sign of life for 0.7 s, so it was killed)")
     with again(service) as robot:
         state = until(robot, lambda state: state.mode == "holding")
-        assert 0.01 < state.pose[0] < 0.09
-        assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(timeout=10.0).outcome == "done"
+        assert 0.0 < state.pose[0] < 0.09
+        assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         robot.disable()
     assert service.end() == 0
     assert_stopped_smoothly(service.frames())
@@ -65,15 +74,15 @@ def test_a_frozen_gateway_is_a_controlled_stop_and_is_replaced(service: Service)
 
 def test_a_frozen_recorder_is_replaced_and_the_robot_does_not_mind(service: Service) -> None:
     with service.robot() as robot:
-        in_motion(robot)
+        in_motion(robot, speed=0.2)
         os.kill(service.child("recorder"), signal.SIGSTOP)
         service.wait_said(
             "the recorder has died (no sign of life for 5 s, so it was killed): the robot is not affected"
         )
         state = until(robot, lambda state: state.mode == "holding")
         assert state.pose[0] == pytest.approx(0.1, abs=1e-5)
-        until(robot, lambda _: len([*(service.folder / "recordings").glob("*.rrd")]) == 2)
-        robot.move_to(x=0.0, y=0.0, phi=0.0, id="afterwards").wait(timeout=10.0)
+        told_by(robot, lambda heard: sum(event.message.startswith("recording to") for event in heard) == 2)
+        robot.move_to(x=0.0, y=0.0, phi=0.0, id="afterwards").wait(WITHIN)
     assert service.end() == 0
     newest = max((service.folder / "recordings").glob("*.rrd"), key=lambda path: path.stat().st_mtime)
     assert ("afterwards", "done") in outcomes(read(newest))
@@ -82,7 +91,7 @@ def test_a_frozen_recorder_is_replaced_and_the_robot_does_not_mind(service: Serv
 def test_a_frozen_loop_ends_the_service_and_everyone_is_told(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)
-        told = robot.events(history=True, timeout=20.0)
+        told = robot.events(history=True, timeout=WITHIN)
         heard = [next(told)]
         os.kill(service.child("loop"), signal.SIGSTOP)
         for event in told:
@@ -101,7 +110,7 @@ def test_a_frozen_loop_ends_the_service_and_everyone_is_told(service: Service) -
 def test_the_state_says_that_the_loop_has_died(service: Service) -> None:
     with service.robot() as robot:
         in_motion(robot)
-        states = robot.states(timeout=20.0)
+        states = robot.states(WITHIN)
         next(states)  # who asks only when it has died may be too late
         os.kill(service.child("loop"), signal.SIGKILL)
         died = next(state for state in states if state.mode == "fault")

@@ -18,6 +18,7 @@ from trirail.processes.child_process import Order
 from trirail.processes.forked_processes import UNTOLD, ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import Heartbeats
 from trirail.wire import links
+from waiting import WITHIN
 
 SERVER = """
 import json, os, signal, sys, threading, time
@@ -60,7 +61,6 @@ def work(child):
 
 compiling.load, compiling.compile_all = load, compile_all
 """
-WITHIN = 30.0
 
 
 class Parent:
@@ -100,6 +100,8 @@ class Parent:
 @pytest.fixture
 def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parent]:
     (tmp_path / "kept").touch()
+    for times in ("TELLS_WITHIN", "IMPORTS_WITHIN"):  # of a busy machine
+        monkeypatch.setattr(forked_processes, times, WITHIN)
     monkeypatch.setattr(forked_processes, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
     made = Parent(tmp_path)
     try:
@@ -229,7 +231,8 @@ def test_how_a_child_ended_is_told_also_where_its_parent_is_importing(parent: Pa
     assert parent.until_over(gateway) == "exit code 7"
 
 
-def test_a_frozen_parent_is_waited_for_once(parent: Parent) -> None:
+def test_a_frozen_parent_is_waited_for_once(parent: Parent, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forked_processes, "TELLS_WITHIN", 1.0)
     children = [parent.child(name) for name in ("planner", "gateway", "recorder")]
     for child in children:
         parent.until_said(child)

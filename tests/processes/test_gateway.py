@@ -76,7 +76,7 @@ def test_what_has_waited_is_as_old_as_its_arrival_and_a_targets_age_is_that_of_t
     (sent,) = link.sent
     assert isinstance(sent, GoalRequest)
     assert sent.received_ns == arrived
-    assert 0.05 < sent.age < 1.0
+    assert 0.05 < sent.age < 2.0
 
 
 def command(gateway: Gateway, name: str, content: bytes = b"", user: str = "ann", number: int = 0) -> None:
@@ -292,7 +292,7 @@ def test_an_asker_that_takes_no_answer_holds_up_nobody_else(rig: Rig, tmp_path: 
             asked = 0
             while asked < 5 or gateway._replies.waiting <= 100:  # so many are not even tried meanwhile
                 asked += 1
-                (reply,) = other.get("trirail/demo/cmd/ann/dance", timeout=20.0)
+                (reply,) = other.get("trirail/demo/cmd/ann/dance", timeout=60.0)
                 assert reply.err is not None
                 assert "no such command" in reply.err.payload.to_string()
         finally:

@@ -19,6 +19,7 @@ from certificates import tls_config, user
 from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
+from ports import free_port
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 from trirail.config import SIM, Config
@@ -41,7 +42,6 @@ from trirail.processes.monitoring import (
 )
 from trirail.processes.publications import StateMaker
 from trirail.processes.zenoh_links import InUse
-from trirail.telemetry.sinks import free_port
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
 

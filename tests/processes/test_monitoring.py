@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ports import free_port
 from processes.test_service import Service, wait_readable
 from trirail.config import SIM
-from trirail.telemetry.sinks import free_port
+from waiting import WITHIN
 
 pytestmark = pytest.mark.slow
-
-WITHIN = 60.0
-"""Time for a process to be seen away, or back [s]."""
 
 
 class Watched(Service):
@@ -36,7 +34,7 @@ class Watched(Service):
     def health(self) -> dict[str, str]:
         """What is wrong, by process."""
         try:
-            with urllib.request.urlopen(f"{self.url}/healthz", timeout=5.0) as answer:
+            with urllib.request.urlopen(f"{self.url}/healthz", timeout=WITHIN) as answer:
                 body = answer.read()
         except urllib.error.HTTPError as error:
             body = error.read()
@@ -54,7 +52,7 @@ class Watched(Service):
         return health
 
     def metrics(self) -> dict[str, float]:
-        with urllib.request.urlopen(f"{self.url}/metrics", timeout=5.0) as answer:
+        with urllib.request.urlopen(f"{self.url}/metrics", timeout=WITHIN) as answer:
             lines = answer.read().decode().splitlines()
         return {name: float(value) for line in lines if line[0] != "#" for name, value in [line.rsplit(" ", 1)]}
 
@@ -103,27 +101,20 @@ def test_health_is_red_while_a_process_is_away_and_says_which(service: Watched, 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
 def test_health_ends_red_with_the_loop(service: Watched, number: int) -> None:
     service.wait_health(lambda wrong: not wrong)
+    recorder = service.child("recorder")
+    os.kill(recorder, signal.SIGSTOP)  # its end is waited for, and meanwhile whoever asks is answered
     os.kill(service.child("loop"), number)
-    seen: list[str] = []
-
-    def gone() -> bool:
-        try:
-            seen.extend(service.health())
-        except (OSError, urllib.error.URLError):
-            return True
-        return False
-
-    deadline = time.monotonic() + 20.0
-    while not gone() and time.monotonic() < deadline:
-        wait_readable(service.process, 0.02)
-    assert service.process.wait(10.0) == 1
-    assert "loop" in seen
+    service.wait_health(lambda wrong: "loop" in wrong)
+    os.kill(recorder, signal.SIGCONT)
+    assert service.process.wait(WITHIN) == 1
+    with pytest.raises(OSError, match="refused"):
+        service.health()
 
 
 def test_what_the_robot_does_is_counted(service: Watched) -> None:
     with service.robot() as robot:
         robot.enable()
-        assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+        assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         robot.quick_stop()
 
     def counted() -> bool:
@@ -134,7 +125,7 @@ def test_what_the_robot_does_is_counted(service: Watched) -> None:
             and found.get('trirail_mode{mode="fault"}') == 1.0
         )
 
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + WITHIN
     while not counted() and time.monotonic() < deadline:
         wait_readable(service.process, 0.1)
     found = service.metrics()
@@ -160,24 +151,24 @@ def test_prometheus_scrapes_it(service: Watched, tmp_path: Path) -> None:
     with (tmp_path / "prometheus.log").open("wb") as log:
         prometheus = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
     try:
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + WITHIN
         while not (found := _asked(address, "trirail_loop_cycles_total > 0")) and time.monotonic() < deadline:
             wait_readable(prometheus, 0.5)
         assert found, (tmp_path / "prometheus.log").read_text()
         with service.robot() as robot:  # what there is to see of goals and faults
             robot.enable()
-            assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+            assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
             robot.quick_stop()
         dashboard = json.loads((SIM.parent / "grafana.json").read_text())
         queries = [query["expr"] for panel in dashboard["panels"] for query in panel["targets"]]
         expressions = [each.replace("$__rate_interval", "1m").replace("$instance", ".*") for each in queries]
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + WITHIN
         while lacking := [each for each in expressions if not _numbers(_asked(address, each))]:
             assert time.monotonic() < deadline, lacking
             wait_readable(prometheus, 0.5)
     finally:
         prometheus.terminate()
-        prometheus.wait(30.0)
+        prometheus.wait(WITHIN)
 
 
 def _numbers(found: list[Any] | None) -> bool:

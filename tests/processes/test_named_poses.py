@@ -14,18 +14,18 @@ from typing import Any, NamedTuple
 import message_schemas
 import pytest
 from jsonschema import Draft202012Validator
+from processes.test_ends import wait_gone
 from processes.test_service import until
 from refusals import refused_as
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.processes.operating_system import child
+from trirail.processes.operating_system import child, processes
 from trirail.wire.zenoh_session import open_client
+from waiting import WITHIN
 from warm import trirail
 
 pytestmark = pytest.mark.slow
-
-WITHIN = 20.0
 
 
 class Place(NamedTuple):
@@ -44,8 +44,11 @@ class Place(NamedTuple):
         try:
             yield process
         finally:
+            others = processes(process.pid).values()
             process.send_signal(number)
             process.wait(WITHIN)
+            for other in others:  # they outlive one that is killed, and have its socket
+                wait_gone(other)
 
 
 @pytest.fixture

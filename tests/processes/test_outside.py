@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
-from processes.test_service import Service, until
+from processes.test_service import SLOWLY, Service, until
 from refusals import refused_as
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
@@ -27,6 +27,7 @@ from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 from trirail.wire.messages import Event
 from trirail.wire.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
 from trirail.wire.zenoh_session import open_client
+from waiting import WITHIN
 from warm import trirail
 
 pytestmark = pytest.mark.slow
@@ -45,7 +46,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, 
         with service.robot() as robot, open_client(service.locator) as session:
             robot.enable()
             yield service, robot, session
-            assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(10.0).outcome == "done"
+            assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         assert [service.child(name) for name in names] == before, service.log.read_text()
         assert service.end() == 0
         log = service.log.read_text()
@@ -56,7 +57,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, 
 def asked(session: zenoh.Session, key: str, **what: object) -> list[tuple[str, str]]:
     """Return what is answered: code and message of each error, or "ok" and the content as JSON."""
     found = []
-    for reply in session.get(key, timeout=5.0, **what):  # type: ignore[call-overload]
+    for reply in session.get(key, timeout=WITHIN, **what):  # type: ignore[call-overload]
         answer = reply.ok or reply.err
         packed = str(answer.encoding) == boundary.MSGPACK
         content = (msgspec.msgpack if packed else msgspec.json).decode(answer.payload.to_bytes())
@@ -165,12 +166,12 @@ def test_a_stop_that_cannot_be_read_stops_the_robot_all_the_same(
     _, robot, session = shared
     robot.override(100)
     robot.enable()
-    goal = robot.move_to(x=0.05 if robot.state().pose[0] < 0.0 else -0.05, y=0.0, phi=0.0, speed=0.1)
+    goal = robot.move_to(x=0.05 if robot.state().pose[0] < 0.0 else -0.05, y=0.0, phi=0.0, speed=SLOWLY)
     until(robot, lambda state: state.mode == "moving")
     ((found, message),) = asked(session, f"trirail/demo/cmd/eve/{name}", payload=payload, encoding=encoding)
     assert found == code
     assert message.endswith(f"; the robot is told to {name} all the same")
-    assert goal.wait(timeout=20.0).outcome in ("stopped", "faulted")
+    assert goal.wait(WITHIN).outcome in ("stopped", "faulted")
     until(robot, lambda state: state.mode == {"stop": "holding", "quick_stop": "fault", "disable": "disabled"}[name])
     if name == "quick_stop":
         robot.reset()
@@ -238,11 +239,12 @@ def test_every_goal_of_many_threads_is_answered_once(
     threads, goals = 8, 500
     answers: Counter[str] = Counter()
     failures: list[Exception] = []
-    watch = robot.events(timeout=10.0)
     ended: Counter[str] = Counter()
+    heard = threading.Event()
 
     def listen() -> None:
-        for event in watch:
+        for event in robot.events(history=True, timeout=WITHIN):
+            heard.set()
             if event.outcome and event.id and event.id.startswith(f"{clients}-"):
                 ended[event.id] += 1
                 if len(ended) == threads * goals:
@@ -265,6 +267,7 @@ def test_every_goal_of_many_threads_is_answered_once(
         own = [stack.enter_context(Robot("demo", service.locator, user=f"u{n}")) for n in range(clients)]
         listening = threading.Thread(target=listen)
         listening.start()
+        assert heard.wait(WITHIN)  # the past at first: it listens
         sending = [threading.Thread(target=send, args=(own[n % clients], n)) for n in range(threads)]
         for thread in sending:
             thread.start()
@@ -346,8 +349,8 @@ def test_clients_skip_what_is_no_message(shared: tuple[Service, Robot, zenoh.Ses
         moved = trirail("goto", 0.0, 0.01, 0.0, "--wait", locator=service.locator)
         heard: list[bytes] = []
         with robot.records(heard.append):
-            assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(10.0).outcome == "done"
-        seen = next(event for event in robot.events(timeout=5.0) if event.message.startswith("[/]"))
+            assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
+        seen = next(event for event in robot.events(timeout=WITHIN) if event.message.startswith("[/]"))
     for ran in (status, moved):
         assert ran.returncode == 0, ran.stderr
         assert "Traceback" not in ran.stderr
@@ -420,7 +423,7 @@ if {how!r} == "waits":
         if how == "waits":
             program.send_signal(signal.SIGINT)
         try:
-            _, said = program.communicate(timeout=20.0)
+            _, said = program.communicate(timeout=WITHIN)
         except subprocess.TimeoutExpired:
             program.kill()
             raise

@@ -17,12 +17,10 @@ from trirail.client.client import Robot
 from trirail.client.fleet import Attention, Fleet, Member
 from trirail.errors import ServiceError
 from trirail.processes.operating_system import python
+from waiting import WITHIN
 from warm import trirail
 
 pytestmark = pytest.mark.slow
-
-WITHIN = 30.0
-"""For a robot to be back behind its router [s]."""
 
 
 class Hub:
@@ -90,7 +88,7 @@ def through(hub: Hub) -> Robot:
 def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub: Hub, service: Service) -> None:
     with through(hub) as robot, Fleet(hub.locator, "demo") as fleet:
         robot.enable()
-        assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+        assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         seen(fleet, lambda member, _: member.summary.mode == "holding", service)
         robot.quick_stop()
         seen(fleet, lambda member, now: member.need(now) is Attention.FAULT, service)
@@ -102,9 +100,9 @@ def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub
         lost = f"no link to the router {hub.locator}: connection refused; it is dialled again, local control goes on"
         assert next(state for state in robot.states(WITHIN) if state.warnings).warnings == (lost,)
         hub.start()
-        assert moving.wait(20.0).outcome == "done"
+        assert moving.wait(WITHIN).outcome == "done"
         assert not next(state for state in robot.states(WITHIN) if not state.warnings).warnings
-        said = (event.message for event in robot.events(history=True, timeout=20.0) if "the router" in event.message)
+        said = (event.message for event in robot.events(history=True, timeout=WITHIN) if "the router" in event.message)
         assert list(itertools.islice(said, 3)) == [
             f"linked to the router {hub.locator}",
             lost,

@@ -26,10 +26,10 @@ from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
 from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest, stop_address
 from trirail.wire.vocabulary import Command
+from waiting import WITHIN
 
 DONE = CommandReply("stop", "holding", 1)
 PLACES = 64
-WITHIN = 10.0
 
 
 class Asked:

@@ -10,17 +10,21 @@ from pathlib import Path
 
 import pytest
 from certificates import ROLES, tls_config, user
-from processes.test_service import Service, until
+from processes.test_service import SLOWLY, Service, until
 from refusals import refused_as
+from trirail.client import connection
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, ServiceError
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.vocabulary import Role
+from waiting import WITHIN
 from warm import trirail
 
 pytestmark = pytest.mark.slow
 
+LONG = 10.0
+"""The time-out of a lease that a busy machine must not end [s]."""
 LISTEN = 'listen = ["tcp/127.0.0.1:7447"]'
 
 
@@ -55,11 +59,17 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         assert stat.S_IMODE(recording.stat().st_mode) == 0o640
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "ROLE_WITHIN", WITHIN)
+    monkeypatch.setattr(connection, "HERE_WITHIN", WITHIN)
+
+
 @pytest.fixture
 def ann(served: Served) -> Iterator[Robot]:
     with served.robot("ann") as ann:
         ann.enable()
-        assert ann.move_to(x=-0.1, y=0.0, phi=0.0).wait(20.0).outcome == "done"
+        assert ann.move_to(x=-0.1, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         yield ann
 
 
@@ -95,11 +105,11 @@ def test_a_viewer_sees_it_and_is_refused(served: Served) -> None:
 
 @pytest.mark.parametrize("name", ROLES)
 def test_everybody_with_a_role_stops_it(served: Served, ann: Robot, name: str) -> None:
-    goal = ann.move_to(x=0.1, y=0.0, phi=0.0, speed=0.1)
+    goal = ann.move_to(x=0.1, y=0.0, phi=0.0, speed=SLOWLY)
     until(ann, lambda state: state.mode == "moving")
-    with ann.lease(), served.robot(name) as anybody:
+    with ann.lease(timeout=LONG), served.robot(name) as anybody:
         anybody.stop()
-        assert goal.wait(10.0).outcome == "stopped"
+        assert goal.wait(WITHIN).outcome == "stopped"
 
 
 @pytest.mark.usefixtures("ann")
@@ -127,11 +137,11 @@ def test_nobody_without_a_certificate_opens_one(served: Served) -> None:
 
 
 def test_only_a_maintainer_takes_the_lease_over(served: Served, ann: Robot) -> None:
-    with served.robot("max") as boss, boss.lease() as lease:
+    with served.robot("max") as boss, boss.lease(timeout=LONG) as lease:
         with refused_as(RefusalCode.NOT_ALLOWED), ann.lease(force=True):
             pass
         until(ann, lambda state: state.lease == "max")
         assert lease.lost is None
-    with ann.lease() as lease, served.robot("max") as boss, boss.lease(force=True):
-        assert lease.wait(10.0)
+    with ann.lease(timeout=LONG) as lease, served.robot("max") as boss, boss.lease(force=True, timeout=LONG):
+        assert lease.wait(WITHIN)
         until(ann, lambda state: state.lease == "max")

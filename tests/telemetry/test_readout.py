@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
+from ports import free_port
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 from trirail.config import SIM, load
@@ -21,7 +22,7 @@ from trirail.processes.operating_system import python
 from trirail.telemetry import readout
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
-from trirail.telemetry.sinks import free_port, live_relay, live_server
+from trirail.telemetry.sinks import live_relay, live_server
 from trirail.telemetry.streams import Streams
 from trirail.wire.vocabulary import MODES, Mode
 

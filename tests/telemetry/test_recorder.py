@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from ports import free_port
 from rerun.chunk import Chunk, RrdReader
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
@@ -24,13 +25,14 @@ from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.shown_robot import ShownRobot
-from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, free_port
+from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, is_watched
 from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
 from trirail_drivers.bus.can_frame import CAPTURED
 from trirail_drivers.bus.frames import Frame, packed
 from trirail_drivers.errors import FileError
+from waiting import WITHIN, wait_until
 
 WALL_NS = 1_795_245_300_000_000_000
 
@@ -161,12 +163,11 @@ def test_a_live_port_in_use_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_live_view_is_served_on_loopback_beside_the_file(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     recording = recorder(tmp_path, configured(live_port=port), live=True)
     try:
         assert recording.live_url == f"rerun+http://127.0.0.1:{port}/proxy"
-        socket.create_connection(("127.0.0.1", port), timeout=5.0).close()
+        socket.create_connection(("127.0.0.1", port), timeout=WITHIN).close()
         feed(recording, made.records(0.4))
     finally:
         recording.close()
@@ -242,13 +243,13 @@ def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
 
     def deliver(batch: Any) -> None:
         began.set()
-        assert go_on.wait(10.0)
+        assert go_on.wait(WITHIN)
         delivered.append(batch)
 
     relay = Relay(deliver, finished.set)
     batches: list[Any] = [[number] for number in range(2 * BACKLOG + 5)]
     relay.send(batches[0])
-    assert began.wait(10.0)
+    assert began.wait(WITHIN)
     for batch in batches[1:]:
         relay.send(batch)
     go_on.set()
@@ -322,6 +323,7 @@ def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, mo
     assert sum(drawn) <= 5000
     drawn.clear()
     with socket.create_connection(("127.0.0.1", port)):
+        wait_until(lambda: is_watched(port))
         feed(recording, records[5000:])
     assert sum(drawn) > 7000
     recording.close()

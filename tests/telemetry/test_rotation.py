@@ -316,7 +316,7 @@ os._exit(0)
 def test_after_a_disk_that_failed_the_recording_goes_on_in_another_file(tmp_path: Path) -> None:
     command = [sys.executable, "-c", LIMITED, str(tmp_path)]
     done = subprocess.run(
-        command, cwd=Path(__file__).parents[1], capture_output=True, text=True, timeout=60, check=False
+        command, cwd=Path(__file__).parents[1], capture_output=True, text=True, timeout=500, check=False
     )
     assert done.returncode == 0, done.stderr
     first, *others = parts(tmp_path)

@@ -53,7 +53,7 @@ def folder(tmp_path: Path) -> Path:
 
 def pytest_in(folder: Path, *options: str) -> int:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options]
-    return subprocess.run(command, cwd=folder, stdout=subprocess.DEVNULL, timeout=100, check=False).returncode
+    return subprocess.run(command, cwd=folder, stdout=subprocess.DEVNULL, timeout=500, check=False).returncode
 
 
 def told(folder: Path) -> list[dict[str, Any]]:

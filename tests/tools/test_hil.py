@@ -140,7 +140,7 @@ def test_the_foreign_drive_says_its_units_and_what_it_lacks() -> None:
     """On a bus of this process: the driver's own thread is this one, the drive's another."""
     counts, turns = hil_second.COUNTS, hil_second.REVOLUTIONS
     a, b, c = (Drive(node=node, counts_per_metre=counts, revolutions_per_metre=turns) for node in (1, 2, 3))
-    drives = Drives("cia402", a, b, c, sdo_timeout=0.2)  # A and B, which are not there, are waited for
+    drives = Drives("cia402", a, b, c, sdo_timeout=0.5)  # A and B, which are not there, are waited for
     ends = [can.Bus("hil", interface="virtual") for _ in range(2)]
     said: list[str] = []
     over = threading.Event()

@@ -98,7 +98,7 @@ class _Heard:
 
     def _listen(self) -> None:
         while not self._over.is_set():
-            for event in self._robot.events(timeout=0.5):
+            for event in self._robot.events(history=True, timeout=0.5):  # nothing is missed between two of them
                 self._on_event(event)
                 if self._over.is_set():
                     return

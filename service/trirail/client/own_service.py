@@ -19,8 +19,14 @@ from trirail.config import SIM
 from trirail.errors import RefusedError, ServiceError, TrirailError
 from trirail.processes.operating_system import python
 
-PATIENT = {"max_overruns": "1000", "missed_syncs": "2000", "missed_positions": "1000", "heartbeat": "1.0"}
-"""Keys of a configuration with which neither the loop nor the drives give up on a machine that stalls for a second."""
+PATIENT = {
+    "max_overruns": "1000",
+    "missed_syncs": "2000",
+    "missed_positions": "1000",
+    "heartbeat": "1.0",
+    "gateway_timeout": "1.0",
+}
+"""Keys of a configuration with which nobody gives up on a process that a busy machine keeps waiting for a second."""
 START_WITHIN = 300.0
 """How long it may take to come up, or at the very first start to compile a function [s]."""
 END_WITHIN = 20.0

@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 OLDEST = 3
-"""The greatest age of a position that is looked at, in SYNCs: at the next one the drive is silent."""
+"""The greatest age of a position that is compared with its setpoint [SYNCs]: at the next one a real drive is silent."""
 PASSED, STANDS = 1, 2
 """What command finds beside what is refused: the goal under way has ended on the path, the motion stands."""
 FAR = 1000
@@ -116,9 +116,11 @@ def observe(
             told.velocity[i] = (now.position[i] - before.position[i]) / (cycles * period)
         # A drive reaches at a SYNC the setpoint that it took up one SYNC ago, which was written a cycle earlier.
         age = min(now.age[i], OLDEST)
-        due = written[len(written) - 2 - age, i]
         told.backlash[i] = due_offset(kept, age, i)
-        told.following_error[i] = due - now.position[i] if now.follows[i] else 0.0
+        if not now.follows[i]:
+            told.following_error[i] = 0.0
+        elif now.age[i] <= OLDEST:  # else what was due then is not known any more, and the error stays what it was
+            told.following_error[i] = written[len(written) - 2 - age, i] - now.position[i]
         if beyond == 0 and not abs(told.following_error[i]) <= limit:
             beyond = 1 + i
         jumps[i] = not abs(told.velocity[i]) <= fastest

@@ -301,7 +301,8 @@ class Supervisor:
                 self._kill_unwilling(child)
                 self._failed = True
             # In a start that is interrupted, the SIGTERM may come before they have said what it is to do.
-            self._failed = self._failed or (self._turned and child.returncode != 0)
+            up = self._turned and child.ready_with is not None
+            self._failed = self._failed or (up and child.returncode != 0)
             self._forget(child)
 
     def _kill_unwilling(self, child: ChildProcess) -> None:
