@@ -235,7 +235,7 @@ def test_the_lease_is_taken_over_by_a_role_that_may(rig: Rig, monkeypatch: pytes
     if role is Role.MAINTAINER:
         assert link.sent == [CommandRequest(1, "ann", Command.ACQUIRE, AcquireLease("l", 0.5, force=True))]
     else:
-        said = "ann is a operator at demo: taking the lease over needs maintainer"
+        said = "ann is operator at demo: taking the lease over needs maintainer"
         assert link.sent == [RefusedRequest("ann", said)]
 
 

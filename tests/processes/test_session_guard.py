@@ -140,7 +140,7 @@ def test_a_role_does_what_it_may_and_is_told_of_the_rest(served: Served, name: s
             does, f"cmd/{name}/{does}"
         )
         assert caught.value.code is RefusalCode.NOT_ALLOWED
-        assert str(caught.value) == f"{name} is a {role} at demo: {key} needs {needed}"
+        assert str(caught.value) == f"{name} is {role} at demo: {key} needs {needed}"
         assert len(loop.asked) == before
 
 

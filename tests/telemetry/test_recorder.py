@@ -202,17 +202,17 @@ def test_a_full_disk_is_counted_and_said_and_recording_goes_on(tmp_path: Path, m
 def test_a_stuck_disk_is_left_alone_until_it_answers() -> None:
     stream = _Stream()
     archive = Archive(stream, Path("/tmp/x.rrd"))  # type: ignore[arg-type]
-    archive.send([])
+    archive.write_chunks([])
     assert archive.lost == 0
     stream.stuck = True
-    archive.send([])
-    archive.send([])
+    archive.write_chunks([])
+    archive.write_chunks([])
     assert archive.lost == 2
     assert stream.sent == 2  # Rerun's sink would block for ever if it were sent more
     archive.close()
     assert not stream.closed
     stream.stuck = False
-    archive.send([])
+    archive.write_chunks([])
     assert archive.lost == 2
     archive.close()
     assert stream.closed
@@ -248,10 +248,10 @@ def test_a_slow_viewer_is_skipped_to_the_newest() -> None:
 
     relay = Relay(deliver, finished.set)
     batches: list[Any] = [[number] for number in range(2 * BACKLOG + 5)]
-    relay.send(batches[0])
+    relay.write_chunks(batches[0])
     assert began.wait(WITHIN)
     for batch in batches[1:]:
-        relay.send(batch)
+        relay.write_chunks(batch)
     go_on.set()
     relay.close()
     assert finished.is_set()
@@ -265,7 +265,7 @@ class Kept:
     def __init__(self) -> None:
         self.drawn: list[list[Chunk]] = []
 
-    def send(self, chunks: list[Chunk]) -> None:
+    def write_chunks(self, chunks: list[Chunk]) -> None:
         if any(chunk.entity_path == PLATFORM for chunk in chunks):
             self.drawn.append(chunks)
 

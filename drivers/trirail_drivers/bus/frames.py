@@ -17,6 +17,7 @@ from trirail_drivers.bus.can_frame import (
     REMOTE,
     STANDARD_BITS,
 )
+from trirail_drivers.errors import BusError
 
 
 def frame_bits(n: int) -> int:
@@ -87,3 +88,11 @@ def unpacked(packed: bytes, timestamp: float = 0.0) -> can.Message:
         dlc=length,
         data=None if identifier & REMOTE else data[:length],
     )
+
+
+def send_in_setup(bus: can.BusABC, frame: Frame) -> None:
+    """Send a frame before the cycle runs; BusError where the bus does not take it."""
+    try:
+        bus.send(frame.message())
+    except (can.CanError, OSError) as error:
+        raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error

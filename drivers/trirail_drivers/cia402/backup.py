@@ -10,11 +10,12 @@ from typing import Any, Final, NamedTuple, TypeVar
 import can
 from canopen.objectdictionary import ODArray, ODVariable
 
+from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames, eds, setup
 from trirail_drivers.cia402.conversations import side_by_side, until
 from trirail_drivers.cia402.makers_objects import address, owned
 from trirail_drivers.cia402.objects import Key
-from trirail_drivers.cia402.one_drive import HAS_POWER, greet, send
+from trirail_drivers.cia402.one_drive import HAS_POWER, greet
 from trirail_drivers.cia402.other_masters import NoOtherMaster
 from trirail_drivers.cia402.parameter_file import Different, Origin, Saved, compare
 from trirail_drivers.cia402.parameters import BYTES, Parameter, is_parameter, of_kind, parameter
@@ -193,7 +194,7 @@ async def _restore(
     await greet(remote, drive.node, wakes=False)
     await _without_power(remote)
     _check(remote.name, saved.origin, await _origin(remote, drive), replace=replace)
-    send(remote.client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
+    send_in_setup(remote.client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
     kept = {key: _kept(remote, key, each, saved.origin.vendor) for key, each in saved.parameters.items()}
     meant = {key: each for key, each in saved.parameters.items() if not kept[key]}
     written: dict[Key, None] = {}

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import can
-
-from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.conversations import LOG
 from trirail_drivers.cia402.differences import Difference, Differences
@@ -23,7 +21,7 @@ from trirail_drivers.cia402.settings import give_cycle, give_homing, give_reacti
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.scaling import Scale
-from trirail_drivers.errors import BusError, DriveError, DriveTimeout
+from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
@@ -152,14 +150,6 @@ async def bring(one: OneDrive, remote: Remote) -> SetUp:
     )
 
 
-def send(bus: can.BusABC, frame: Frame) -> None:
-    """Send a frame; BusError where the bus does not take it."""
-    try:
-        bus.send(frame.message())
-    except (can.CanError, OSError) as error:
-        raise BusError(f"cannot send on {bus.channel_info}: {error}; is the interface up?") from error
-
-
 async def greet(remote: Remote, node: int, *, wakes: bool) -> None:
     """Wait until the node answers, as long as it may take to boot, and see that it is a CiA 402 drive.
 
@@ -180,7 +170,7 @@ async def greet(remote: Remote, node: int, *, wakes: bool) -> None:
             remote.boots = True
         except RestartedError:
             if wakes:
-                send(client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
+                send_in_setup(client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
     remote.boots = False
     if device_type & 0xFFFF != 402:
         raise DriveError(

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import can
 
+from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames, eds
-from trirail_drivers.cia402.one_drive import OneDrive, SetUp, Start, bring, look_over, send, start
+from trirail_drivers.cia402.one_drive import OneDrive, SetUp, Start, bring, look_over, start
 from trirail_drivers.cia402.sdo import Remote, together
 from trirail_drivers.cia402.sdo_client import Client
 from trirail_drivers.cia402.settings import check_nodes, heartbeat_of, interpolation_periods
@@ -39,7 +40,7 @@ def configure(
     interpolation_periods(period)
     each = _drives(bus, drives, scales, period, clock)
     for drive in drives.each:
-        send(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
+        send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
     # Everything is refused that can be told by reading, of every drive, before the first value is written.
     _accepted(together(bus, clock, [one.remote for one in each], "reading", [look_over(one) for one in each]))
     done = _accepted(
@@ -47,7 +48,7 @@ def configure(
     )
     raise_all([found for found in (_velocity_refused(made, fastest) for made in done) if found is not None])
     for drive in drives.each:
-        send(bus, canopen_frames.nmt(canopen_frames.NMT_START, drive.node))
+        send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_START, drive.node))
     starts = together(bus, clock, [one.remote for one in each], "starting", [start(one.remote) for one in each])
     raise_all([each for each in starts if isinstance(each, DriveError)])
     return tuple((made, each) for made, each in zip(done, starts, strict=True) if isinstance(each, Start))

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import can
 
-from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.errors import BusError
 from trirail_drivers.interface import Clock
@@ -24,11 +23,3 @@ def late(
         except (can.CanError, OSError) as error:
             raise BusError(f"cannot receive on {wire.bus.channel_info}: {error}") from error
     return lacking
-
-
-def send(wire: Wire, frame: Frame) -> None:
-    """Send a frame; BusError where the bus does not take it."""
-    try:
-        wire.bus.send(frame.message())
-    except (can.CanError, OSError) as error:
-        raise BusError(f"cannot send on {wire.bus.channel_info}: {error}; is the interface up?") from error

@@ -6,12 +6,13 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock
 from trirail_drivers.odrive import cansimple, flat_endpoints
-from trirail_drivers.odrive.asking import late, send
+from trirail_drivers.odrive.asking import late
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.flat_endpoints import Endpoint
 from trirail_drivers.odrive.protections import NEEDED, SETTINGS, Settings
@@ -51,7 +52,7 @@ def _read_each(
     for _ in range(TRIES):
         for axis in missing:
             data = cansimple.SDO.pack(cansimple.READ, wanted[axis.name], 0)
-            send(wire, cansimple.command(axis.node, cansimple.RX_SDO, data))
+            send_in_setup(wire.bus, cansimple.command(axis.node, cansimple.RX_SDO, data))
         missing = late(
             wire, missing, clock, timeout / TRIES, lambda axis: axis.sdo is None or axis.sdo[0] != wanted[axis.name]
         )

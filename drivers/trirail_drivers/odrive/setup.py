@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
@@ -24,7 +25,7 @@ from trirail_drivers.driver.refusals import judged, raise_all
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock
 from trirail_drivers.odrive import cansimple, settings
-from trirail_drivers.odrive.asking import late, send
+from trirail_drivers.odrive.asking import late
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
 from trirail_drivers.odrive.protections import PROTECTIONS, Settings, check_watchdog, lacking
@@ -61,11 +62,13 @@ def configure(
     Raises DriveError; of its kinds, DriveTimeout for a drive that does not answer. Errors of a drive are none here.
     """
     for axis in axes:
-        send(wire, cansimple.command(axis.node, cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(AxisState.IDLE)))
+        send_in_setup(
+            wire.bus, cansimple.command(axis.node, cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(AxisState.IDLE))
+        )
         axis.note_request(AxisState.IDLE)
         axis.sync_sent()
         for number in (cansimple.GET_VERSION, cansimple.GET_ERROR, cansimple.GET_ENCODER_ESTIMATES):
-            send(wire, cansimple.request(axis.node, number))
+            send_in_setup(wire.bus, cansimple.request(axis.node, number))
     for axis in late(wire, axes, clock, drives.sdo_timeout, _missing):
         raise DriveTimeout(axis.name, f"answer to {_missing(axis)}", drives.sdo_timeout)
     for axis in axes:

@@ -219,7 +219,7 @@ class Connection:
         if role is None:
             problem = f"{user} has no role at {self.robot}: its [zenoh.users] does not name him, or he is revoked"
         elif not Role(role).includes(needed):
-            problem = f"{user} is a {role} at {self.robot}: {'/'.join(parts)} needs {needed}"
+            problem = f"{user} is {role} at {self.robot}: {'/'.join(parts)} needs {needed}"
         else:
             return None
         return RefusedError(RefusalCode.NOT_ALLOWED, problem)

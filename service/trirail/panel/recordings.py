@@ -47,7 +47,7 @@ class Recordings:
         """Return the folder, whether it is here, and its sessions, the newest first, ready to be encoded."""
         return {"folder": str(self._folder), "here": self._here, "sessions": self._sessions()[: -LISTED - 1 : -1]}
 
-    def send(self, opened: ServerConnection, name: str, headers: dict[str, str]) -> Response | None:
+    def send_file(self, opened: ServerConnection, name: str, headers: dict[str, str]) -> Response | None:
         """Send a recording, however large, as a file to be kept; None where there is no such one."""
         if not self._here or SHOWABLE.fullmatch(name) is None:
             return None

@@ -106,7 +106,7 @@ class Guard:
         """Raise RefusedError where a user's role does not allow what is asked."""
         role = self.role(user)
         if role is None or not role.includes(needed):
-            his = f"is a {role}" if role is not None else "has no role"
+            his = f"is {role}" if role is not None else "has no role"
             problem = f"{user} {his} at {self._robot}: {what} needs {needed}"
             raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
 

@@ -240,7 +240,7 @@ class Recorder:
         self._entered = words
 
     def _record(self, records: NDArray[np.void]) -> None:
-        self._files.send(self._streams.scene.complete(records))
+        self._files.write_chunks(self._streams.scene.complete(records))
 
     def _flush(self) -> None:
         self._records.flush()

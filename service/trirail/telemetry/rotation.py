@@ -75,14 +75,14 @@ class RotatedFiles:
         except OSError:
             return 0
 
-    def send(self, chunks: list[Chunk]) -> None:
+    def write_chunks(self, chunks: list[Chunk]) -> None:
         """Write a batch, or count it as lost. Waits for the disk, but not for long."""
         now = self._clock()
         if self._archive.gone and (self._retry is None or now >= self._retry):
             self._retry, deleted = now + RETRY, self.path
             if self.turn():
                 self._warn(f"{deleted} has been deleted or moved: the recording goes on in {self.path}")
-        self._archive.send(chunks)
+        self._archive.write_chunks(chunks)
         self.cause = self.trouble or self.cause
         if self._archive.gone:
             return

@@ -67,7 +67,7 @@ class Archive:
         self._identity = identity(path)
         self._stuck = False
 
-    def send(self, chunks: list[Chunk]) -> None:
+    def write_chunks(self, chunks: list[Chunk]) -> None:
         """Write a batch, or count it as lost. Waits for the disk, but not for long."""
         self.trouble = self._write(chunks)
         self.lost += bool(self.trouble)
@@ -122,7 +122,7 @@ class Relay:
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self._thread.start()
 
-    def send(self, chunks: list[Chunk]) -> None:
+    def write_chunks(self, chunks: list[Chunk]) -> None:
         """Take a batch; never blocks."""
         with self._changed:
             if len(self._waiting) == BACKLOG:

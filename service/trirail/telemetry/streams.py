@@ -34,7 +34,7 @@ REPORT_EVERY = 10.0
 class Sink(Protocol):
     """Takes batches; what it cannot take it counts."""
 
-    def send(self, chunks: list[Chunk]) -> None:
+    def write_chunks(self, chunks: list[Chunk]) -> None:
         """Take a batch; never waits for long."""
 
 
@@ -141,7 +141,7 @@ class Streams:
         self._waiting, self._entries = [], []
         if chunks:
             for sink in self._paces:
-                sink.send(chunks)
+                sink.write_chunks(chunks)
 
     def flush(self) -> None:
         """Pass on all there is."""
@@ -158,7 +158,7 @@ class Streams:
         chunks = self._placed(self.scene.drawn(records, self._standing))
         for sink, pace in self._paces.items():
             if pace == hz:
-                sink.send(chunks)
+                sink.write_chunks(chunks)
 
     def _placed(self, chunks: list[Chunk]) -> list[Chunk]:
         root = self.shown.root
