@@ -137,7 +137,7 @@ def main() -> int:
             bus_to_be_on(options.interface, options.channel, config) as wire,
             simulated_bus(config.can, config.drives) as bus,
         ):
-            bus.faults.tell = say
+            bus.faults.announce = say
             bus.faults.seed(options.seed)
             if options.faults:
                 bus.faults.load(options.faults)

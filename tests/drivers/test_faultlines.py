@@ -34,7 +34,7 @@ class Rig:
         servo = (Servo(0.0, time_constant=0.0, max_velocity=2e6, max_acceleration=1e9) for _ in range(3))
         drives = [SimulatedDrive(node, each) for node, each in enumerate(servo, start=1)]
         self.said: list[str] = []
-        self.faults = Faults(drives, [SCALE, -SCALE, SCALE], CIA402.fault_frames, seed=7, tell=self.said.append)
+        self.faults = Faults(drives, [SCALE, -SCALE, SCALE], CIA402.fault_frames, seed=7, announce=self.said.append)
         self.drives = drives
         self.bus = SimulatedBus(drives, lambda: self.now, self.faults)
         for drive in drives:

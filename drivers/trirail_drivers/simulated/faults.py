@@ -67,15 +67,15 @@ class Faults:
         counts_per_metre: Sequence[float],
         frames: Mapping[str, Frames],
         seed: int = 0,
-        tell: Callable[[str], None] = _to_nobody,
+        announce: Callable[[str], None] = _to_nobody,
         mounted: Sequence[Mounted] | None = None,
     ) -> None:
         """`counts_per_metre`: negative where counts fall as the slider rises. `frames`: those that lines can name.
 
-        `tell`: hears what begins and ends. `mounted`: what each drive really moves, where that is not its own slider
-        by those counts; a line names a drive by that slider.
+        `announce`: hears what begins and ends. `mounted`: what each drive really moves, where that is not its own
+        slider by those counts; a line names a drive by that slider.
         """
-        self.tell = tell
+        self.announce = announce
         self._mounted = [Mounted(*each) for each in enumerate(counts_per_metre)] if mounted is None else list(mounted)
         self._drive_of = {each.slider: index for index, each in enumerate(self._mounted)}
         self.carriages = Carriages([drive.servo for drive in drives], [each.counts_per_metre for each in self._mounted])
@@ -236,7 +236,7 @@ class Faults:
         fault = active.fault
         active.begun = True
         active.since = self._now
-        self.tell(f"begins: {fault.line}")
+        self.announce(f"begins: {fault.line}")
         self._break_drives()
         match fault.name:
             case "emcy":
@@ -258,7 +258,7 @@ class Faults:
 
     def _end(self, active: _Active) -> None:
         fault = active.fault
-        self.tell(f"is over: {fault.line}" + (f" ({active.struck} frames)" if self._strikes_frames(fault) else ""))
+        self.announce(f"is over: {fault.line}" + (f" ({active.struck} frames)" if self._strikes_frames(fault) else ""))
         match fault.name:
             case "emcy":
                 for errors in self._emergencies(fault):

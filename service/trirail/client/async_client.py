@@ -189,8 +189,8 @@ class AsyncRobot:
 
         goal_id = id or uuid.uuid4().hex[:12]
 
-        def post(goal: Goal, take: Taker) -> None:
-            self._connection.post(("goal", self.user), GoalReply, goal_message(lambda _: goal, goal_id), take)
+        def post(goal: Goal, deliver: Taker) -> None:
+            self._connection.post(("goal", self.user), GoalReply, goal_message(lambda _: goal, goal_id), deliver)
 
         return AsyncTrack(self.send, post, goal_id, timeout)
 
@@ -273,9 +273,9 @@ class AsyncRobot:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
         return self._connection.events(history, seconds(timeout))
 
-    def records(self, take: Callable[[bytes], None]) -> AbstractContextManager[Any]:
+    def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
         """Have every batch of records taken in the event loop, until the context ends, as Robot.records does."""
-        return self._connection.records(take)
+        return self._connection.records(deliver)
 
     @property
     def _connection(self) -> AsyncConnection:

@@ -90,10 +90,10 @@ class AsyncConnection:
         return reply
 
     def post(
-        self, parts: tuple[str, ...], kind: type[T], payload: bytes, take: Callable[[T | TrirailError], None]
+        self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
         """Query the key of these parts, and have what comes of it taken in the event loop, as Connection.post does."""
-        self._connection.post(parts, kind, payload, self._hand_over(take))
+        self._connection.post(parts, kind, payload, self._hand_over(deliver))
 
     def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
         """Query the key of these parts, and wait for no answer."""
@@ -134,20 +134,20 @@ class AsyncConnection:
         """Whether a state is of before the newest answer or event that this client has."""
         return self._connection.overtaken(state)
 
-    def subscribe_to_events(self, take: Callable[[Event], None], *, history: bool) -> AbstractContextManager[Any]:
+    def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AbstractContextManager[Any]:
         """Have every event taken in the event loop, with `history` the past too."""
-        return self._connection.subscribe_to_events(self._hand_over(take), history=history)
+        return self._connection.subscribe_to_events(self._hand_over(deliver), history=history)
 
-    def records(self, take: Callable[[bytes], None]) -> AbstractContextManager[Any]:
+    def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
         """Have every batch of records taken in the event loop, until the subscriber's context ends."""
-        return self._connection.records(self._hand_over(take))
+        return self._connection.records(self._hand_over(deliver))
 
-    def _hand_over(self, take: Callable[..., None]) -> Callable[..., None]:
+    def _hand_over(self, deliver: Callable[..., None]) -> Callable[..., None]:
         """Return what has something taken in the event loop; for Zenoh's threads."""
 
         def hand_over(*what: object) -> None:
             with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to take it
-                self._loop.call_soon_threadsafe(take, *what)
+                self._loop.call_soon_threadsafe(deliver, *what)
 
         return hand_over
 

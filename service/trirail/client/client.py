@@ -300,8 +300,8 @@ class Robot:
 
         goal_id = id or uuid.uuid4().hex[:12]
 
-        def post(goal: Goal, take: Taker) -> None:
-            self._connection.post(("goal", self.user), GoalReply, goal_message(lambda _: goal, goal_id), take)
+        def post(goal: Goal, deliver: Taker) -> None:
+            self._connection.post(("goal", self.user), GoalReply, goal_message(lambda _: goal, goal_id), deliver)
 
         return Track(self.send, post, goal_id, timeout)
 
@@ -515,12 +515,12 @@ class Robot:
         """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
         return self._connection.events(history, seconds(timeout))
 
-    def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
+    def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
         """Have every batch of records taken as it comes, until the context ends; wire.records.unpack reads them.
 
-        `take` is called by the connection's own thread: it must be quick.
+        `deliver` is called by the connection's own thread: it must be quick.
         """
-        return self._connection.records(take)
+        return self._connection.records(deliver)
 
     # ------------------------------------------------------------------ inside
 

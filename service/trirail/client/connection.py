@@ -146,28 +146,28 @@ class Connection:
         return reply
 
     @contextlib.contextmanager
-    def copies(self, stop: StopOrder, take: Callable[[Outcome], None]) -> Iterator[Outcomes]:
+    def copies(self, stop: StopOrder, deliver: Callable[[Outcome], None]) -> Iterator[Outcomes]:
         """Send all copies of a stop, and have what comes of each taken, by whatever thread; until the context ends."""
-        at_door = stop.at_door(self._connect, self._credentials, lambda outcome: take(self._noted(outcome)))
+        at_door = stop.at_door(self._connect, self._credentials, lambda outcome: deliver(self._noted(outcome)))
         try:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
-            self._post(query, CommandReply, take)
+            self._post(query, CommandReply, deliver)
             yield Outcomes(2 if at_door is not None else 1)
         finally:
             if at_door is not None:
                 at_door.cancel()
 
     def post(
-        self, parts: tuple[str, ...], kind: type[T], payload: bytes, take: Callable[[T | TrirailError], None]
+        self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
-        """Query the key of these parts without waiting: `take` gets a message of `kind`, or why there is none.
+        """Query the key of these parts without waiting: `deliver` gets a message of `kind`, or why there is none.
 
         It is called once, by a thread of the connection: it must be quick.
         """
         query = self.query(parts, payload, POST_WITHIN) | {"congestion_control": zenoh.CongestionControl.DROP}
-        self._post(query, kind, take)
+        self._post(query, kind, deliver)
 
-    def _post(self, query: dict[str, Any], kind: type[T], take: Callable[[T | TrirailError], None]) -> None:
+    def _post(self, query: dict[str, Any], kind: type[T], deliver: Callable[[T | TrirailError], None]) -> None:
         answers: list[T | TrirailError] = []
 
         def on_reply(reply: zenoh.Reply) -> None:
@@ -178,7 +178,7 @@ class Connection:
 
         def on_end() -> None:
             silent = SilenceError(self._silent("is its service running?"))
-            take(answers[0] if answers else silent)
+            deliver(answers[0] if answers else silent)
 
         handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
         self._session.get(**query, handler=handler)
@@ -249,23 +249,23 @@ class Connection:
         with self.subscribe_to_events(once(received.put), history=history):
             yield from _until_silent(received, timeout)
 
-    def subscribe_to_states(self, take: Callable[[State], None]) -> zenoh.Subscriber[None]:
+    def subscribe_to_states(self, deliver: Callable[[State], None]) -> zenoh.Subscriber[None]:
         """Have every state taken, until the subscriber's context ends."""
-        return self._session.declare_subscriber(self._key("state"), self._reader.messages(State, take))
+        return self._session.declare_subscriber(self._key("state"), self._reader.messages(State, deliver))
 
-    def subscribe_to_events(self, take: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
+    def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
         """Have every event taken, with `history` the past too, that of a gateway that was started again as well."""
         return declare_advanced_subscriber(
             self._session,
             self._key("event"),
-            self._reader.messages(Event, lambda event: take(self._noted(event))),
+            self._reader.messages(Event, lambda event: deliver(self._noted(event))),
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
 
-    def records(self, take: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
+    def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
         """Have every batch of records taken, until the subscriber's context ends."""
-        return self._session.declare_subscriber(self._key("records"), self._reader.batches(take))
+        return self._session.declare_subscriber(self._key("records"), self._reader.batches(deliver))
 
     def users(self) -> list[str]:
         """Return the users who have a session to this robot, by name."""
@@ -297,7 +297,7 @@ class Connection:
         return zenoh_session.key(self.robot, *parts)
 
 
-def once(take: Callable[[Event], object]) -> Callable[[Event], None]:
+def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
     """Return what takes events of which some come again: each is taken once, in order.
 
     A gateway that was started again tells the past once more; a service that was, counts from one.
@@ -308,7 +308,7 @@ def once(take: Callable[[Event], object]) -> Callable[[Event], None]:
         nonlocal last
         if event.seq > last[0] or event.time > last[1]:
             last = event.seq, event.time
-            take(event)
+            deliver(event)
 
     return take_new
 

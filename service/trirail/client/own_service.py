@@ -36,10 +36,10 @@ Process = subprocess.Popen[bytes]
 
 
 @contextlib.contextmanager
-def service(config: Path, recording: Path, told: Callable[[str], None] = lambda _: None) -> Iterator[Process]:
+def service(config: Path, recording: Path, report_start: Callable[[str], None] = lambda _: None) -> Iterator[Process]:
     """Run a service of a configuration file that is up, and records to a file; end it when the context ends.
 
-    `told` is called with what it says of its start: how far the very first one's compiling is.
+    `report_start` is called with what it says of its start: how far the very first one's compiling is.
 
     Raises ServiceError if it cannot start. Where the context ends with an error that is no refusal, what the service
     said goes to standard error first.
@@ -47,7 +47,7 @@ def service(config: Path, recording: Path, told: Callable[[str], None] = lambda 
     with tempfile.TemporaryFile() as log:
         process = None
         try:
-            process = start(config, log, "--record", str(recording), told=told)
+            process = start(config, log, "--record", str(recording), report_start=report_start)
             yield process
         except RefusedError:
             raise  # it works, and has said why not
@@ -61,7 +61,11 @@ def service(config: Path, recording: Path, told: Callable[[str], None] = lambda 
 
 
 def start(
-    config: Path, log: IO[bytes], *arguments: str, told: Callable[[str], None] = lambda _: None, **environment: str
+    config: Path,
+    log: IO[bytes],
+    *arguments: str,
+    report_start: Callable[[str], None] = lambda _: None,
+    **environment: str,
 ) -> Process:
     """Start a service, and wait until it is up; the caller has to `end` it.
 
@@ -80,7 +84,7 @@ def start(
             env=os.environ | {"NOTIFY_SOCKET": ready.getsockname()} | environment,
         )
         try:
-            _wait(process, ready, told)
+            _wait(process, ready, report_start)
         except BaseException:
             end(process)
             raise
@@ -113,7 +117,7 @@ def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
     return path, locator
 
 
-def _wait(process: Process, ready: socket.socket, told: Callable[[str], None]) -> None:
+def _wait(process: Process, ready: socket.socket, report_start: Callable[[str], None]) -> None:
     deadline = time.monotonic() + START_WITHIN
     while time.monotonic() < deadline:
         with contextlib.suppress(TimeoutError):
@@ -121,7 +125,7 @@ def _wait(process: Process, ready: socket.socket, told: Callable[[str], None]) -
             if said == "READY=1":
                 return
             deadline = time.monotonic() + START_WITHIN
-            told(said.partition("STATUS=")[2].partition("\n")[0])
+            report_start(said.partition("STATUS=")[2].partition("\n")[0])
         if process.poll() is not None:
             raise ServiceError("the service could not start, see above")
     raise ServiceError(f"the service was not up within {START_WITHIN:g} s")

@@ -27,8 +27,8 @@ class SampleReader:
         self.skipped = 0
         """Samples that were no messages."""
 
-    def messages(self, kind: type[T], take: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return what decodes messages of a `kind`, JSON or msgpack as their encoding says, and hands them to `take`.
+    def messages(self, kind: type[T], deliver: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+        """Return what decodes messages of a `kind`, JSON or msgpack by their encoding, and hands them to `deliver`.
 
         That is called at once and in the connection's own thread: it must be quick.
         """
@@ -38,16 +38,16 @@ class SampleReader:
             message: T = boundary.decode(sample.payload.to_bytes(), kind, what, str(sample.encoding))
             return message
 
-        return self._handler(read, take)
+        return self._handler(read, deliver)
 
-    def batches(self, take: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+    def batches(self, deliver: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
         """Return what hands over batches of records, likewise: whole ones, packed as wire.records has them."""
         from trirail.wire import records  # with numpy, which most commands do without
 
-        return self._handler(lambda sample: records.checked(sample.payload.to_bytes()), take)
+        return self._handler(lambda sample: records.checked(sample.payload.to_bytes()), deliver)
 
     def _handler(
-        self, read: Callable[[zenoh.Sample], T | bytes], take: Callable[..., None]
+        self, read: Callable[[zenoh.Sample], T | bytes], deliver: Callable[..., None]
     ) -> zenoh.handlers.Callback[zenoh.Sample]:
         def on_sample(sample: zenoh.Sample) -> None:
             try:
@@ -55,7 +55,7 @@ class SampleReader:
             except RefusedError as refusal:
                 self._skip(str(sample.key_expr), refusal)
             else:
-                take(content)
+                deliver(content)
 
         # Not indirect: that would be a thread of Zenoh's that keeps Python from ending.
         return zenoh.handlers.Callback(on_sample, indirect=False)

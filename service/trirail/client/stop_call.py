@@ -59,7 +59,7 @@ class StopOrder(NamedTuple):
         return "cmd", self.user, self.name
 
     def at_door(
-        self, locator: str, credentials: Credentials | None, take: Callable[[Outcome], None]
+        self, locator: str, credentials: Credentials | None, deliver: Callable[[Outcome], None]
     ) -> StopCall | None:
         """Ask at the door beside a locator, and have the outcome taken; None where there is no door."""
         address = stop_address(locator)
@@ -67,7 +67,7 @@ class StopOrder(NamedTuple):
         line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
         if address is None or len(line) > MAX_LINE:
             return None
-        return StopCall(address, credentials, line, self.within, take)
+        return StopCall(address, credentials, line, self.within, deliver)
 
 
 class Outcomes:
@@ -93,7 +93,7 @@ class Outcomes:
 
 
 class StopCall:
-    """A stop at the door beside a locator; `take` gets its outcome, once, from a thread of its own."""
+    """A stop at the door beside a locator; `deliver` gets its outcome, once, from a thread of its own."""
 
     def __init__(
         self,
@@ -101,13 +101,13 @@ class StopCall:
         credentials: Credentials | None,
         line: bytes,
         within: float,
-        take: Callable[[Outcome], None],
+        deliver: Callable[[Outcome], None],
     ) -> None:
         self._address = address
         self._credentials = credentials
         self._line = line
         self._deadline = time.monotonic() + within
-        self._take = take
+        self._deliver = deliver
         self._cancelled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="stop at the door", daemon=True)
         self._thread.start()
@@ -122,11 +122,11 @@ class StopCall:
 
     def _run(self) -> None:
         try:
-            self._take(self._query_until_answered())
+            self._deliver(self._query_until_answered())
         except TrirailError as error:
-            self._take(error)
+            self._deliver(error)
         except Exception as error:  # noqa: BLE001 - whoever waits gets an outcome, whatever it is
-            self._take(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
+            self._deliver(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
 
     def _query_until_answered(self) -> CommandReply:
         """Ask until there is an answer. Raises RefusedError where that is a no, ServiceError where none comes."""

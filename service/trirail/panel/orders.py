@@ -81,7 +81,7 @@ class Orders:
             return
         self._under_way.add(name)
 
-        def tell() -> None:
+        def send_command() -> None:
             try:
                 if name is Command.ACQUIRE:
                     self._acquire()
@@ -92,7 +92,7 @@ class Orders:
             finally:
                 self._under_way.discard(name)
 
-        if not self._begin(tell, name):
+        if not self._begin(send_command, name):
             self._under_way.discard(name)
 
     def _acquire(self, *, force: bool = False) -> None:

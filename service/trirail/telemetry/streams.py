@@ -201,9 +201,9 @@ class Shortfall:
 class Batches:
     """Records, put together until there are enough to be worth passing on."""
 
-    def __init__(self, size: int, take: Callable[[NDArray[np.void]], None]) -> None:
+    def __init__(self, size: int, deliver: Callable[[NDArray[np.void]], None]) -> None:
         self._enough = max(1, size) * DTYPE.itemsize
-        self._take = take
+        self._deliver = deliver
         self._pending = bytearray()
 
     def add(self, batch: bytes) -> None:
@@ -217,4 +217,4 @@ class Batches:
         if self._pending:
             records = unpack(bytes(self._pending))
             self._pending.clear()
-            self._take(records)
+            self._deliver(records)
