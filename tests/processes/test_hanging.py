@@ -8,11 +8,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.processes.heartbeats import Effort, HangWatch, Heartbeats, effort
+from trirail.config import SIM, load
+from trirail.processes.child_process import Child, Order
+from trirail.processes.heartbeats import PROCESSES, Effort, HangWatch, Heartbeats, effort
 
 TURN = 0.1
 TURNS = st.tuples(st.booleans(), st.sampled_from("RDSTtZ"), st.floats(0.0, TURN))
@@ -54,6 +58,23 @@ def test_one_that_gets_nothing_of_the_machine_never_hangs(turns: int, state: str
 def test_nobody_hangs_who_is_not_expected_to_beat() -> None:
     watch = HangWatch(Heartbeats.create().of("planner"), 0.7, TURN, lambda _: Effort("S", 0.0))
     assert not any(watch.hangs(1) for _ in range(100))
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_who_says_that_it_is_up_is_expected_to_beat_from_then_on(name: str) -> None:
+    heartbeats = Heartbeats.create()
+    hears, voice = os.pipe()
+    try:
+        child = Child(name, Order(load(SIM), None), Path(), heartbeats, [], voice)
+        child.compiling("a function")
+        assert heartbeats.of(name).count == 0
+        child.ready({"lacking": ()})
+    finally:
+        os.close(voice)
+    watch = HangWatch(heartbeats.of(name), 0.7, TURN, lambda _: Effort("S", 0.0))
+    assert any(watch.hangs(1) for _ in range(20))
+    with open(hears, "rb") as heard:
+        assert [*map(msgspec.json.decode, heard)] == [{"compiling": "a function"}, {"lacking": []}]
 
 
 @contextmanager

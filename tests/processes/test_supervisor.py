@@ -47,6 +47,10 @@ def work(child):
             heartbeats.of(name).beat()
             time.sleep(0.01)
 
+    def rest():
+        if name != "drives":
+            heartbeats.of(name).rest()
+
     def loop_gone():
         return heartbeats.of("loop").count == 0 or never()
 
@@ -55,7 +59,7 @@ def work(child):
 """
 CONFIG = load(SIM)
 TURNING = "ready(); beat_until(never)"
-RECORDING = "ready(); freeze()"
+RECORDING = "ready(); rest(); freeze()"
 HANGING = "ready(); beat_until(lambda: begun('up')); freeze()"
 SERVING = "ready(); beat_until(lambda: heartbeats.of('loop').count); beat_until(loop_gone)"
 
@@ -141,7 +145,7 @@ def test_a_frozen_loop_ends_the_service(told: list[str], tmp_path: Path) -> None
         tmp_path,
         loop_1=HANGING,
         gateway_1=TURNING,
-        recorder_1="ready(); freeze()",
+        recorder_1=RECORDING,
     )
     assert code == 1
     assert told[1] == (

@@ -22,7 +22,7 @@ from trirail_drivers.config import Can
 from trirail.config import Config
 from trirail.errors import ServiceError, TrirailError
 from trirail.processes import realtime
-from trirail.processes.heartbeats import BEAT_EVERY, Heartbeats
+from trirail.processes.heartbeats import BEAT_EVERY, PROCESSES, Heartbeats
 from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.links import Closed
@@ -70,18 +70,23 @@ class Child:
         self._voice = voice
 
     def ready(self, content: object) -> None:
-        """Say that it is up, and whatever else has no haste."""
+        """Say that it is up. Its first sign of life comes before that: one that hangs from then on is found."""
+        if self.name in PROCESSES:
+            self.heartbeats.of(self.name).beat()
+        self._say(content)
+
+    def _say(self, content: object) -> None:
         with suppress(BrokenPipeError):  # a supervisor that was killed: the loop ends by itself, and the others with it
             os.write(self._voice, msgspec.json.encode(content) + b"\n")
 
     def compiling(self, function: str) -> None:
         """Say which function is being compiled."""
-        self.ready({COMPILING: function})
+        self._say({COMPILING: function})
 
     def log(self, event: Event) -> None:
         """Say what has happened."""
         if select.select([], [self._voice], [], LOG_WITHIN)[1]:
-            self.ready({HAPPENED: event})
+            self._say({HAPPENED: event})
 
     def measured(self, content: msgspec.Struct) -> None:
         """Say what has been measured: no more than a pipe takes at once, for in a second it comes again."""
