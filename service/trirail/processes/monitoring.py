@@ -222,7 +222,7 @@ class Health:
 
     def ages(self) -> dict[str, float]:
         """Return how old that is, by process [s]."""
-        return {name: self._clock() - told for name, told in self._told.items()}
+        return {name: self._clock() - told for name, told in self._told.copy().items()}
 
     def troubles(self) -> dict[str, str]:
         """Return what is wrong, by process, "" for nothing; the supervisor is one of them."""
