@@ -43,9 +43,10 @@ def work(child):
     (folder / f"{{name}}-{{number}}.begun").touch()
 
     def beat_until(condition):
+        heartbeats.of(name).beat()
         while not (condition() or never()):
-            heartbeats.of(name).beat()
             time.sleep(0.01)
+            heartbeats.of(name).beat()
 
     def rest():
         if name != "drives":
@@ -61,7 +62,10 @@ CONFIG = load(SIM)
 TURNING = "ready(); beat_until(never)"
 RECORDING = "ready(); rest(); freeze()"
 HANGING = "ready(); beat_until(lambda: begun('up')); freeze()"
-SERVING = "ready(); beat_until(lambda: heartbeats.of('loop').count); beat_until(loop_gone)"
+SERVING = (
+    "ready(); beat_until(lambda: heartbeats.of('loop').count); (folder / 'serving.begun').touch(); "
+    "beat_until(loop_gone)"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -183,9 +187,11 @@ def test_those_that_end_because_the_loop_ends_are_not_started_again(told: list[s
     code = run(
         told,
         tmp_path,
-        loop_1="ready(); beat_until(lambda: begun('up')); heartbeats.of(name).rest(); time.sleep(0.5)",
+        loop_1="ready(); beat_until(lambda: begun('up') and begun('serving') and begun('recording')); "
+        "heartbeats.of(name).rest(); time.sleep(0.5)",
         gateway_1=SERVING,
-        recorder_1="ready(); beat = heartbeats.of('loop')\nwhile not beat.count: pass\nwhile beat.count: pass",
+        recorder_1="ready(); beat = heartbeats.of('loop')\nwhile not beat.count: pass\n"
+        "(folder / 'recording.begun').touch()\nwhile beat.count: pass",
     )
     assert code == 1
     assert told == [
