@@ -33,6 +33,7 @@ def modes(monkeypatch: pytest.MonkeyPatch) -> list[Mode]:
 @pytest.mark.long
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_stop_quick_stop_fault_and_a_lost_gateway_are_rehearsed(path: Path, modes: list[Mode]) -> None:
+    gc.collect()
     before = os.listdir("/proc/self/fd")
     assert rehearse(load(path)) == ()
     up = [Mode.ENABLING, Mode.HOLDING, Mode.MOVING]
@@ -50,4 +51,4 @@ def test_stop_quick_stop_fault_and_a_lost_gateway_are_rehearsed(path: Path, mode
         Mode.DISABLED,
     ]
     gc.collect()
-    assert len(os.listdir("/proc/self/fd")) == len(before)
+    assert len(os.listdir("/proc/self/fd")) <= len(before)  # of other tests some may be closed meanwhile
