@@ -100,11 +100,10 @@ def test_what_was_taught_outlasts_gateway_and_service(place: Place, number: int)
     with place.service(number) as process, Robot("demo", place.locator) as robot:
         robot.teach("pick")
         before = robot.poses()
-        os.kill(child(process.pid, "gateway"), signal.SIGKILL)
-        for event in robot.events(timeout=WITHIN):
-            if "gateway is gone" in event.message:
-                break
-        assert robot.state(WITHIN).mode == "disabled"
+        gateway = child(process.pid, "gateway")
+        os.kill(gateway, signal.SIGKILL)
+        wait_gone(gateway)
+        assert until(robot, lambda _: True).mode == "disabled"  # the next one says so
         assert robot.poses() == before
     with place.service(), Robot("demo", place.locator) as robot:
         assert robot.poses() == before
