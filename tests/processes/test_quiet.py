@@ -9,7 +9,7 @@ import errno
 import random
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from trirail.wire.links import Port
 from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Request, decode_answer, message
 from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
-from trirail.wire.vocabulary import Command, Mode
+from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
 from trirail_drivers.bus.frames import packed, unpacked
 from trirail_drivers.cia402.drives import Cia402
@@ -68,6 +68,8 @@ class Session:
         self.config = config
         self.late_ns = 0
         """By how much the next tick comes late."""
+        self.takes_ns = 0
+        """So long the next decision takes."""
         self.room: int | None = None
         """So many frames the bus takes in the next cycle; None for all."""
         self.beats = True
@@ -95,13 +97,18 @@ class Session:
             self._stack.callback(closes.close)
         self.hearts = Heartbeats.create()
         self.motion = MotionPlanner(config)
-        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet, now=lambda: self.now_ns)
+        self.loop = Loop(config, driver, ports, self.hearts, quiet=quiet, now=self.decide)
         self.loop.begin()
         self.ticker = Ticker(round(config.period * 1e9), lambda: self.now_ns, self.sleep)
         self.heard: list[object] = []
 
     def clock(self) -> float:
         return self.now_ns / 1e9
+
+    def decide(self) -> int:
+        """The time when a decision begins, or has been taken."""
+        self.now_ns, self.takes_ns = self.now_ns + self.takes_ns, 0
+        return self.now_ns
 
     def clock_of_driver(self) -> float:
         """The same; while drives are set up it goes on when it is looked at."""
@@ -560,3 +567,27 @@ def _difference(one: object, other: object) -> str:
             f"{name}: {a[name]} {b[name]}" for name in a.dtype.names if not np.array_equal(a[name], b[name])
         )
     return f"{one}\n{other}"
+
+
+@pytest.mark.parametrize("slow", [(), (1,), (0, 2), (1, 3), (1, 3, 5), range(0, 20, 2), range(1, 20, 2), range(20)])
+def test_an_event_belongs_to_the_first_cycle_that_it_shows_in(slow: Sequence[int], tmp_path: Path) -> None:
+    """However long it took to decide, and whoever runs the cycle behind which it is said."""
+
+    def ask(number: int) -> Happening:
+        goal = PoseGoal(0.01 * (number // 300), 0.0, 0.0)
+        return Happening(lambda session: session.ask(GoalRequest(number, "ann", f"g{number}", goal, session.now_ns)))
+
+    def script() -> dict[int, list[Happening]]:
+        script = {30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))]}
+        for number in range(300, 1500, 300):
+            for late in slow:
+                script[number + late] = [Happening(lambda session: setattr(session, "takes_ns", 150_000))]
+            script.setdefault(number, []).append(ask(number))
+        return script
+
+    for session in both_ways(fast(), tmp_path, script, CYCLES):
+        events = [what for what in session.heard if isinstance(what, tuple) and len(what) == 6]
+        records = unpack(b"".join(what for what in session.heard if isinstance(what, bytes)))
+        moving = records["mode"] == MODES.index(Mode.MOVING)
+        begun = records["cycle"][1:][moving[1:] & ~moving[:-1]]
+        assert [event[1] for event in events if event[3] == "mode" and event[4].startswith("moving")] == [*begun]

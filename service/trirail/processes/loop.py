@@ -185,8 +185,9 @@ class Loop:
             self.control.decide(self._noted(next_ns, self._gateway.requests() if in_time else ()))
         if self._unsaid or ((called or waited) and next_ns - self._now() >= SAYING_NS):
             self._say()
-        else:
-            self._unsaid = called or waited
+        elif called or waited:
+            self._unsaid = True
+            self._reports.postpone()
         if self._reports.full:
             self._flush()
 

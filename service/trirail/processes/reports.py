@@ -75,6 +75,8 @@ class Reports:
         self._told = 0
         self._inputs = 0
         self._given: list[ControlInput] = []
+        self._postponed = 0, 0
+        """How many events wait that belong to an earlier cycle than what comes behind them, and to which."""
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._made = control.measured.record.view(np.uint8).data
         """The cycle's record, as the control makes it."""
@@ -126,6 +128,10 @@ class Reports:
             self._publish()
         if self._answers:
             self._send_answers()
+
+    def postpone(self) -> None:
+        """Leave what has happened to be passed on behind the next cycle: it shows in that already."""
+        self._postponed = len(self._control.ledger.notices), self._control.modes.cycle
 
     def flush(self) -> None:
         """Send the batch, take new peers, and what was kept for them."""
@@ -187,9 +193,10 @@ class Reports:
         """Answer requests, number what has happened, and pass on what the control was given."""
         control, ledger = self._control, self._control.ledger
         self._send_given()
-        for notice in ledger.notices:
+        (postponed, earlier), self._postponed = self._postponed, (0, 0)
+        for number, notice in enumerate(ledger.notices):
             self._events += 1
-            cycle = control.modes.cycle
+            cycle = earlier if number < postponed else control.modes.cycle
             event = Event(self._events, cycle * self._period, cycle, time.time(), **notice._asdict())
             packet = event_packet(event)
             self._kept.append(packet)
