@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from trirail.client.goal import GoalHandle
 from trirail.client.track import Taker, Track
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, TrackGoal
 from trirail.wire.messages import GoalReply
 
 POSE = 0.0, 0.0, 0.0
@@ -23,6 +23,7 @@ class Sent:
     """A track of which all updates have been sent, and what takes the answer to each after the first."""
 
     def __init__(self) -> None:
+        self.goals: list[Goal] = []
         self.takers: list[Taker] = []
         self.track = Track(self._begin, self._post, "target", 0.25)
         for _ in range(UPDATES + 1):
@@ -33,7 +34,8 @@ class Sent:
         handle.reply = GoalReply(goal_id, None, lag=0.0)
         return handle
 
-    def _post(self, _: Goal, take: Taker) -> None:
+    def _post(self, goal: Goal, take: Taker) -> None:
+        self.goals.append(goal)
         self.takers.append(take)
 
     def told(self) -> TrirailError | None:
@@ -69,3 +71,10 @@ def test_the_lag_is_what_the_service_last_said() -> None:
     sent.takers[3](GoalReply("target", None, lag=2e-3))
     sent.takers[4](GoalReply("target", None))
     assert sent.track.lag == pytest.approx(2e-3)
+
+
+def test_an_update_is_sent_as_it_is_said() -> None:
+    sent = Sent()
+    sent.track.update((0.1, 0.2, 0.3), (1.0, 2.0, 3.0), time=5.0)
+    said = TrackGoal(0.1, 0.2, 0.3, velocity=(1.0, 2.0, 3.0), time=5.0, id="target", timeout=0.25)
+    assert sent.goals[-1] == said
