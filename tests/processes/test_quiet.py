@@ -579,9 +579,9 @@ def test_an_event_belongs_to_the_first_cycle_that_it_shows_in(slow: Sequence[int
 
     def script() -> dict[int, list[Happening]]:
         script = {30: [Happening(lambda session: session.ask(CommandRequest(1, "ann", Command.ENABLE)))]}
+        for late in slow:
+            script[300 + late] = [Happening(lambda session: setattr(session, "takes_ns", 150_000))]
         for number in range(300, 1500, 300):
-            for late in slow:
-                script[number + late] = [Happening(lambda session: setattr(session, "takes_ns", 150_000))]
             script.setdefault(number, []).append(ask(number))
         return script
 
@@ -591,3 +591,6 @@ def test_an_event_belongs_to_the_first_cycle_that_it_shows_in(slow: Sequence[int
         moving = records["mode"] == MODES.index(Mode.MOVING)
         begun = records["cycle"][1:][moving[1:] & ~moving[:-1]]
         assert [event[1] for event in events if event[3] == "mode" and event[4].startswith("moving")] == [*begun]
+        cycles = [event[1] for event in events]
+        assert cycles == sorted(cycles)
+        assert cycles[-1] > begun[-1]
