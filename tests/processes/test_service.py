@@ -624,7 +624,8 @@ def test_a_view_is_drawn_from_what_the_service_publishes(shared: tuple[Service, 
         goal = robot.move_to(x=0.01, y=0.0, phi=0.0)
         assert goal.wait(WITHIN).outcome == "done"
         until(robot, lambda _: drawn.streams.t > began + 0.2)
-    assert drawn._bus_load == pytest.approx(0.75, abs=0.01)
+    assert (drawn.lost, view.relay.skipped) == (0, 0)
+    assert drawn._bus_load == robot.state(WITHIN).loop.bus_load == pytest.approx(0.75, abs=0.01)
     assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
     refused = trirail("view", "--web", locator=service.locator)
     assert refused.returncode == 1
