@@ -155,8 +155,8 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     endpoints: Name | None = None
     """An ODrive's flat_endpoints.json, relative to this file, for firmware or hardware that trirail does not know."""
     accept_without: tuple[ProtectionName, ...] = ()
-    """Protections that the drive may lack, of the tables in drivers/README.md: objects, as ["1006", "6007"], or an
-    ODrive's settings, as ["enable_watchdog"]; "6041" where bit 12 of its statusword is never set."""
+    """Protections that the drive may lack, of the tables in drivers/requirements.md: objects, as ["1006", "6007"], or
+    an ODrive's settings, as ["enable_watchdog"]; "6041" where bit 12 of its statusword is never set."""
     write: tuple[ObjectWrite, ...] = ()
     """Objects of its maker's that it is to be given."""
 

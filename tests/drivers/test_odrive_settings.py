@@ -280,7 +280,7 @@ def test_states_15_and_16_are_known_by_name() -> None:
 
 def test_the_guide_has_every_protection() -> None:
     """One row each, with what is said of it."""
-    guide = (Path(__file__).parents[2] / "drivers/README.md").read_text()
+    guide = (Path(__file__).parents[2] / "drivers/requirements.md").read_text()
     section = guide.partition("## What an ODrive must be set to")[2].partition("\n## ")[0]
     rows = {row[0]: row for row in (line.strip("| ").split(" | ") for line in section.splitlines() if line[:1] == "|")}
     for name, (purpose, without) in PROTECTIONS.items():

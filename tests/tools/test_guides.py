@@ -24,7 +24,8 @@ GUIDES = sorted(
     {
         *ROOT.glob("*.md"),
         *(ROOT / "service").glob("*.md"),
-        *(ROOT / name / "README.md" for name in ("drivers", "configs", "tools")),
+        *(ROOT / "drivers").glob("*.md"),
+        *(ROOT / name / "README.md" for name in ("configs", "tools")),
         ROOT / "configs/stages.md",
         ROOT / "configs/align.md",
     }
@@ -128,6 +129,12 @@ def test_the_readme_stays_one_for_a_newcomer() -> None:
     assert len(text.splitlines()) <= 150
     for guide in GUIDES:
         assert (guide.name == "README.md" and guide.parent == ROOT) or f"]({named(guide)}" in text
+
+
+def test_a_page_is_short_enough_to_be_read() -> None:
+    words = {named(guide): len(guide.read_text(encoding="utf-8").split()) for guide in GUIDES}
+    del words["configs/README.md"]  # every key, to be looked up
+    assert {name: count for name, count in words.items() if count > (1000 if name == "README.md" else 1800)} == {}
 
 
 def test_every_room_has_its_line() -> None:
