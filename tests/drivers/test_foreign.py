@@ -145,7 +145,7 @@ def test_a_drive_that_is_set_up_is_only_read_and_nothing_is_ever_stored_in_it(cl
 
 
 def test_the_tables_of_objects_are_those_of_the_guide() -> None:
-    guide = (Path(__file__).parents[2] / "drivers" / "README.md").read_text()
+    guide = (Path(__file__).parents[2] / "drivers" / "requirements.md").read_text()
     for need in ("protection", "replaceable"):
         table = guide.partition(f"| {need} | what for | without it |")[2].partition("\n\n")[0]
         rows = re.findall(r"^\| ([0-9A-F]{4}(?::\d\d)?) (.+) \| (.+) \| (.+) \|$", table, re.MULTILINE)
