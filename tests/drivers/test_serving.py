@@ -36,10 +36,16 @@ class Served:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.said: list[str] = []
+        self.goes_on = threading.Event()
+        """Until then nothing is read once a master has come."""
+        self.goes_on.set()
         self._thread = threading.Thread(
-            target=serve,
-            args=(path, SECTION, DRIVES, lambda: self.said.append("ready"), lambda: self.said.append("connected")),
+            target=serve, args=(path, SECTION, DRIVES, lambda: self.said.append("ready"), self._connected)
         )
+
+    def _connected(self) -> None:
+        self.said.append("connected")
+        self.goes_on.wait(WITHIN)
 
     def begin(self) -> None:
         """Serve; return when they can be connected to."""
@@ -119,6 +125,22 @@ def test_a_remote_frame_is_answered(served: Served) -> None:
         for state in (b"\x7f", b"\xff"):
             bus.send(frame(0x701, is_remote_frame=True))
             assert until(bus, 0x701) == state
+
+
+@pytest.mark.parametrize("syncs", [1, 2, 7])
+def test_what_was_stalled_answers_the_newest_sync_alone_and_every_request(served: Served, syncs: int) -> None:
+    served.goes_on.clear()
+    with UnixBus(str(served.path)) as bus:
+        for setting in ("2300180181010080", "2f00180201000000", "2300180181010000"):  # 1800h: at each SYNC
+            bus.send(frame(0x601, bytes.fromhex(setting)))
+        bus.send(frame(0x000, b"\x01\x00"))
+        for _ in range(syncs):
+            bus.send(frame(0x080))
+            bus.send(frame(0x602, DEVICE_TYPE))
+        served.goes_on.set()
+        came = [message.arbitration_id for message in iter(lambda: bus.recv(0.5), None)]
+    assert (came.count(0x582), came.count(0x181)) == (syncs, 1)
+    assert came[-1] == 0x181, "behind what else was waiting"
 
 
 def test_a_master_that_does_not_read_loses_frames_and_no_more(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
