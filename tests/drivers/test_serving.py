@@ -16,6 +16,7 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.config import Can, Drive, Drives
 from trirail_drivers.connection.serving import serve
 from trirail_drivers.errors import DriveError
+from trirail_drivers.odrive import cansimple
 from waiting import WITHIN, wait_until
 
 DRIVES = Drives(
@@ -23,6 +24,12 @@ DRIVES = Drives(
     A=Drive(node=1, counts_per_metre=1e6),
     B=Drive(node=2, counts_per_metre=1e6),
     C=Drive(node=3, counts_per_metre=1e6),
+)
+ODRIVES = Drives(
+    protocol="odrive",
+    A=Drive(node=1, counts_per_metre=20.0),
+    B=Drive(node=2, counts_per_metre=20.0),
+    C=Drive(node=3, counts_per_metre=20.0),
 )
 SECTION = Can("simulated")
 DEVICE_TYPE = bytes.fromhex("4000100000000000")
@@ -33,14 +40,14 @@ SERVO = bytes.fromhex("4300100092010200")
 class Served:
     """Drives that are served, and what has been said of that."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, drives: Drives = DRIVES) -> None:
         self.path = path
         self.said: list[str] = []
         self.goes_on = threading.Event()
         """Until then nothing is read once a master has come."""
         self.goes_on.set()
         self._thread = threading.Thread(
-            target=serve, args=(path, SECTION, DRIVES, lambda: self.said.append("ready"), self._connected)
+            target=serve, args=(path, SECTION, drives, lambda: self.said.append("ready"), self._connected)
         )
 
     def _connected(self) -> None:
@@ -59,8 +66,8 @@ class Served:
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[Served]:
-    made = Served(tmp_path / "drives")
+def served(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
+    made = Served(tmp_path / "drives", getattr(request, "param", DRIVES))
     made.begin()
     yield made
     if made.said == ["ready"]:
@@ -141,6 +148,27 @@ def test_what_was_stalled_answers_the_newest_sync_alone_and_every_request(served
         came = [message.arbitration_id for message in iter(lambda: bus.recv(0.5), None)]
     assert (came.count(0x582), came.count(0x181)) == (syncs, 1)
     assert came[-1] == 0x181, "behind what else was waiting"
+
+
+@pytest.mark.parametrize("served", [ODRIVES], indirect=True)
+def test_drives_have_moved_on_while_they_were_stalled(served: Served) -> None:
+    """For 40 ms, ten time constants of their servos."""
+    served.goes_on.clear()
+    estimates = cansimple.identifier(1, cansimple.GET_ENCODER_ESTIMATES)
+    with UnixBus(str(served.path)) as bus:
+        wait_until(lambda: "connected" in served.said)  # what comes before that has no time
+        for command, data in (
+            (cansimple.SET_CONTROLLER_MODE, cansimple.CONTROLLER_MODE.pack(cansimple.POSITION_CONTROL, 1)),
+            (cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(cansimple.AxisState.CLOSED_LOOP_CONTROL)),
+            (cansimple.SET_INPUT_POS, cansimple.INPUT_POS.pack(0.01, 0, 0)),
+        ):
+            bus.send(frame(cansimple.identifier(1, command), data))
+        for _ in range(4):
+            time.sleep(0.01)
+            bus.send(frame(estimates, is_remote_frame=True))
+        served.goes_on.set()
+        first = until(bus, estimates)
+    assert cansimple.ESTIMATES.unpack(first)[0] == pytest.approx(0.01, rel=0.01)
 
 
 def test_a_master_that_does_not_read_loses_frames_and_no_more(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:

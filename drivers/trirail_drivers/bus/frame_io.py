@@ -29,9 +29,9 @@ from trirail_drivers.bus.unixbus import UnixBus
 MOST_NOTHINGS = 64
 """Times in a row at most that an interface is read on though it has given no frame: more than a cycle's answers."""
 
-_TIME: Final = Struct("@ll")
-"""Linux' `struct timespec`: seconds, nanoseconds."""
-_TIME_SPACE: Final = socket.CMSG_SPACE(_TIME.size)
+TIME: Final = Struct("@ll")
+"""Linux' `struct timespec`: seconds, nanoseconds; and `struct timeval`: seconds, microseconds."""
+TIME_SPACE: Final = socket.CMSG_SPACE(TIME.size)
 SO_TIMESTAMPNS: Final = 35
 """Socket option of asm-generic/socket.h, which Python does not name: the time of arrival with each packet."""
 
@@ -135,11 +135,11 @@ class SocketFrames:
 
     def _receive_timed(self, capture: Capture) -> int:
         """Receive into the packet, and note it with the time at which the kernel had it."""
-        size, ancillary, _, _ = self._socket.recvmsg_into([self._packet], _TIME_SPACE, socket.MSG_DONTWAIT)
+        size, ancillary, _, _ = self._socket.recvmsg_into([self._packet], TIME_SPACE, socket.MSG_DONTWAIT)
         arrived = time.time()
         for level, kind, data in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
-                seconds, nanoseconds = _TIME.unpack(data)
+                seconds, nanoseconds = TIME.unpack(data)
                 arrived = seconds + nanoseconds * 1e-9
         if size == CAN_FRAME.size:
             capture.note(self._packet, arrived)

@@ -66,6 +66,7 @@ CIA402 = Protocol(
     save=save,
     restore=restore,
     protections={name: means(name) for name in PROTECTIONS},
+    states=lambda node: {canopen_frames.TPDO1 + node, canopen_frames.TPDO2 + node},
     fault_frames={
         "nmt": Frames(True, canopen_frames.NMT),
         "sync": Frames(True, canopen_frames.SYNC),

@@ -44,6 +44,10 @@ ODRIVE = Protocol(
     save=None,
     restore=None,
     protections={name: means(name) for name in PROTECTIONS},
+    states=lambda node: {
+        cansimple.identifier(node, cansimple.HEARTBEAT),
+        cansimple.identifier(node, cansimple.GET_ENCODER_ESTIMATES),
+    },
     fault_frames={  # named as in the manual
         "set_axis_state": Frames(True, cansimple.SET_AXIS_STATE, _NODE),
         "set_controller_mode": Frames(True, cansimple.SET_CONTROLLER_MODE, _NODE),

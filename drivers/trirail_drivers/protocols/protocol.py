@@ -47,5 +47,7 @@ class Protocol:
     inputs: Callable[[can.BusABC, config.Drives, Clock], Callable[[str], int | None]] | None
     """Makes what reads the digital inputs of the drive of a name, as bits of object 60FDh; None where drives do not
     tell them."""
+    states: Callable[[int], set[int]]
+    """The identifiers of the frames in which the drive of a node id says what is now."""
     fault_frames: Mapping[str, Frames]
     """The frames that faults on demand can name."""
