@@ -56,7 +56,7 @@ def goal(seq: int, cycle: int, name: str) -> ControlInput:
 
 
 def ended(cycle: int, name: str, outcome: Any) -> Line:
-    event = Event(cycle, cycle * 1e-3, cycle, 0.0, "goal", "info", "", id=name, outcome=outcome)
+    event = Event("goal", "info", "", id=name, outcome=outcome, seq=cycle, t=cycle * 1e-3, cycle=cycle, time=0.0)
     return Line(event.t, np.datetime64(0, "ns"), "INFO", "", event)
 
 
@@ -68,7 +68,7 @@ class Talking:
 
     def events(self, history: bool, timeout: float) -> Iterator[Event]:
         for seq in itertools.count(1):
-            yield Event(seq, 0.0, seq, 0.0, "service", "info", "", goal=f"{timeout}")
+            yield Event("service", "info", "", goal=f"{timeout}", seq=seq, t=0.0, cycle=seq, time=0.0)
             self.told.set()
             time.sleep(0)  # the other thread's turn
 
@@ -95,7 +95,7 @@ class Late(Talking):
 
     def events(self, history: bool, timeout: float) -> Iterator[Event]:
         if history and self.told.is_set():
-            yield Event(1, 0.0, 7, 0.0, "mode", "info", "", goal="g")
+            yield Event("mode", "info", "", goal="g", seq=1, t=0.0, cycle=7, time=0.0)
         self.told.set()
 
 
@@ -115,7 +115,7 @@ def test_the_goal_that_set_the_robot_in_motion_and_why_it_ended_are_told_in_fiel
     begins = rig.control.cycles
     rig.goal(name, 0.01, 0.0, 0.0, speed=0.5)
     rig.command(Command.STOP)
-    events = [Event(n, 0.0, begins, 0.0, **notice._asdict()) for n, notice in enumerate(rig.notices, 1)]
+    events = [notice.event(n, 0.0, begins, 0.0) for n, notice in enumerate(rig.notices, 1)]
     lines = [Line(0.0, np.datetime64(0, "ns"), "INFO", event.message, event) for event in events]
     recording = Recording("demo", records(0.2), np.zeros(0), np.zeros(0, "datetime64[ns]"), lines, {})
     assert _beginnings(recording) == [(name, begins)]
