@@ -6,13 +6,13 @@ import json as json_text
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 from cyclopts import App
 
 from trirail.cli import terminal
-from trirail.cli.options import Flag
+from trirail.cli.options import ConfigFile, Json
 from trirail.errors import ConfigError
 
 app = App(name="config", help="List and copy shipped configurations, show what one comes to.")
@@ -30,14 +30,8 @@ def _folder() -> Path:
 
 
 @app.default
-def shipped(*, json: Annotated[bool, Flag] = False) -> int:
-    """List what `trirail config copy` can copy, each with what it is for.
-
-    Parameters
-    ----------
-    json
-        Print one JSON object instead of words.
-    """
+def shipped(*, json: Json = False) -> int:
+    """List what `trirail config copy` can copy, each with what it is for."""
     files = shipped_files()
     if json:
         terminal.json({"folder": str(_folder()), "files": files})
@@ -50,7 +44,7 @@ def shipped(*, json: Annotated[bool, Flag] = False) -> int:
 
 
 @app.command
-def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
     """Copy a shipped file to change it: a configuration, the systemd unit, … Never over a file that exists.
 
     Parameters
@@ -59,8 +53,6 @@ def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] 
         As `trirail config` lists it; ".toml" may be left out.
     dest
         File or folder; the folder one is in, if absent.
-    json
-        Print one JSON object instead of words.
     """
     source = shipped_file(name)
     target = dest or Path()
@@ -81,17 +73,10 @@ def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] 
 
 
 @app.command
-def show(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+def show(config: ConfigFile = None, /, *, json: Json = False) -> int:
     """Print what a configuration comes to, every default filled in, and where it differs from the shipped sim.toml.
 
     What is printed is a configuration again.
-
-    Parameters
-    ----------
-    config
-        Configuration file; the simulated robot if absent.
-    json
-        Print one JSON object instead of words.
     """
     base = _folder() / BASE
     effective, simulated = (_tables(path) for path in (config or base, base))
