@@ -78,6 +78,8 @@ def show(config: ConfigFile = None, /, *, json: Json = False) -> int:
 
     What is printed is a configuration again.
     """
+    from trirail.telemetry.provenance import toml_lines
+
     base = _folder() / BASE
     effective, simulated = (_tables(path) for path in (config or base, base))
     different = {
@@ -86,34 +88,9 @@ def show(config: ConfigFile = None, /, *, json: Json = False) -> int:
     if json:
         terminal.json({"config": effective, "differences": different})
         return 0
-    for line in toml(effective, simulated):
+    for line in toml_lines(effective, simulated, BASE):
         terminal.say(line)
     return 0
-
-
-def toml(tables: _Tables, other: _Tables, path: str = "") -> Iterator[str]:
-    """Write tables as TOML; a comment says where `other` has something else."""
-    inner = {key: value for key, value in tables.items() if _is_tables(value)}
-    plain = {key: value for key, value in tables.items() if key not in inner}
-    if path and (plain or not inner):
-        yield ""
-        yield f"[{path}]"
-    for key, value in plain.items():
-        was = other.get(key)
-        if value is not None:
-            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {BASE}: {_said(was)}")
-        elif was is not None:
-            yield f"# no {key}; {BASE}: {_said(was)}"
-    for key, value in inner.items():
-        name, was = f"{path}.{key}" if path else key, other.get(key)
-        if isinstance(value, dict):
-            yield from toml(value, was if isinstance(was, dict) else {}, name)
-            continue
-        for number, table in enumerate(value):
-            yield ""
-            yield f"[[{name}]]"
-            beside = was[number] if isinstance(was, list) and number < len(was) else {}
-            yield from toml(table, beside)
 
 
 def shipped_files() -> dict[str, str]:
@@ -167,16 +144,3 @@ def _paired(tables: _Tables, other: _Tables, path: str = "") -> Iterator[tuple[s
             yield from _paired(value or {}, was or {}, name)
         else:
             yield name, value, was
-
-
-def _is_tables(value: object) -> bool:
-    return isinstance(value, dict) or (isinstance(value, list) and bool(value) and isinstance(value[0], dict))
-
-
-def _literal(value: object) -> str:
-    """Write a value as TOML; its strings, numbers, booleans and arrays are written as in JSON."""
-    return json_text.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _said(value: object) -> str:
-    return "none" if value is None else _literal(value)
