@@ -125,7 +125,7 @@ def compare(
     for field in ("vendor", "product", "revision", "serial"):
         mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
         if mine != theirs:
-            terminal.say(f"{field}: {_origin(mine)} and {_origin(theirs)}")
+            terminal.say(f"{field}: {parameter_file.told(mine)} and {parameter_file.told(theirs)}")
     if found:
         _table(str(file), heading, [(each, "") for each in found])
     terminal.say(f"{len(found)} of {len({*one.parameters, *two.parameters})} parameters differ")
@@ -233,10 +233,6 @@ def _as_json(each: Different) -> dict[str, Any]:
 
 def _value(held: Held | None) -> str:
     return "–" if held is None else str(held.value)
-
-
-def _origin(value: int | None) -> str:
-    return "not told" if value is None else f"{value:08X}h"
 
 
 def _some(objects: Sequence[str]) -> str:
