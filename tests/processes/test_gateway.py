@@ -307,7 +307,7 @@ def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.Mon
     said: list[object] = []
     monkeypatch.setattr(gateway._replies, "send", lambda _incoming, content: said.append(content))
     missing = (MissingProtection("A", "1006", "its watch on SYNC"), MissingProtection("C", "6007", "its stop"))
-    gateway._hear(packets.message(Welcome((), 0.5, 0.0, missing)), lambda: None)
+    gateway._hear(packets.message(Welcome((), 0.5, missing)), lambda: None)
     gateway._handle(came("info", "trirail/demo/info", b""))
     (info,) = said
     assert isinstance(info, Info)

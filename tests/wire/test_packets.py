@@ -57,7 +57,7 @@ def test_requests(request_: Request) -> None:
         Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
         Happened(Event("goal", "info", "goal g done", id="g", outcome="done", seq=1, t=0.5, cycle=500, time=1.0)),
         Status("g", 1.0, None),
-        Welcome(("SCHED_FIFO: no",), 0.75, 1.0),
+        Welcome(("SCHED_FIFO: no",), 0.75),
     ],
 )
 def test_answers(answer: Answer) -> None:

@@ -63,7 +63,7 @@ class Reports:
         self._recorder = recorder
         self._capture = capture
         self._period = config.period
-        self._welcome = message(Welcome(lacking, drives.bus_load, time.time(), drives.missing_protections))
+        self._welcome = message(Welcome(lacking, drives.bus_load, drives.missing_protections))
         self._status = Status(None, 1.0, None)
         self._bitrate = config.can.bitrate
         self._bus_load = 0.0
