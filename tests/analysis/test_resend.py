@@ -17,7 +17,7 @@ from trirail.analysis.resend import _beginnings, _Heard, _send
 from trirail.analysis.summary import _goals
 from trirail.client.client import GoalHandle, Result, Robot
 from trirail.telemetry.reading import Line, Recording
-from trirail.wire.goals import PoseGoal
+from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Stop
@@ -30,9 +30,10 @@ class Heard:
     def __init__(self) -> None:
         self.log: list[str] = []
 
-    def send(self, make: Any, name: str) -> GoalHandle:
-        self.log.append(f"send {name[:-7]}")
-        return Ending(name, self)
+    def send(self, goal: Goal) -> GoalHandle:
+        assert goal.id is not None
+        self.log.append(f"send {goal.id[:-7]}")
+        return Ending(goal.id, self)
 
     def command(self, name: str, content: CommandContent | bytes) -> None:
         assert content == Stop()
