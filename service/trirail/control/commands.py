@@ -91,7 +91,6 @@ class Commands:
             self._change_mode(request)
 
     def _home(self, request: CommandRequest) -> None:
-        """Home the drives."""
         if not self._can_home:
             raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
         self._change_mode(request)
@@ -112,7 +111,6 @@ class Commands:
             self._change_lease(change)
 
     def _release(self, request: CommandRequest) -> None:
-        """Let a user give the lease back."""
         self._change_lease(self._lease.release(request.user, request.content))
 
     def _change_lease(self, change: LeaseChange) -> None:

@@ -168,7 +168,6 @@ class ForkServer:
             os._exit(code)
 
     def _reap(self, pidfd: int) -> None:
-        """Take in that a child has ended."""
         ended = os.waitid(os.P_PIDFD, pidfd, os.WEXITED)
         code = 0 if ended is None else ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
         self._poll.unregister(pidfd)
