@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner
-from trirail.control.notices import Notice
 from trirail.motion.paths import FOR_EVER, Path, constant
 from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
+from trirail.wire.messages import Notice
 from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Mode
 from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple

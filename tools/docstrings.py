@@ -8,10 +8,16 @@ import inspect
 import itertools
 import sys
 
+from msgspec import Struct
+
 
 def fields(kind: type) -> dict[str, str]:
-    """Return the docstring of each field of a class that has one, on one line."""
-    return _of_module(kind.__module__).get(kind.__name__, {})
+    """Return the docstring of each field of a Struct that has one, its own or inherited, on one line."""
+    return {
+        field: text
+        for each in reversed(kind.__mro__[: kind.__mro__.index(Struct)])
+        for field, text in _of_module(each.__module__).get(each.__name__, {}).items()
+    }
 
 
 @functools.cache

@@ -63,7 +63,8 @@ def schemas() -> dict[str, str]:
             told = next(getattr(module, struct) for module in MODULES if hasattr(module, struct))
             on_the_wire = {field.name: field.encode_name for field in msgspec.structs.fields(told)}
             for field, text in docstrings.fields(told).items():
-                definition["properties"][on_the_wire[field]]["description"] = text
+                if field in on_the_wire:
+                    definition["properties"][on_the_wire[field]]["description"] = text
         whole = {"$schema": DIALECT, "title": f"trirail: {name}", "description": where, **schema, "$defs": definitions}
         made[f"{name}.json"] = json.dumps(whole, indent=2, ensure_ascii=False) + "\n"
     return made

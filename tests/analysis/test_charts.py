@@ -68,10 +68,10 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
     for half in np.split(records, 2):
         recorder.records(half.tobytes())
     for n in range(charts.LISTED + 2):
-        fault = Event(n + 1, 0.15 * n, 150 * n, 1.7e9, "fault", "error", f"drive B: fault $_{{{n}}} $")
+        fault = Event("fault", "error", f"drive B: fault $_{{{n}}} $", seq=n + 1, t=0.15 * n, cycle=150 * n, time=1.7e9)
         recorder.event(fault)
     name = "g $x_{1}$ %s"
-    recorder.event(Event(20, 1.9, 1900, 1.7e9, "goal", "info", "done", id=name, outcome="done"))
+    recorder.event(Event("goal", "info", "done", id=name, outcome="done", seq=20, t=1.9, cycle=1900, time=1.7e9))
     recorder.control_input(ControlInput(1, 100, 0, GoalRequest(1, "somebody", name, SlidersGoal((0.0, 0.0, 0.0)), 0)))
     recorder.close()
     picture = tmp_path / "session.svg"

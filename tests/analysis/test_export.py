@@ -116,7 +116,7 @@ def test_a_dataframe_is_the_table_by_time(recording: Recording) -> None:
 
 def test_a_goal_lasts_from_where_it_was_given_until_it_ended(recording: Recording) -> None:
     goal = GoalRequest(1, "ann", "g-17", MoveGoal(0.0, 0.0, 0.1), 0)
-    ended = Event(1, 0.5, 500, 0.0, "goal", "info", "goal g-17 done", id="g-17", outcome="done")
+    ended = Event("goal", "info", "goal g-17 done", id="g-17", outcome="done", seq=1, t=0.5, cycle=500, time=0.0)
     line = Line(0.5, recording.wall[0], "INFO", "", ended)
     told = recording._replace(requests=(ControlInput(1, 200, 0, goal),), events=[line])
     part = told.part(goal="g-17")

@@ -17,7 +17,7 @@ from trirail.analysis.resend import _beginnings, _Heard, _send
 from trirail.analysis.summary import _goals
 from trirail.client.client import GoalHandle, Result, Robot
 from trirail.telemetry.reading import Line, Recording
-from trirail.wire.goals import PoseGoal
+from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Stop
@@ -30,9 +30,10 @@ class Heard:
     def __init__(self) -> None:
         self.log: list[str] = []
 
-    def send(self, make: Any, name: str) -> GoalHandle:
-        self.log.append(f"send {name[:-7]}")
-        return Ending(name, self)
+    def send(self, goal: Goal) -> GoalHandle:
+        assert goal.id is not None
+        self.log.append(f"send {goal.id[:-7]}")
+        return Ending(goal.id, self)
 
     def command(self, name: str, content: CommandContent | bytes) -> None:
         assert content == Stop()
@@ -56,7 +57,7 @@ def goal(seq: int, cycle: int, name: str) -> ControlInput:
 
 
 def ended(cycle: int, name: str, outcome: Any) -> Line:
-    event = Event(cycle, cycle * 1e-3, cycle, 0.0, "goal", "info", "", id=name, outcome=outcome)
+    event = Event("goal", "info", "", id=name, outcome=outcome, seq=cycle, t=cycle * 1e-3, cycle=cycle, time=0.0)
     return Line(event.t, np.datetime64(0, "ns"), "INFO", "", event)
 
 
@@ -68,7 +69,7 @@ class Talking:
 
     def events(self, history: bool, timeout: float) -> Iterator[Event]:
         for seq in itertools.count(1):
-            yield Event(seq, 0.0, seq, 0.0, "service", "info", "", goal=f"{timeout}")
+            yield Event("service", "info", "", goal=f"{timeout}", seq=seq, t=0.0, cycle=seq, time=0.0)
             self.told.set()
             time.sleep(0)  # the other thread's turn
 
@@ -95,7 +96,7 @@ class Late(Talking):
 
     def events(self, history: bool, timeout: float) -> Iterator[Event]:
         if history and self.told.is_set():
-            yield Event(1, 0.0, 7, 0.0, "mode", "info", "", goal="g")
+            yield Event("mode", "info", "", goal="g", seq=1, t=0.0, cycle=7, time=0.0)
         self.told.set()
 
 
@@ -115,7 +116,7 @@ def test_the_goal_that_set_the_robot_in_motion_and_why_it_ended_are_told_in_fiel
     begins = rig.control.cycles
     rig.goal(name, 0.01, 0.0, 0.0, speed=0.5)
     rig.command(Command.STOP)
-    events = [Event(n, 0.0, begins, 0.0, **notice._asdict()) for n, notice in enumerate(rig.notices, 1)]
+    events = [notice.event(n, 0.0, begins, 0.0) for n, notice in enumerate(rig.notices, 1)]
     lines = [Line(0.0, np.datetime64(0, "ns"), "INFO", event.message, event) for event in events]
     recording = Recording("demo", records(0.2), np.zeros(0), np.zeros(0, "datetime64[ns]"), lines, {})
     assert _beginnings(recording) == [(name, begins)]

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from trirail.cli.service_log import Log
 from trirail.wire.messages import Event
 
-FAULT = Event(7, 1.0, 1000, 1_700_000_000.25, "fault", "error", "drive B: following error", mode="fault")
+FAULT = Event(
+    "fault", "error", "drive B: following error", mode="fault", seq=7, t=1.0, cycle=1000, time=1_700_000_000.25
+)
 
 
 def written(form: str, *events: Event, **environment: str) -> list[str]:

@@ -198,7 +198,9 @@ def test_a_goal_that_is_refused_is_forgotten_and_one_that_is_none_is_not_sent(si
 
 
 def test_a_goal_is_waited_for_and_cancelling_the_wait_does_not_stop_it(silent: Silent, locator: str) -> None:
-    end = Event(7, 0.0, 0, 5.0, "goal", "info", "goal g done: arrived", id="g", outcome="done", settle=0.01)
+    end = Event(
+        "goal", "info", "goal g done: arrived", id="g", outcome="done", settle=0.01, seq=7, t=0.0, cycle=0, time=5.0
+    )
 
     async def work(robot: AsyncRobot) -> None:
         sending = asyncio.ensure_future(robot.move_to(x=0.0, y=0.0, phi=0.0, id="g"))
@@ -238,7 +240,7 @@ def test_a_jog_that_is_left_while_it_is_renewed_hears_its_end_and_is_not_stopped
             sent = json.loads(braking.payload.to_string())
             assert (sent["id"], sent["x"], sent["y"], sent["phi"]) == (name, 0.0, 0.0, 0.0)
             braking.reply(braking.key_expr, msgspec.json.encode(GoalReply(name, 1.0)))
-        end = Event(7, 0.0, 0, 5.0, "goal", "info", "goal done: not renewed", id=name, outcome="done")
+        end = Event("goal", "info", "goal done: not renewed", id=name, outcome="done", seq=7, t=0.0, cycle=0, time=5.0)
         await asyncio.to_thread(silent.publish, "event", end)
         await leaving
         assert jog.result is not None

@@ -44,7 +44,7 @@ class Service:
 
     def event(self) -> None:
         self.known = self.seq + BEHIND
-        event = Event(self.known, 0.0, self.known, 0.0, "mode", "info", "holding", mode="holding")
+        event = Event("mode", "info", "holding", mode="holding", seq=self.known, t=0.0, cycle=self.known, time=0.0)
         self._session.put("trirail/demo/event", msgspec.json.encode(event))
 
     def _answer(self, query: zenoh.Query) -> None:

@@ -20,11 +20,11 @@ from control_rig import CONFIG, PerfectDrives
 from trirail.config import geometry
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner
-from trirail.control.notices import Notice
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
+from trirail.wire.messages import Notice
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import Feedback, PowerState, Triple

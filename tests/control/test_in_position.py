@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from trirail.config import Config, geometry
 from trirail.control.in_position import Settling, monitor
 from trirail.control.modes import ModeEvent
-from trirail.control.notices import Notice
 from trirail.kinematics.robot import inverse
 from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.messages import Notice
 from trirail.wire.packets import Accepted, Confirmed
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Mode

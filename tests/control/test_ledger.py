@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refused_as
 from trirail.control.ledger import Ledger
-from trirail.control.notices import REMEMBERED_IDS
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.goals import PoseGoal, VelocityGoal
+from trirail.wire.messages import REMEMBERED_IDS
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused, RefusedRequest
 from trirail.wire.vocabulary import Command
 
@@ -95,7 +95,7 @@ def test_an_id_is_good_for_one_goal(ledger: Ledger) -> None:
         Refused(9, RefusalCode.DUPLICATE_ID, "goal id 'g1' has been used: every goal needs its own")
     ]
     assert len(ended(ledger)) == 3  # the one that had the id ended once
-    assert ledger.notices[-1][:3] == ("refused", "warning", "goal id 'g1' has been used: every goal needs its own")
+    assert ledger.notices[-1].message == "goal id 'g1' has been used: every goal needs its own"
     ledger.check_id(asked("g9"))
 
 

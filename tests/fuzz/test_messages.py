@@ -242,7 +242,9 @@ def test_a_packet_that_would_be_cut_is_refused_by_its_sender(tmp_path: Path) -> 
 @given(length=st.integers(0, 100_000))
 @example(length=100_000)
 def test_an_event_always_fits_into_a_packet(length: int) -> None:
-    event = Event(1, 1.0, 1, 1.0, "goal", "info", "\U0001f916" * length, id="i" * length, user="u" * length)
+    event = Event(
+        "goal", "info", "\U0001f916" * length, id="i" * length, user="u" * length, seq=1, t=1.0, cycle=1, time=1.0
+    )
     packet = packets.event_packet(event)
     assert len(packet) <= MAX_PACKET
     told = packets.decode_answer(packet[1:])

@@ -191,7 +191,7 @@ def test_what_waits_for_the_loop_does_not_begin_under_anothers_lease(rig: Rig) -
     for number in range(AHEAD + 1):
         goal(gateway, f"a{number}", "ann")
         goal(gateway, f"b{number}", "bob")
-    event = Event(1, 0.0, 1, 0.0, "lease", "info", "lease acquired by bob", user="bob")
+    event = Event("lease", "info", "lease acquired by bob", user="bob", seq=1, t=0.0, cycle=1, time=0.0)
     gateway._hear(packets.message(Happened(event)), lambda: None)
     for ticket in range(1, 2 * AHEAD + 1):
         accepted(gateway, ticket)
@@ -307,7 +307,7 @@ def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.Mon
     said: list[object] = []
     monkeypatch.setattr(gateway._replies, "send", lambda _incoming, content: said.append(content))
     missing = (MissingProtection("A", "1006", "its watch on SYNC"), MissingProtection("C", "6007", "its stop"))
-    gateway._hear(packets.message(Welcome((), 0.5, 0.0, missing)), lambda: None)
+    gateway._hear(packets.message(Welcome((), 0.5, missing)), lambda: None)
     gateway._handle(came("info", "trirail/demo/info", b""))
     (info,) = said
     assert isinstance(info, Info)

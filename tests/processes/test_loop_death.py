@@ -24,7 +24,7 @@ def request(goal_id: str) -> GoalRequest:
 
 
 def ended(seq: int, goal_id: str) -> Happened:
-    return Happened(Event(seq, 0.0, 1, 0.0, "goal", "info", "", id=goal_id, outcome="done"))
+    return Happened(Event("goal", "info", "", id=goal_id, outcome="done", seq=seq, t=0.0, cycle=1, time=0.0))
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ TURN = 0.1
 
 def event(seq: int, **fields: object) -> Event:
     said: dict[str, object] = {"kind": "service", "level": "info", "message": ""} | fields
-    return Event(seq, 0.001 * seq, seq, 0.0, **said)  # type: ignore[arg-type]
+    return Event(seq=seq, t=0.001 * seq, cycle=seq, time=0.0, **said)  # type: ignore[arg-type]
 
 
 class Told:

@@ -342,7 +342,9 @@ def published(session: zenoh.Session, *messages: tuple[str, bytes]) -> Iterator[
 
 def test_clients_skip_what_is_no_message(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     service, robot, session = shared
-    forged = msgspec.json.encode(Event(10**6, 1.0, 1, 2e9, "service", "info", "[/]\x1b[2J\u202e\nforged: a line"))
+    forged = msgspec.json.encode(
+        Event("service", "info", "[/]\x1b[2J\u202e\nforged: a line", seq=10**6, t=1.0, cycle=1, time=2e9)
+    )
     junk = [(f"trirail/demo/{key}", each) for each in JUNK for key in ("state", "event", "records")]
     with published(session, *junk, ("trirail/demo/event", forged)):
         status = trirail("status", locator=service.locator)
@@ -364,7 +366,7 @@ def test_clients_skip_what_is_no_message(shared: tuple[Service, Robot, zenoh.Ses
 def test_what_was_forged_is_shown_as_what_it_is(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     service, _, session = shared
     forged = msgspec.json.encode(
-        Event(10**7, 1.0, 1, 3e9, "service", "info", "[/] [bold]\x1b[2J\x9b\u202e\nmode: fault")
+        Event("service", "info", "[/] [bold]\x1b[2J\x9b\u202e\nmode: fault", seq=10**7, t=1.0, cycle=1, time=3e9)
     )
     with (
         events(service, "events") as lines,

@@ -168,19 +168,21 @@ def test_nobody_sends_in_the_name_of_another(served: Served) -> None:
 def test_a_strangers_event_reaches_nobody_and_the_robots_do_with_their_past(served: Served) -> None:
     config, folder, _, gateway = served
     for number in range(1, 6):
-        gateway._publications.event(Event(number, 0.0, number, float(number), "service", "info", f"e{number}"))
+        gateway._publications.event(
+            Event("service", "info", f"e{number}", seq=number, t=0.0, cycle=number, time=float(number))
+        )
     with (
         robot(served, "eva") as eva,
         zenoh_session.open_client(config.zenoh.listen[0], Credentials.read(user(folder, "max"))) as stranger,
     ):
         heard = eva.events(history=True, timeout=WITHIN)
         assert [next(heard).message for _ in range(5)] == [f"e{number}" for number in range(1, 6)]
-        lie = Event(99, 9.0, 9, 99.0, "goal", "info", "done: arrived", id="g", outcome="done")
+        lie = Event("goal", "info", "done: arrived", id="g", outcome="done", seq=99, t=9.0, cycle=9, time=99.0)
         for key in ("trirail/demo/event", "trirail/demo/state"):
             stranger.put(key, msgspec.json.encode(lie), encoding="application/json")
         (reply,) = stranger.get("trirail/demo/role/max", timeout=WITHIN)  # so that what was put has arrived before
         assert reply.ok is not None
-        gateway._publications.event(Event(6, 0.0, 6, 6.0, "service", "info", "e6"))
+        gateway._publications.event(Event("service", "info", "e6", seq=6, t=0.0, cycle=6, time=6.0))
         assert next(heard).message == "e6"
         assert eva.skipped == 0
 

@@ -12,7 +12,7 @@ from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
 from trirail.wire.vocabulary import Command
 
 SAID = 1_700_000_000_500_000_000
-EVENT = Event(7, 1.25, 1250, 1_700_000_000.5, "goal", "warning", "goal g expired", id="g")
+EVENT = Event("goal", "warning", "goal g expired", id="g", seq=7, t=1.25, cycle=1250, time=1_700_000_000.5)
 GOAL = ControlInput(3, 1250, 5_000_000_000, GoalRequest(1, "ann", "g", PoseGoal(0.01, 0.0, 0.0), 4_999_000_000))
 STOP = ControlInput(4, 1300, 5_050_000_000, CommandRequest(2, "ann", Command.STOP))
 

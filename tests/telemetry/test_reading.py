@@ -76,8 +76,10 @@ def test_times_are_nominal_and_of_the_wall_clock(tmp_path: Path) -> None:
 
 
 def test_events_are_in_order_with_their_times(tmp_path: Path) -> None:
-    moving = Event(2, 0.6, 600, WALL_NS * 1e-9, "mode", "info", "moving: goal g-1 of ann", mode="moving")
-    fault = Event(3, 0.75, 750, WALL_NS * 1e-9, "fault", "error", "drive B: silent")
+    moving = Event(
+        "mode", "info", "moving: goal g-1 of ann", mode="moving", seq=2, t=0.6, cycle=600, time=WALL_NS * 1e-9
+    )
+    fault = Event("fault", "error", "drive B: silent", seq=3, t=0.75, cycle=750, time=WALL_NS * 1e-9)
     written(tmp_path / "a.rrd", made.records(0.1), (fault, moving))
     events = read(tmp_path / "a.rrd").events
     assert [(line.t, line.level, line.text) for line in events] == [
@@ -165,7 +167,7 @@ def test_a_file_that_ends_with_a_whole_message_is_read_where_it_is(
 def test_every_length_of_the_last_message_is_survived(tmp_path: Path) -> None:
     recorder = written(tmp_path / "a.rrd", made.records(0.2), close=False)
     before = (tmp_path / "a.rrd").read_bytes()
-    recorder.event(Event(1, 0.2, 200, WALL_NS * 1e-9, "mode", "info", "the last line", mode="holding"))
+    recorder.event(Event("mode", "info", "the last line", mode="holding", seq=1, t=0.2, cycle=200, time=WALL_NS * 1e-9))
     recorder.save()
     after = (tmp_path / "a.rrd").read_bytes()
     recorder.close()

@@ -109,8 +109,10 @@ def test_the_file_holds_blueprint_drawing_and_curves(tmp_path: Path) -> None:
 
 def test_events_are_lines_of_the_log(tmp_path: Path) -> None:
     recording = recorder(tmp_path)
-    recording.event(Event(1, 0.5, 500, WALL_NS * 1e-9, "mode", "info", "enabled by ann", mode="holding"))
-    recording.event(Event(2, 0.6, 600, WALL_NS * 1e-9, "fault", "error", "drive B: silent"))
+    recording.event(
+        Event("mode", "info", "enabled by ann", mode="holding", seq=1, t=0.5, cycle=500, time=WALL_NS * 1e-9)
+    )
+    recording.event(Event("fault", "error", "drive B: silent", seq=2, t=0.6, cycle=600, time=WALL_NS * 1e-9))
     recording.close()
     assert lines(recording.path) == [("INFO", "enabled by ann"), ("ERROR", "drive B: silent")]
 

@@ -370,8 +370,10 @@ def faulted(folder: Path, seconds: float, at: float, after: float) -> tuple[list
     box.control_input(goal(cycle - 500))
     feed(box, sent[cycle - 500 : cycle], time)
     wall = (WALL_NS + cycle * 1_000_000) * 1e-9
-    box.event(Event(1, at, cycle, wall, "fault", "error", "drive B: emergency 4310"))
-    box.event(Event(2, at, cycle, wall, "mode", "info", "fault: drive B: emergency 4310", mode=Mode.FAULT))
+    box.event(Event("fault", "error", "drive B: emergency 4310", seq=1, t=at, cycle=cycle, time=wall))
+    box.event(
+        Event("mode", "info", "fault: drive B: emergency 4310", mode=Mode.FAULT, seq=2, t=at, cycle=cycle, time=wall)
+    )
     feed(box, sent[cycle : cycle + round(after * 1000)], time)
     box.close()
     return [read(path) for path in parts(folder)], told
@@ -402,8 +404,18 @@ def test_a_flood_of_messages_before_a_fault_leaves_the_newest(tmp_path: Path, mo
     for number in range(100):
         feed(box, sent[20 * number :][:20], time)
         for _ in range(5):
-            box.event(Event(number, number / 50, 20 * number, WALL_NS * 1e-9, "refused", "info", f"{number:04}" * 50))
-    box.event(Event(100, 2.0, 2000, WALL_NS * 1e-9, "fault", "error", "drive B: emergency 4310"))
+            box.event(
+                Event(
+                    "refused",
+                    "info",
+                    f"{number:04}" * 50,
+                    seq=number,
+                    t=number / 50,
+                    cycle=20 * number,
+                    time=WALL_NS * 1e-9,
+                )
+            )
+    box.event(Event("fault", "error", "drive B: emergency 4310", seq=100, t=2.0, cycle=2000, time=WALL_NS * 1e-9))
     box.close()
     (path,) = parts(tmp_path)
     *flood, fault = (line.text for line in read(path).events)
@@ -423,7 +435,9 @@ def test_without_a_fault_there_is_no_black_box(tmp_path: Path) -> None:
     time = Time()
     box = BlackBox(1000, lambda name, _: recorder(tmp_path, time, configured(), name=name), print)
     feed(box, made.records(1.0), time)
-    box.event(Event(1, 0.5, 500, WALL_NS * 1e-9, "mode", "info", "holding: enable by ann", mode="holding"))
+    box.event(
+        Event("mode", "info", "holding: enable by ann", mode="holding", seq=1, t=0.5, cycle=500, time=WALL_NS * 1e-9)
+    )
     box.close()
     assert list(tmp_path.iterdir()) == []
 

@@ -87,9 +87,18 @@ def record(folder: Path, began: str = "2026-01-31 12:00:00", name: str = "demo",
         box.records(sent[start : start + 20].tobytes())
     now = time.wall() * 1e-9
     for event in (
-        Event(1, 0.3, 300, now, "goal", "info", "done", id="g1", outcome="done", user="ann"),
-        Event(2, 0.3, 300, now, "goal", "error", "faulted", id="g2", outcome="faulted", user="ben"),
-        Event(3, 0.3, 300, now, "fault", "error", "drive B: EMCY 8700", fault=FaultDetail("emcy", "B", 0x8700)),
+        Event("goal", "info", "done", id="g1", outcome="done", user="ann", seq=1, t=0.3, cycle=300, time=now),
+        Event("goal", "error", "faulted", id="g2", outcome="faulted", user="ben", seq=2, t=0.3, cycle=300, time=now),
+        Event(
+            "fault",
+            "error",
+            "drive B: EMCY 8700",
+            fault=FaultDetail("emcy", "B", 0x8700),
+            seq=3,
+            t=0.3,
+            cycle=300,
+            time=now,
+        ),
     ):
         recording.event(event)
         box.event(event)

@@ -31,7 +31,7 @@ def show(streams: Streams, relay: Relay) -> None:
     streams.stands(Standing("g-1", (0.05, 0.02, 0.3)))
     for start in range(0, len(records), 1000):
         streams.records(records[start : start + 1000].tobytes())
-    streams.event(Event(1, 0.5, 500, 0.5, "mode", "info", f"{streams.shown.robot.name} moves"))
+    streams.event(Event("mode", "info", f"{streams.shown.robot.name} moves", seq=1, t=0.5, cycle=500, time=0.5))
     streams.flush()
 
 

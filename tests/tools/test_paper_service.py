@@ -55,7 +55,7 @@ def recording(example: Example, first: int = 40, lost: slice = slice(0, 0)) -> R
 def line(cycle: int, goal: str, kind: Literal["mode", "goal"] = "mode") -> Line:
     """A line of the log that names a goal: one with which the robot was set in motion, or one that has ended."""
     begun, ended = (goal, None) if kind == "mode" else (None, goal)
-    event = Event(1, cycle * PERIOD, cycle, 0.0, kind, "info", "", id=ended, goal=begun)
+    event = Event(kind, "info", "", id=ended, goal=begun, seq=1, t=cycle * PERIOD, cycle=cycle, time=0.0)
     return Line(event.t, np.datetime64(0, "ns"), "INFO", event.message, event)
 
 

@@ -49,4 +49,6 @@ LARGEST = AlignmentLook(
 def told(number: int, look: AlignmentLook, user: str = "ann") -> Event:
     """Return the event of a look, so many milliseconds after the loop's start."""
     t = number * 1e-3
-    return Event(number, t, number, 1.8e9 + t, "alignment", "info", "a look", user=user, alignment=look)
+    return Event(
+        "alignment", "info", "a look", user=user, alignment=look, seq=number, t=t, cycle=number, time=1.8e9 + t
+    )

@@ -55,9 +55,9 @@ def test_requests(request_: Request) -> None:
         Accepted(1, "g", 0.5, 1.0, False, True),
         Confirmed(2, Command.STOP, "holding", 1),
         Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
-        Happened(Event(1, 0.5, 500, 1.0, "goal", "info", "goal g done", id="g", outcome="done")),
+        Happened(Event("goal", "info", "goal g done", id="g", outcome="done", seq=1, t=0.5, cycle=500, time=1.0)),
         Status("g", 1.0, None),
-        Welcome(("SCHED_FIFO: no",), 0.75, 1.0),
+        Welcome(("SCHED_FIFO: no",), 0.75),
     ],
 )
 def test_answers(answer: Answer) -> None:
@@ -67,7 +67,7 @@ def test_answers(answer: Answer) -> None:
 
 
 def an_event(text: str) -> Event:
-    return Event(1, 0.5, 500, 1.0, "goal", "info", text, id="g" * 64, outcome="done")
+    return Event("goal", "info", text, id="g" * 64, outcome="done", seq=1, t=0.5, cycle=500, time=1.0)
 
 
 def test_an_event_is_told_whole_up_to_the_size_of_a_packet() -> None:
@@ -85,7 +85,7 @@ def test_an_event_is_told_whole_up_to_the_size_of_a_packet() -> None:
 
 def test_whatever_is_long_in_an_event_is_cut() -> None:
     long = "x" * MAX_PACKET
-    event = Event(1, 0.5, 500, 1.0, "goal", "info", long, id=long, reason=long, goal=long, user=long)
+    event = Event("goal", "info", long, id=long, reason=long, goal=long, user=long, seq=1, t=0.5, cycle=500, time=1.0)
     packet = packets.event_packet(event)
     assert len(packet) <= MAX_PACKET
     told = packets.decode_answer(packet[1:])

@@ -135,7 +135,6 @@ class Wire:
             self._dispatch(*received, clock())
 
     def _dispatch(self, identifier: int, data: bytearray, now: float) -> None:
-        """Give one frame to who listens to it."""
         if identifier & ERROR:
             self._take_error(canerrors.report(identifier & EXTENDED_BITS, data))
             return

@@ -17,7 +17,7 @@ from trirail_drivers.cia402.makers_objects import address, owned
 from trirail_drivers.cia402.objects import Key
 from trirail_drivers.cia402.one_drive import HAS_POWER, greet
 from trirail_drivers.cia402.other_masters import NoOtherMaster
-from trirail_drivers.cia402.parameter_file import Different, Origin, Saved, compare
+from trirail_drivers.cia402.parameter_file import Different, Origin, Saved, compare, told
 from trirail_drivers.cia402.parameters import BYTES, Parameter, is_parameter, of_kind, parameter
 from trirail_drivers.cia402.sdo import Remote, SdoRefused, reason
 from trirail_drivers.config import Drive, Drives
@@ -282,17 +282,13 @@ def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> No
     for field in ("device_type", "vendor", "product"):
         mine, theirs = getattr(of_file, field), getattr(of_drive, field)
         if mine != theirs:
-            raise DriveError(f"drive {name}: its {field} is {_hex(theirs)}, the file's {_hex(mine)}: another product")
+            raise DriveError(f"drive {name}: its {field} is {told(theirs)}, the file's {told(mine)}: another product")
     others = [field for field in ("revision", "serial") if getattr(of_file, field) != getattr(of_drive, field)]
     if others and not replace:
         what = ", ".join(
-            f"{field} {_hex(getattr(of_drive, field))} (the file's {_hex(getattr(of_file, field))})" for field in others
+            f"{field} {told(getattr(of_drive, field))} (the file's {told(getattr(of_file, field))})" for field in others
         )
         raise DriveError(f"drive {name} has {what}; where that is meant, as with a spare drive, say --replace")
-
-
-def _hex(value: int | None) -> str:
-    return "not told" if value is None else f"{value:08X}h"
 
 
 async def _without_power(remote: Remote) -> None:

@@ -52,12 +52,10 @@ class Differences:
             if found == candidate:
                 return candidate
             try:
-                await self.remote.write(index, subindex, candidate)
+                await self.put(key, found, candidate)
             except SdoRefused as error:
                 refusal = error
                 continue
-            self.note(key, found, candidate)
-            await self.confirm(key, candidate)
             return candidate
         if refusal is None:
             return found
@@ -69,12 +67,16 @@ class Differences:
         found = await self.remote.peek(*key)
         if found is None or not same(*key, found, value):
             try:
-                await self.remote.write(*key, value)
+                await self.put(key, found, value)
             except SdoRefused:
                 return False
-            self.note(key, found, value)
-            await self.confirm(key, value)
         return True
+
+    async def put(self, key: Key, found: int | None, value: int, why: str = "") -> None:
+        """Write an object, note that, and read it back; SdoRefused where it is not taken, and as `confirm`."""
+        await self.remote.write(*key, value)
+        self.note(key, found, value, why)
+        await self.confirm(key, value)
 
     async def confirm(self, key: Key, value: int) -> None:
         """Read back what was written; ConfigurationRefused where it stays another, nothing where it is not told."""

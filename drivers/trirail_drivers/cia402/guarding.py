@@ -38,10 +38,7 @@ async def give_watchdogs(drive: Differences, drives: Drives, period: int, node: 
     if not guarded:
         heard = await drive.give(0x1017, 0, period) is not None
         await _watch_master(drive, drives.master_node, MISSED * period)
-    if await drive.remote.has(0x1029, 1):
-        await drive.give(0x1029, 1, 0)  # a drive that lost its master turns pre-operational: deaf to setpoints
-    else:
-        drive.lack((0x1029, 1), "it has no such object")
+    await drive.give(0x1029, 1, 0)  # a drive that lost its master turns pre-operational: deaf to setpoints
     return Watched(guarded, heard, await _emergency(drive, drives, node))
 
 

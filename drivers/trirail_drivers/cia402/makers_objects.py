@@ -62,6 +62,4 @@ async def give_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...
             raise DriveError(f'{where} has {bits} bits, and type = "{each.type}"')
         found = await remote.peek(*key)
         if found != each.value:
-            await remote.write(*key, each.value)
-            drive.note(key, found, each.value, each.why)
-            await drive.confirm(key, each.value)
+            await drive.put(key, found, each.value, each.why)

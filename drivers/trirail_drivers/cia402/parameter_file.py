@@ -82,6 +82,11 @@ def compare(one: Saved, other: Saved) -> list[Different]:
     return found
 
 
+def told(value: int | None) -> str:
+    """A number of an origin for people."""
+    return "not told" if value is None else f"{value:08X}h"
+
+
 def write(path: Path, saved: Saved) -> None:
     """Write a file whole or not at all; FileError where it cannot be."""
     try:

@@ -127,7 +127,6 @@ class Client:
         await self.pause(PAUSE)
 
     async def _request(self, request: bytes) -> bytes:
-        """Send a request and await its answer."""
         self._asked = request
         self._send(request)
         frame = await Wait(self._is_awaited, self.clock() + self.timeout)

@@ -99,10 +99,9 @@ async def _give_interpolation(drive: Differences, periods: list[tuple[int, int]]
     refusal: SdoRefused | ConfigurationRefused | None = None
     for value, exponent in periods:
         try:
-            if await remote.peek(0x60C2, 2) != exponent:
-                await _write(drive, (0x60C2, 2), exponent)
-            if await remote.peek(0x60C2, 1) != value:
-                await _write(drive, (0x60C2, 1), value)
+            for key, wanted in (((0x60C2, 2), exponent), ((0x60C2, 1), value)):
+                if (found := await remote.peek(*key)) != wanted:
+                    await drive.put(key, found, wanted)
         except (SdoRefused, ConfigurationRefused) as error:
             refusal = error
             continue
@@ -118,13 +117,6 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
         return ""
     period = value * 10.0**exponent
     return f"; it holds {1000 * period:g} ms: say loop.rate_hz = {1 / period:g}"
-
-
-async def _write(drive: Differences, key: tuple[int, int], value: int) -> None:
-    found = await drive.remote.peek(*key)
-    await drive.remote.write(*key, value)
-    drive.note(key, found, value)
-    await drive.confirm(key, value)
 
 
 async def give_reactions(drive: Differences, drives: Drives, units: Units) -> None:

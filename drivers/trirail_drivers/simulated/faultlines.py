@@ -104,39 +104,19 @@ CONDITIONS: Final = ("enabled", "moving", "stopping", "fault")
 _DRIVES: Final = {name: (index,) for index, name in enumerate(NAMES)} | {"all": tuple(range(len(NAMES)))}
 
 
-def _decimal(word: str) -> float:
-    value = float(word)
-    if not math.isfinite(value):
-        raise ValueError
-    return value
+def _number(fits: Callable[[float], bool] = math.isfinite) -> Callable[[str], float]:
+    """Return what reads a finite number that fits."""
+
+    def read(word: str) -> float:
+        value = float(word)
+        if not (math.isfinite(value) and fits(value)):
+            raise ValueError
+        return value
+
+    return read
 
 
-def _not_negative(word: str) -> float:
-    value = _decimal(word)
-    if value < 0.0:
-        raise ValueError
-    return value
-
-
-def _ratio(word: str) -> float:
-    value = _decimal(word)
-    if value <= 0.0:
-        raise ValueError
-    return value
-
-
-def _counts(word: str) -> float:
-    value = _decimal(word)
-    if value == 0.0:
-        raise ValueError
-    return value
-
-
-def _share(word: str) -> float:
-    value = _decimal(word)
-    if not 0.0 <= value <= 1.0:
-        raise ValueError
-    return value
+_NOT_NEGATIVE: Final = _number(lambda value: value >= 0.0)
 
 
 def _drive(word: str) -> float:
@@ -167,7 +147,7 @@ _OF_FRAMES: Final = {
     "drop": _Kind(),
     "duplicate": _Kind(),
     "corrupt": _Kind(),
-    "delay": _Kind("seconds", _not_negative, "0.002"),
+    "delay": _Kind("seconds", _NOT_NEGATIVE, "0.002"),
     "dlc": _Kind("a length from 0 to 8", _between(0, 8, 10), "3"),
 }
 _CODE: Final = _Kind("an error code, four hexadecimal digits", _between(1, 0xFFFF, 16), "4310", momentary=True)
@@ -177,17 +157,17 @@ _OF_DRIVES: Final = {
     "fault": _CODE,
     "reboot": _Kind(momentary=True),
     "stuck": _Kind(),
-    "lag": _Kind("seconds", _not_negative, "0.05"),
-    "runaway": _Kind("a speed in m/s", _decimal, "0.2"),
+    "lag": _Kind("seconds", _NOT_NEGATIVE, "0.05"),
+    "runaway": _Kind("a speed in m/s", _number(), "0.2"),
     "reversed": _Kind(),
-    "scale": _Kind("a ratio above 0", _ratio, "0.5"),
+    "scale": _Kind("a ratio above 0", _number(lambda ratio: ratio > 0.0), "0.5"),
     "swapped": _Kind("a drive, A, B or C", _drive, "B"),
-    "counts": _Kind("counts per metre, below 0 or above", _counts, "-1e7"),
+    "counts": _Kind("counts per metre, below 0 or above", _number(lambda counts: counts != 0.0), "-1e7"),
     "node": _Kind("a node id, 0 to 127", _between(0, 127, 10), "2"),
     "loose": _Kind(),
-    "slips": _Kind("a share from 0 to 1", _share, "0.3"),
+    "slips": _Kind("a share from 0 to 1", _number(lambda share: 0.0 <= share <= 1.0), "0.3"),
     "against": _Kind(),
-    "play": _Kind("metres", _not_negative, "0.00005"),
+    "play": _Kind("metres", _NOT_NEGATIVE, "0.00005"),
 }
 OF_SLIDERS: Final = ("node", "counts")
 """Faults whose DRIVE is a slider, and that say what it has whatever is configured."""
@@ -228,9 +208,10 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
     while words.next_is("at", "when", "with"):
         match words.left.pop(0):
             case "at":
-                delay = words.value("at", "seconds", "at 2.5 A silent", _not_negative)
+                delay = words.value("at", "seconds", "at 2.5 A silent", _NOT_NEGATIVE)
             case "with":
-                chance = words.value("with", "a chance above 0, at most 1", "with 0.01 A drop tpdo2", _chance)
+                fits = _number(lambda chance: 0.0 < chance <= 1.0)
+                chance = words.value("with", "a chance above 0, at most 1", "with 0.01 A drop tpdo2", fits)
             case "when":
                 condition = _condition(words)
     drives = _DRIVES[words.left.pop(0)] if words.next_is(*_DRIVES) else ()
@@ -254,13 +235,6 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
         chosen.append(_frames(word, {**known_frames, **EITHER}))
     duration, number = _lasting(words, name, kind.momentary)
     return Fault(line, name, drives, value, tuple(chosen), delay, condition, chance, duration, number)
-
-
-def _chance(word: str) -> float:
-    value = _decimal(word)
-    if not 0.0 < value <= 1.0:
-        raise ValueError
-    return value
 
 
 def _condition(words: _Words) -> Condition:
@@ -291,7 +265,7 @@ def _lasting(words: _Words, name: str, momentary: bool) -> tuple[float, int | No
         return (0.0 if momentary else math.inf), None
     words.left.pop(0)
     example = "for 0.5, or for 3 frames" if name in _OF_FRAMES else "for 0.5"
-    value = words.value("for", "seconds", example, _not_negative)
+    value = words.value("for", "seconds", example, _NOT_NEGATIVE)
     if not words.left:
         return value, None
     if name not in _OF_FRAMES or words.left not in (["frames"], ["frame"]) or value != round(value) or value < 1:

@@ -22,7 +22,6 @@ from trirail_drivers.interface import Triple
 from trirail.client.client import GoalHandle, Robot
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry.reading import Recording
-from trirail.wire.goals import Goal
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.records import unpack
@@ -143,7 +142,7 @@ def _send(
                 goal = msgspec.structs.replace(given.goal, id=renamed[given.id])
                 if goal.time is not None:  # as old as it was then
                     goal = goal.at(time.time() - given.age)
-                goals[given.id] = robot.send(_given(goal), renamed[given.id])
+                goals[given.id] = robot.send(goal)
                 say(f"goal {given.id}: {goals[given.id].expected}")
             elif isinstance(given, CommandRequest) and given.name not in _LEASE:
                 robot.command(given.name, _content(given, renamed))
@@ -151,10 +150,6 @@ def _send(
         except RefusedError as error:
             say(f"refused: {error}")
     return renamed, goals
-
-
-def _given(goal: Goal) -> Callable[[str], Goal]:
-    return lambda _: goal
 
 
 def _content(request: CommandRequest, renamed: dict[str, str]) -> CommandContent:

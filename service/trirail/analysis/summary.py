@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 import msgspec
@@ -135,7 +136,7 @@ def summary(recording: Recording) -> Summary:
         commands=_commands(recording),
         goals=list(_goals(recording, period)),
         alignments=[_alignment(each) for each in recording.alignments],
-        faults=[_incident(line) for line in recording.events if _is_fault(line)],
+        faults=[_incident(line) for line in recording.events if line.event is not None and line.event.kind == "fault"],
         warnings=[
             _incident(line)
             for line in recording.events
@@ -167,11 +168,8 @@ def _percentiles(nanoseconds: NDArray[np.int64]) -> Percentiles:
 
 
 def _commands(recording: Recording) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for what in recording.requests:
-        if isinstance(what.given, CommandRequest):
-            counts[what.given.name] = counts.get(what.given.name, 0) + 1
-    return counts
+    given = (what.given for what in recording.requests)
+    return dict(Counter(str(each.name) for each in given if isinstance(each, CommandRequest)))
 
 
 def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
@@ -219,10 +217,6 @@ def _alignment(told: RecordedAlignment) -> AlignmentSummary:
         corrections,
         rows,
     )
-
-
-def _is_fault(line: Line) -> bool:
-    return line.event is not None and line.event.kind == "fault"
 
 
 def _incident(line: Line) -> Incident:

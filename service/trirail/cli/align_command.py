@@ -63,14 +63,13 @@ def calibrate(
     from trirail.alignment.procedure import calibration_by_moves, mean_look, moves_for
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
-    from trirail.client.client import Robot
 
     if lens == "radial" and centre is None:
         raise TrirailError(
             "a radial lens wants --centre U V, the pixel on its axis: the middle of the picture for most"
         )
     moves = moves_for(lens, by, notation.radians(angle, False))
-    with source.open_source() as (look, known), Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with source.open_source() as (look, known), service.open() as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
         wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
         found = drive(robot, look, _printed(wishes, service, len(moves) + 1), source.speed, source.wait)
@@ -116,7 +115,6 @@ def run(
     from trirail.alignment.procedure import Task, align
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
-    from trirail.client.client import Robot
 
     kept = _kept(file, service)
     task = Task(
@@ -129,7 +127,7 @@ def run(
         source.looks,
         _approach(approach),
     )
-    with source.open_source() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with source.open_source() as (look, _), service.open() as robot:
         found = drive(robot, look, _printed(align(task), service), source.speed, source.wait)
     if found.confirmed != kept.calibration.confirmed:
         known = msgspec.structs.replace(kept.calibration, confirmed=found.confirmed)
@@ -167,11 +165,10 @@ def check(
     from trirail.alignment.changes import view_changes
     from trirail.alignment.procedure import Task, calibration_again, look_only
     from trirail.client.alignment import drive
-    from trirail.client.client import Robot
 
     kept = _kept(file, service)
     task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
-    with source.open_source() as (look, _), Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with source.open_source() as (look, _), service.open() as robot:
         if moves:
             again = calibration_again(kept.calibration, source.looks)
             now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), source.speed, source.wait)

@@ -35,7 +35,7 @@ from trirail.cli import (
     typed,
     workspace_command,
 )
-from trirail.cli.options import ALL_HERE, Flag, Services
+from trirail.cli.options import ALL_HERE, ConfigFile, Flag, Services
 from trirail.cli.tab_completion import Shell, script
 from trirail.errors import TrirailError
 from trirail.wire.stop_protocol import STOPS
@@ -50,17 +50,13 @@ app = App(
 
 
 @app.command
-def run(
-    config: Path | None = None, /, *, record: Path | None = None, log: Literal["text", "json"] | None = None
-) -> int:
+def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Literal["text", "json"] | None = None) -> int:
     """Run the service in the foreground until SIGTERM or Ctrl-C.
 
     Then it stops in a controlled way, disables the drives, and exits with 0.
 
     Parameters
     ----------
-    config
-        Configuration file; the simulated robot if absent.
     record
         Recording file to write, instead of one named by the time in the configured folder.
     log
@@ -124,7 +120,7 @@ def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: P
 
 @app.command
 def doctor(
-    config: Path | None = None, /, *, quick: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
+    config: ConfigFile = None, /, *, quick: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
 ) -> int:
     """Check this machine and a configuration.
 
@@ -134,8 +130,6 @@ def doctor(
 
     Parameters
     ----------
-    config
-        Configuration file; the simulated robot if absent.
     quick
         Leave that measurement out.
     json

@@ -6,13 +6,13 @@ import json as json_text
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 from cyclopts import App
 
 from trirail.cli import terminal
-from trirail.cli.options import Flag
+from trirail.cli.options import ConfigFile, Json
 from trirail.errors import ConfigError
 
 app = App(name="config", help="List and copy shipped configurations, show what one comes to.")
@@ -30,14 +30,8 @@ def _folder() -> Path:
 
 
 @app.default
-def shipped(*, json: Annotated[bool, Flag] = False) -> int:
-    """List what `trirail config copy` can copy, each with what it is for.
-
-    Parameters
-    ----------
-    json
-        Print one JSON object instead of words.
-    """
+def shipped(*, json: Json = False) -> int:
+    """List what `trirail config copy` can copy, each with what it is for."""
     files = shipped_files()
     if json:
         terminal.json({"folder": str(_folder()), "files": files})
@@ -50,7 +44,7 @@ def shipped(*, json: Annotated[bool, Flag] = False) -> int:
 
 
 @app.command
-def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
     """Copy a shipped file to change it: a configuration, the systemd unit, … Never over a file that exists.
 
     Parameters
@@ -59,8 +53,6 @@ def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] 
         As `trirail config` lists it; ".toml" may be left out.
     dest
         File or folder; the folder one is in, if absent.
-    json
-        Print one JSON object instead of words.
     """
     source = shipped_file(name)
     target = dest or Path()
@@ -81,18 +73,13 @@ def copy(name: str, dest: Path | None = None, /, *, json: Annotated[bool, Flag] 
 
 
 @app.command
-def show(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False) -> int:
+def show(config: ConfigFile = None, /, *, json: Json = False) -> int:
     """Print what a configuration comes to, every default filled in, and where it differs from the shipped sim.toml.
 
     What is printed is a configuration again.
-
-    Parameters
-    ----------
-    config
-        Configuration file; the simulated robot if absent.
-    json
-        Print one JSON object instead of words.
     """
+    from trirail.telemetry.provenance import toml_lines
+
     base = _folder() / BASE
     effective, simulated = (_tables(path) for path in (config or base, base))
     different = {
@@ -101,34 +88,9 @@ def show(config: Path | None = None, /, *, json: Annotated[bool, Flag] = False) 
     if json:
         terminal.json({"config": effective, "differences": different})
         return 0
-    for line in toml(effective, simulated):
+    for line in toml_lines(effective, simulated, BASE):
         terminal.say(line)
     return 0
-
-
-def toml(tables: _Tables, other: _Tables, path: str = "") -> Iterator[str]:
-    """Write tables as TOML; a comment says where `other` has something else."""
-    inner = {key: value for key, value in tables.items() if _is_tables(value)}
-    plain = {key: value for key, value in tables.items() if key not in inner}
-    if path and (plain or not inner):
-        yield ""
-        yield f"[{path}]"
-    for key, value in plain.items():
-        was = other.get(key)
-        if value is not None:
-            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {BASE}: {_said(was)}")
-        elif was is not None:
-            yield f"# no {key}; {BASE}: {_said(was)}"
-    for key, value in inner.items():
-        name, was = f"{path}.{key}" if path else key, other.get(key)
-        if isinstance(value, dict):
-            yield from toml(value, was if isinstance(was, dict) else {}, name)
-            continue
-        for number, table in enumerate(value):
-            yield ""
-            yield f"[[{name}]]"
-            beside = was[number] if isinstance(was, list) and number < len(was) else {}
-            yield from toml(table, beside)
 
 
 def shipped_files() -> dict[str, str]:
@@ -182,16 +144,3 @@ def _paired(tables: _Tables, other: _Tables, path: str = "") -> Iterator[tuple[s
             yield from _paired(value or {}, was or {}, name)
         else:
             yield name, value, was
-
-
-def _is_tables(value: object) -> bool:
-    return isinstance(value, dict) or (isinstance(value, list) and bool(value) and isinstance(value[0], dict))
-
-
-def _literal(value: object) -> str:
-    """Write a value as TOML; its strings, numbers, booleans and arrays are written as in JSON."""
-    return json_text.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _said(value: object) -> str:
-    return "none" if value is None else _literal(value)

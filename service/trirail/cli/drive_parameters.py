@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from trirail_drivers.errors import DriveError, FileError
 
 from trirail.cli import terminal
-from trirail.cli.options import Flag
+from trirail.cli.options import ConfigFile, Flag, Json
 
 if TYPE_CHECKING:
     from trirail_drivers.cia402.backup import Left
@@ -30,9 +30,9 @@ def save(
     folder: Path = Path(),
     /,
     *,
-    config: Path | None = None,
+    config: ConfigFile = None,
     drive: Annotated[tuple[Axis, ...], Parameter(negative="", consume_multiple=False)] = ("A", "B", "C"),
-    json: Annotated[bool, Flag] = False,
+    json: Json = False,
 ) -> int:
     """Read every parameter of the drives into a file each, drive-A.toml and so on. Never over one that exists.
 
@@ -42,12 +42,8 @@ def save(
     ----------
     folder
         Where to write; the folder one is in, if absent.
-    config
-        Configuration file; the simulated robot if absent.
     drive
         Which drive; may be repeated. All three if absent.
-    json
-        Print one JSON object instead of words.
     """
     from trirail_drivers.cia402 import parameter_file
 
@@ -94,9 +90,9 @@ def compare(
     other: Path | None = None,
     /,
     *,
-    config: Path | None = None,
+    config: ConfigFile = None,
     drive: Axis | None = None,
-    json: Annotated[bool, Flag] = False,
+    json: Json = False,
 ) -> int:
     """Show which parameters two files, or a file and the drive, do not have alike; exit 0 if none, 1 if any.
 
@@ -106,12 +102,8 @@ def compare(
         File of trirail drives save.
     other
         Another one; the drive itself if absent.
-    config
-        Configuration file; the simulated robot if absent.
     drive
         Which drive; the one that the file names if absent.
-    json
-        Print one JSON object instead of words.
     """
     from trirail_drivers.cia402 import parameter_file
 
@@ -133,7 +125,7 @@ def compare(
     for field in ("vendor", "product", "revision", "serial"):
         mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
         if mine != theirs:
-            terminal.say(f"{field}: {_origin(mine)} and {_origin(theirs)}")
+            terminal.say(f"{field}: {parameter_file.told(mine)} and {parameter_file.told(theirs)}")
     if found:
         _table(str(file), heading, [(each, "") for each in found])
     terminal.say(f"{len(found)} of {len({*one.parameters, *two.parameters})} parameters differ")
@@ -144,11 +136,11 @@ def restore(
     file: Path,
     /,
     *,
-    config: Path | None = None,
+    config: ConfigFile = None,
     drive: Axis | None = None,
     replace: Annotated[bool, Flag] = False,
     store: Annotated[bool, Flag] = False,
-    json: Annotated[bool, Flag] = False,
+    json: Json = False,
 ) -> int:
     """Write what differs from a file to the drive, read it back, and say what differs still: then exit 1.
 
@@ -159,16 +151,12 @@ def restore(
     ----------
     file
         File of trirail drives save.
-    config
-        Configuration file; the simulated robot if absent.
     drive
         Which drive; the one that the file names if absent.
     replace
         Also where the drive has another revision or serial number, as one that takes a broken one's place.
     store
         Have the drive keep them without supply (object 1010h), once all of them are there.
-    json
-        Print one JSON object instead of words.
     """
     from trirail_drivers.cia402 import parameter_file
     from trirail_drivers.connection.opening import open_bus
@@ -245,10 +233,6 @@ def _as_json(each: Different) -> dict[str, Any]:
 
 def _value(held: Held | None) -> str:
     return "–" if held is None else str(held.value)
-
-
-def _origin(value: int | None) -> str:
-    return "not told" if value is None else f"{value:08X}h"
 
 
 def _some(objects: Sequence[str]) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App
 
 from trirail.cli import drive_parameters, terminal
-from trirail.cli.options import Flag
+from trirail.cli.options import ConfigFile, Flag, Json
 
 app = App(name="drives", help="Show the drives; save, compare, restore their parameters.")
 for command in drive_parameters.COMMANDS:
@@ -20,21 +19,15 @@ UNTRIED = "no make of drive was tried on hardware yet: go on with trirail commis
 
 
 @app.default
-def drives(
-    config: Path | None = None, /, *, apply: Annotated[bool, Flag] = False, json: Annotated[bool, Flag] = False
-) -> int:
+def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False, json: Json = False) -> int:
     """Show each drive: who it says it is, its modes and units, and what its set-up would change, and why.
 
     Reads only, unless told to apply; no drive gets power, and nothing is stored in one. Not while the service runs.
 
     Parameters
     ----------
-    config
-        Configuration file; the simulated robot if absent.
     apply
         Write the differences, and read them back.
-    json
-        Print one JSON object instead of words.
     """
     from trirail_drivers.connection.opening import open_bus
     from trirail_drivers.errors import DriveError

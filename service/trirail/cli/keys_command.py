@@ -10,7 +10,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from trirail.cli import terminal
-from trirail.cli.options import Flag
+from trirail.cli.options import Json
 from trirail.wire.endpoints import is_host
 from trirail.wire.text import check_name, quoted
 from trirail.wire.vocabulary import Role
@@ -18,6 +18,7 @@ from trirail.wire.vocabulary import Role
 app = App(name="keys", help="Make, list, renew and revoke the certificates of a robot and its users, for zenoh.tls.")
 
 Folder = Annotated[Path, Parameter(name="--folder")]
+AuthorityFolder = Annotated[Folder, Parameter(help="That of the authority.")]
 Days = Annotated[float, Parameter(validator=lambda _kind, days: _check_days(days))]
 Addresses = Annotated[
     tuple[str, ...],
@@ -55,7 +56,7 @@ def init(
     address: Addresses = (),
     days: Days = 365.0,
     folder: Folder = HERE,
-    json: Annotated[bool, Flag] = False,
+    json: Json = False,
 ) -> int:
     """Make an authority of your own, and the robot's certificate.
 
@@ -70,8 +71,6 @@ def init(
         How long the robot's certificate is good.
     folder
         Folder to make, beside the configuration.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -95,8 +94,8 @@ def add(
     *,
     role: Role,
     days: Days = 365.0,
-    folder: Folder = HERE,
-    json: Annotated[bool, Flag] = False,
+    folder: AuthorityFolder = HERE,
+    json: Json = False,
 ) -> int:
     """Make a user's certificate, in a folder to give to him.
 
@@ -109,10 +108,6 @@ def add(
         and homes. It counts once it is in the configuration.
     days
         How long the certificate is good.
-    folder
-        That of the authority.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -135,8 +130,8 @@ def further(
     *,
     address: Addresses = (),
     days: Days = 365.0,
-    folder: Folder = HERE,
-    json: Annotated[bool, Flag] = False,
+    folder: AuthorityFolder = HERE,
+    json: Json = False,
 ) -> int:
     """Make the certificate of a further robot of this authority, as one that dials a router has it.
 
@@ -148,10 +143,6 @@ def further(
         Host names and IP addresses at which clients find it without the router, beside those of its own machine.
     days
         How long the certificate is good.
-    folder
-        That of the authority.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -167,16 +158,8 @@ def further(
 
 @app.default
 @app.command(name="list")
-def show(*, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
-    """List the certificates and until when they are good, and who is revoked; roles are in the configuration.
-
-    Parameters
-    ----------
-    folder
-        That of the authority.
-    json
-        Print one JSON object instead of words.
-    """
+def show(*, folder: AuthorityFolder = HERE, json: Json = False) -> int:
+    """List the certificates and until when they are good, and who is revoked; roles are in the configuration."""
     from trirail.cli.key_folder import KeyFolder
     from trirail.wire.credentials import revoked
 
@@ -201,7 +184,7 @@ def show(*, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
 
 
 @app.command
-def renew(name: str, /, *, days: Days = 365.0, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
+def renew(name: str, /, *, days: Days = 365.0, folder: AuthorityFolder = HERE, json: Json = False) -> int:
     """Make a new certificate for the key of a user, or of the robot by its name.
 
     A user's counts when his next session opens. The robot's counts when the service starts again: do that while the
@@ -213,10 +196,6 @@ def renew(name: str, /, *, days: Days = 365.0, folder: Folder = HERE, json: Anno
         That of the user, or of the robot.
     days
         How long it is good from now.
-    folder
-        That of the authority.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -230,7 +209,7 @@ def renew(name: str, /, *, days: Days = 365.0, folder: Folder = HERE, json: Anno
 
 
 @app.command
-def revoke(user: str, /, *, folder: Folder = HERE, json: Annotated[bool, Flag] = False) -> int:
+def revoke(user: str, /, *, folder: Folder = HERE, json: Json = False) -> int:
     """Take a user's role away, for good: it counts when the service starts again. Do that while the robot stands.
 
     Parameters
@@ -239,8 +218,6 @@ def revoke(user: str, /, *, folder: Folder = HERE, json: Annotated[bool, Flag] =
         The name, which is never given again.
     folder
         That of the authority; its revoked.txt must be where the robot reads it.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.cli.key_folder import KeyFolder
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from trirail.cli import notation
 from trirail.wire.decoding import converted
 from trirail.wire.endpoints import DEFAULT_LOCATOR
 
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
 
 Flag = Parameter(negative="", show_default=False)
 """An option without a value, that has no opposite."""
+Json = Annotated[bool, Flag, Parameter(help="Print one JSON object instead of words.")]
+ConfigFile = Annotated[Path | None, Parameter(help="Configuration file; the simulated robot if absent.")]
+Wait = Annotated[bool, Flag, Parameter(help="Show the progress; exit 0 only when the robot has arrived.")]
+Speed = Annotated[notation.Share, Parameter(help="Share of the limits, 0.001 to 1, or 5%.")]
 
 
 def robots(context: CompletionContext) -> list[str]:
@@ -62,9 +67,7 @@ def _frames(context: CompletionContext, kind: Literal["tool", "work"]) -> list[s
 
 
 def _robot(context: CompletionContext) -> Robot:
-    from trirail.client.client import Robot
-
-    return Robot(context["robot"].value, context["connect"].value, tls=context["tls"].value)
+    return Service(context["connect"].value, context["tls"].value, robot=context["robot"].value).open()
 
 
 @Parameter(name="*")
@@ -76,8 +79,7 @@ class Address:
     "Zenoh locator of the service or of a router."
     tls: Annotated[Path | None, Parameter(env_var="TRIRAIL_TLS")] = None
     "Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT; ~/.config/trirail/ROBOT if absent."
-    json: Annotated[bool, Flag] = False
-    "Print one JSON object instead of words."
+    json: Json = False
 
 
 @Parameter(name="*")
@@ -87,6 +89,12 @@ class Service(Address):
 
     robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT", completer=robots)] = "demo"
     "Name of the robot, as in its configuration."
+
+    def open(self) -> Robot:
+        """Return a session with it. Raises ServiceError where there is none."""
+        from trirail.client.client import Robot
+
+        return Robot(self.robot, self.connect, tls=self.tls)
 
 
 @Parameter(name="*")
@@ -106,8 +114,7 @@ HERE, ALL_HERE = Service(), Services()
 class Offline:
     """Which robot, and how to print."""
 
-    config: Path | None = None
-    "Configuration file; the simulated robot if absent."
+    config: ConfigFile = None
     json: Annotated[bool, Flag] = False
     "Print one JSON object, in metres and radians, instead of words."
 

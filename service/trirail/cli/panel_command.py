@@ -30,12 +30,11 @@ def panel(
     open_
         Open it in the browser.
     """
-    from trirail.client.client import Robot
     from trirail.panel.server import Panel
     from trirail.processes.operating_system import Signals
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with Robot(service.robot, service.connect, tls=service.tls) as robot, Panel(robot, port) as served:
+    with service.open() as robot, Panel(robot, port) as served:
         show(
             service,
             {"url": served.url},

@@ -203,7 +203,6 @@ def follow(pendant: Pendant, gamepad: Gamepad, now: float) -> None:
 
 
 def _shown(pendant: Pendant, state: State | None) -> Text:
-    """Return the lines that the operator sees."""
     x, _, phi = pendant.speed
     lines = ["no contact with the service" if state is None else f"{state.mode}, override {state.override:.0%}"]
     if state is not None:

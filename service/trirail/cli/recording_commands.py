@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rich.text import Text
 
 from trirail.cli import alignment_lines, notation, terminal
-from trirail.cli.options import Flag
+from trirail.cli.options import Flag, Json
 from trirail.errors import ServiceError
 from trirail.naming import Labels, label
 from trirail.telemetry import palette
@@ -30,7 +30,7 @@ def replay(
     config: Path | None = None,
     to: str | None = None,
     robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
-    json: Annotated[bool, Flag] = False,
+    json: Json = False,
 ) -> int:
     """Give a recorded session to the control once more, cycle by cycle, and compare the setpoints.
 
@@ -48,8 +48,6 @@ def replay(
         Zenoh locator of a service to send the session to.
     robot
         Name of its robot.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.analysis.replay import again
     from trirail.config import load
@@ -110,7 +108,7 @@ def export(
     every: notation.Time | None = None,
     columns: str = "",
     goal: str | None = None,
-    json: Annotated[bool, Flag] = False,
+    json: Json = False,
 ) -> int:
     """Write a recorded session as a table, CSV or Parquet.
 
@@ -133,8 +131,6 @@ def export(
         Names of columns, or words of names, with commas between: pose,error. All if absent.
     goal
         From when a goal of this id was given until it ended.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.analysis.export import write
 

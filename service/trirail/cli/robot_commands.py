@@ -15,7 +15,18 @@ import msgspec
 from cyclopts import CycloptsError, Parameter, validators
 
 from trirail.cli import live, notation, terminal
-from trirail.cli.options import HERE, Address, Flag, Service, axes_names, frame_names, taught_poses, tool_names
+from trirail.cli.options import (
+    HERE,
+    Address,
+    Flag,
+    Service,
+    Speed,
+    Wait,
+    axes_names,
+    frame_names,
+    taught_poses,
+    tool_names,
+)
 from trirail.cli.options import poses as poses_of_robot
 from trirail.naming import Labels
 from trirail.wire import boundary
@@ -41,8 +52,8 @@ def goto(
     phi: notation.Angle | None = None,
     /,
     *,
-    wait: Annotated[bool, Flag] = False,
-    speed: notation.Share = 1.0,
+    wait: Wait = False,
+    speed: Speed = 1.0,
     blend: notation.Distance | None = None,
     tool: Tool | None = None,
     frame: Annotated[str, Parameter(completer=frame_names)] = "base",
@@ -59,10 +70,6 @@ def goto(
         Likewise along y.
     phi
         Angle of the platform, counterclockwise [rad], or with a unit: 10deg, 50mrad.
-    wait
-        Show the progress; exit 0 only when the robot has arrived.
-    speed
-        Share of the limits, 0.001 to 1, or 5%.
     blend
         The next goto waits for this one, and begins that near to its end [m], instead of preempting it.
     tool
@@ -73,8 +80,6 @@ def goto(
     deg
         An angle without a unit is in degrees.
     """
-    from trirail.client.client import Robot
-
     if y is None or phi is None:
         if y is not None:
             typed = f"X = {x} and Y = {notation.written(y, 'mm', 3)}"
@@ -84,13 +89,13 @@ def goto(
         if tool is not None or frame != "base":
             raise CycloptsError(msg="the pose of a NAME is where it was taught: it knows no --tool and no --frame")
         check_name(x, "pose")
-        with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        with service.open() as robot:
             return _follow(service, robot, robot.move_to_named(x, speed=speed, blend=blend), wait, x)
     try:
         at, angle = quantity(x, LENGTH), notation.radians(phi, deg)
     except ValueError as error:
         raise CycloptsError(msg=f"Invalid value for X: {error}") from error
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         goal = robot.move_to(x=at, y=y, phi=angle, speed=speed, blend=blend, tool=tool, frame=frame)
         return _follow(service, robot, goal, wait, notation.pose((at, y, angle)))
 
@@ -101,8 +106,8 @@ def move(
     dphi: notation.Angle,
     /,
     *,
-    wait: Annotated[bool, Flag] = False,
-    speed: notation.Share = 1.0,
+    wait: Wait = False,
+    speed: Speed = 1.0,
     tool: Tool | None = None,
     frame: Annotated[str, Parameter(completer=axes_names)] = "base",
     measured: Annotated[bool, Flag] = False,
@@ -119,10 +124,6 @@ def move(
         Along y.
     dphi
         By what angle to turn, counterclockwise [rad], or with a unit: 1deg.
-    wait
-        Show the progress; exit 0 only when the robot has arrived.
-    speed
-        Share of the limits, 0.001 to 1, or 5%.
     tool
         The point of the platform that moves so far, and about which it turns: U V in the platform's own frame [m], or
         its name in [frames.tool].
@@ -133,29 +134,23 @@ def move(
     deg
         An angle without a unit is in degrees.
     """
-    from trirail.client.client import Robot
-
     angle = notation.radians(dphi, deg)
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         origin: Literal["commanded", "measured"] = "measured" if measured else "commanded"
         goal = robot.move(x=dx, y=dy, phi=angle, speed=speed, tool=tool, frame=frame, origin=origin)
         return _follow(service, robot, goal, wait, f"by {notation.pose((dx, dy, angle))}")
 
 
-def goal(content: str, /, *, wait: Annotated[bool, Flag] = False, service: Service = HERE) -> int:
+def goal(content: str, /, *, wait: Wait = False, service: Service = HERE) -> int:
     """Send a goal of any kind, as JSON.
 
     Parameters
     ----------
     content
         Its kind and what it says, as on the wire, in SI units and radians.
-    wait
-        Show the progress; exit 0 only when the robot has arrived.
     """
-    from trirail.client.client import Robot
-
     meant: Goal = boundary.decode(content.encode(), Goal, "not a goal")
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         return _follow(service, robot, robot.send(meant), wait, str(meant.__struct_config__.tag))
 
 
@@ -165,8 +160,8 @@ def sliders(
     c: notation.Length,
     /,
     *,
-    wait: Annotated[bool, Flag] = False,
-    speed: notation.Share = 1.0,
+    wait: Wait = False,
+    speed: Speed = 1.0,
     service: Service = HERE,
 ) -> int:
     """Move the sliders to positions.
@@ -181,14 +176,8 @@ def sliders(
         Of slider B.
     c
         Of slider C.
-    wait
-        Show the progress; exit 0 only when the robot has arrived.
-    speed
-        Share of the limits, 0.001 to 1, or 5%.
     """
-    from trirail.client.client import Robot
-
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         title = _sliders(robot.info().labels, a, b, c)
         goal = robot.move_sliders(a, b, c, speed=speed)
         return _follow(service, robot, goal, wait, title)
@@ -225,20 +214,18 @@ def jog(
     gamepad
         By a gamepad too, whose sticks move the robot while one of its shoulder buttons is held.
     """
-    from trirail.client.client import Robot
-
     if vx is None:
         from trirail.cli import pendant
         from trirail.cli.gamepad import Pad
 
         with ExitStack() as opened:
             pad = opened.enter_context(Pad.first()) if gamepad else None
-            return pendant.run(opened.enter_context(Robot(service.robot, service.connect, tls=service.tls)), pad, tool)
+            return pendant.run(opened.enter_context(service.open()), pad, tool)
     if vy is None or w is None or gamepad:
         raise CycloptsError(
             msg="jog takes VX, VY and W, or none of them: then keys, or a gamepad, move the robot while they are held"
         )
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w, tool=tool) as jogging:
                 taken = jogging.reply
@@ -261,7 +248,7 @@ def follow(
     *,
     stretch: Annotated[bool, Flag] = False,
     go_there: Annotated[bool, Flag] = False,
-    wait: Annotated[bool, Flag] = False,
+    wait: Wait = False,
     service: Service = HERE,
 ) -> int:
     """Follow a timed trajectory from where the robot stands.
@@ -274,14 +261,11 @@ def follow(
         Slow down what is too fast, instead of refusing it.
     go_there
         Go to its first point before, by an ordinary goal, if the robot is not there.
-    wait
-        Show the progress; exit 0 only when the robot has arrived.
     """
-    from trirail.client.client import Robot
     from trirail.client.trajectory import check_arrived, first_pose, read
 
     points = read(file)
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         if go_there:
             way = robot.send(first_pose(points))
             check_arrived(terminal.follow(robot, way, f"to the first point of {file.name}", show=not service.json))
@@ -299,10 +283,8 @@ def teach(name: str, /, *, service: Service = HERE) -> int:
     name
         Letters, digits, - and _, but no number or quantity; a pose that was taught by that name before is replaced.
     """
-    from trirail.client.client import Robot
-
     check_new_pose(name)
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         pose = robot.teach(name)
     show(service, msgspec.to_builtins(pose), f"{name}: {notation.pose((pose.x, pose.y, pose.phi))}")
     return 0
@@ -316,9 +298,7 @@ def forget(name: Annotated[str, Parameter(completer=taught_poses)], /, *, servic
     name
         One of those that `trirail poses` lists as taught.
     """
-    from trirail.client.client import Robot
-
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         pose = robot.forget(name)
     show(service, msgspec.to_builtins(pose), f"{name} is removed; it was {notation.pose((pose.x, pose.y, pose.phi))}")
     return 0
@@ -326,9 +306,7 @@ def forget(name: Annotated[str, Parameter(completer=taught_poses)], /, *, servic
 
 def poses(*, service: Service = HERE) -> int:
     """List the poses that have names."""
-    from trirail.client.client import Robot
-
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         found = robot.poses()
     if service.json:
         terminal.json({name: msgspec.to_builtins(pose) for name, pose in found.items()})
@@ -350,9 +328,7 @@ def override(percent: notation.Percent, /, *, service: Service = HERE) -> int:
     percent
         Share of full speed, 50 or 50%.
     """
-    from trirail.client.client import Robot
-
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         robot.override(percent)
     show(service, {"override": percent}, f"override: {percent:g} %")
     return 0
@@ -372,13 +348,11 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.
     timeout
         After how long without a sign of life from here it ends, with a controlled stop: 0.1 to 10 s.
     """
-    from trirail.client.client import Robot
-
     if not SHORTEST_LEASE <= timeout <= LONGEST_LEASE:
         allowed = f"{SHORTEST_LEASE:g} to {LONGEST_LEASE:g} s would be right"
         raise CycloptsError(msg=f"Invalid value for --timeout: {timeout:g} s is none: {allowed}")
     with (
-        Robot(service.robot, service.connect, tls=service.tls) as robot,
+        service.open() as robot,
         robot.lease(force=force, timeout=timeout) as lease,
     ):
         show(service, {"lease": robot.user}, f"{robot.user} holds the lease until Ctrl-C")
@@ -392,9 +366,7 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.
 
 def status(*, service: Service = HERE) -> int:
     """Print the present state."""
-    from trirail.client.client import Robot
-
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         state, info = robot.state(), robot.info()
     if service.json:
         fixed = {"missing_protections": info.missing_protections, "correction": info.correction}
@@ -406,9 +378,7 @@ def status(*, service: Service = HERE) -> int:
 
 def watch(*, service: Service = HERE) -> int:
     """Show the state live until Ctrl-C."""
-    from trirail.client.client import Robot
-
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         live.watch(robot, json_lines=service.json)
     return 0
 
@@ -434,9 +404,7 @@ def events(
     follow
         Go on with those to come all the same.
     """
-    from trirail.client.client import Robot
-
-    with Robot(service.robot, service.connect, tls=service.tls) as robot:
+    with service.open() as robot:
         now = robot.state().t  # so that a missing service is said, not waited for
         seen = 0
         if last is not None:
@@ -468,9 +436,7 @@ def command_line_of(name: Command) -> Callable[..., int]:
     """Return the command of the command line that sends one, with the numbers that it cannot come without."""
 
     def send_command(*values: float, service: Service = HERE) -> int:
-        from trirail.client.client import Robot
-
-        with Robot(service.robot, service.connect, tls=service.tls) as robot:
+        with service.open() as robot:
             reply = robot.command(name, name.content(*values) if values else None)
         confirmed(service, name, reply)
         return 0

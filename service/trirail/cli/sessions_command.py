@@ -16,7 +16,7 @@ from cyclopts import Parameter, Token
 from rich.padding import Padding
 
 from trirail.cli import terminal
-from trirail.cli.options import Flag
+from trirail.cli.options import Flag, Json
 from trirail.errors import ServiceError
 from trirail.telemetry import palette
 from trirail.wire.messages import Outcome
@@ -54,7 +54,7 @@ def sessions(
     outcome: Outcome | None = None,
     last: int = 20,
     rebuild: Annotated[bool, Flag] = False,
-    json: Annotated[bool, Flag] = False,
+    json: Json = False,
 ) -> int:
     """List recorded sessions, the newest last, running ones too.
 
@@ -82,8 +82,6 @@ def sessions(
         At most so many, the newest; 0 for all.
     rebuild
         Throw the index away and read every recording.
-    json
-        Print one JSON object instead of words.
     """
     from trirail.telemetry.session_index import SessionIndex, Wanted
 

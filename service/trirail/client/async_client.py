@@ -22,7 +22,7 @@ from trirail.client.async_connection import AsyncConnection
 from trirail.client.async_goal import AsyncGoalHandle, AsyncJog
 from trirail.client.async_lease import AsyncLease
 from trirail.client.async_track import AsyncTrack
-from trirail.client.client import HOME_WITHIN, REPORT_WITHIN, Robot, address, identity, result_of
+from trirail.client.client import HOME_WITHIN, REPORT_WITHIN, Robot, identity, result_of
 from trirail.client.connection import REPLY_WITHIN
 from trirail.client.goal import GoalHandle
 from trirail.client.outgoing import content_message, goal_message, id_of, seconds
@@ -117,10 +117,7 @@ class AsyncRobot:
         user: str | None = None,
         tls: Path | str | None = None,
     ) -> None:
-        name, connect, tls = address(name, connect, tls)
-        self.name = check_name(name, "robot")
-        self.user, self._credentials = identity(self.name, connect, user, tls)
-        self._connect = connect
+        self.name, self._connect, self.user, self._credentials = identity(name, connect, user, tls)
         self._opened = AsyncExitStack()
         self._open: AsyncConnection | None = None
         self._goals: dict[str, AsyncGoalHandle] = {}

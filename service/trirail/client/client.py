@@ -83,9 +83,7 @@ class Robot:
         user: str | None = None,
         tls: Path | str | None = None,
     ) -> None:
-        name, connect, tls = address(name, connect, tls)
-        self.name = check_name(name, "robot")
-        self.user, credentials = identity(self.name, connect, user, tls)
+        self.name, connect, self.user, credentials = identity(name, connect, user, tls)
         self._connection = Connection(self.name, connect, credentials, self.user)
         self._goals: dict[str, GoalHandle] = {}
         self._goals_lock = threading.Lock()
@@ -533,17 +531,17 @@ class Robot:
             goal.end(result)
 
 
-def address(robot: str | None, connect: str | None, tls: Path | str | None) -> tuple[str, str, Path | str | None]:
-    """Return which robot, where, and with whose folder: what is not given as the environment has it, as in a shell."""
-    robot = robot or os.environ.get("TRIRAIL_ROBOT") or "demo"
+def identity(
+    robot: str | None, connect: str | None, user: str | None, tls: Path | str | None
+) -> tuple[str, str, str, Credentials | None]:
+    """Return with which robot a client speaks, where, as whom, and with which credentials.
+
+    What is not given is as the environment has it, as in a shell. Raises RefusedError, ServiceError.
+    """
+    robot = check_name(robot or os.environ.get("TRIRAIL_ROBOT") or "demo", "robot")
     connect = connect or os.environ.get("TRIRAIL_CONNECT") or DEFAULT_LOCATOR
     if tls is None and reach(connect) is ReachableBy.CERTIFICATE:
         tls = os.environ.get("TRIRAIL_TLS") or None
-    return robot, connect, tls
-
-
-def identity(robot: str, connect: str, user: str | None, tls: Path | str | None) -> tuple[str, Credentials | None]:
-    """Return as whom a client speaks to a robot, and with which credentials. Raises RefusedError, ServiceError."""
     credentials = credentials_for(robot, connect, tls)
     known_as = credentials.name if credentials is not None else ""
     name = check_name(user or known_as or _user(), "user")
@@ -551,7 +549,7 @@ def identity(robot: str, connect: str, user: str | None, tls: Path | str | None)
         whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
         problem = f"the certificate in {credentials.folder} is {whose}: {name} cannot send with it"
         raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
-    return name, credentials
+    return robot, connect, name, credentials
 
 
 def result_of(event: Event) -> Result | None:

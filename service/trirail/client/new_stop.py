@@ -6,13 +6,12 @@ import queue
 import threading
 from pathlib import Path
 
-from trirail.client.client import address, identity
+from trirail.client.client import identity
 from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.stop_call import Outcome, Outcomes, StopOrder
 from trirail.errors import ServiceError, TrirailError
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
-from trirail.wire.text import check_name
 
 
 class NewStop:
@@ -24,8 +23,7 @@ class NewStop:
     def __init__(
         self, name: str, robot: str | None = None, connect: str | None = None, tls: Path | str | None = None
     ) -> None:
-        robot, connect, tls = address(robot, connect, tls)
-        user, credentials = identity(check_name(robot, "robot"), connect, None, tls)
+        robot, connect, user, credentials = identity(robot, connect, None, tls)
         stop = StopOrder.of(robot, user, name, None, REPLY_WITHIN)
         self._came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         at_door = stop.at_door(connect, credentials, self._came.put)

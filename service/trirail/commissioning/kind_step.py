@@ -46,7 +46,7 @@ class KindStep:
         way, expected = found
         kinds = self._robot.kind, other.kind
         if expected.apart < DISTINCT * read_to:
-            return judge_kind(kinds, way, expected, None, read_to), self._measured(expected, None, read_to)
+            return judge_kind(kinds, way, expected, None, read_to), _measured(expected, None, read_to)
         axis, line = AXES[way.axis], AXES[way.along]
         self._person.show(
             f"  It turns by {math.degrees(way.turn):+.2f}° and goes {way.distance * 1e3:+.2f} mm along {line}. Let the "
@@ -71,7 +71,7 @@ class KindStep:
             return Judged("failed", (str(why),), "repeat the step of the slider that is named"), {}
         seen = predicted(self._robot, other, first, second, way.axis)
         moved = after - before
-        return judge_kind(kinds, way, seen, moved, read_to), self._measured(seen, moved, read_to)
+        return judge_kind(kinds, way, seen, moved, read_to), _measured(seen, moved, read_to)
 
     def _go(self, to: Array) -> None:
         """Move all three sliders to a place [m], with power for that long. Raises Stopped."""
@@ -80,12 +80,6 @@ class KindStep:
         with bench.power():
             bench.play(moves.together(ways, self._config.limits.slider, bench.period))
 
-    def _measured(self, expected: KindPredicted, moved: float | None, read_to: float) -> dict[str, Number]:
-        """Return what goes into the report [m]."""
-        return {
-            "configured": expected.configured,
-            "other": expected.other,
-            "unsure": expected.unsure,
-            "moved": moved,
-            "read_to": read_to,
-        }
+
+def _measured(expected: KindPredicted, moved: float | None, read_to: float) -> dict[str, Number]:
+    return expected._asdict() | {"moved": moved, "read_to": read_to}

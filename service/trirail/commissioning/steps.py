@@ -20,7 +20,7 @@ from trirail.commissioning.judgement import (
     judge_switches,
     judge_watchdog,
 )
-from trirail.commissioning.kind_step import KindStep
+from trirail.commissioning.kind_step import REMEDY, KindStep
 from trirail.commissioning.observer import Observer, Reading, apart
 from trirail.commissioning.person import Question, choose
 from trirail.commissioning.report import Number
@@ -208,8 +208,7 @@ class Steps:
         try:
             way, path = moves.square(self._config, bench.position)
         except (KinematicsError, ValueError) as error:
-            remedy = "move the sliders, by hand or by their homing, to where the platform is well within its limits"
-            return Judged("failed", (str(error),), remedy), {}
+            return Judged("failed", (str(error),), REMEDY), {}
         half = len(path) // 2
         rules = self._see.rules()
         corner = rules

@@ -17,6 +17,7 @@ from trirail.control.plan_requests import PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.control.transitions import Transitions
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.messages import Notice
 from trirail.wire.packets import CommandRequest
 from trirail.wire.vocabulary import Command, FaultCause, Mode
 
@@ -90,7 +91,6 @@ class Commands:
             self._change_mode(request)
 
     def _home(self, request: CommandRequest) -> None:
-        """Home the drives."""
         if not self._can_home:
             raise RefusedError(RefusalCode.NOTHING_TO_HOME, "absolute encoders: there is nothing to home")
         self._change_mode(request)
@@ -100,7 +100,9 @@ class Commands:
         rate = self._planner.override = request.content.percent / 100.0
         if self._modes.state.mode is Mode.MOVING:
             self._planner.run_at(rate)
-        self._ledger.announce("service", "info", f"override {rate:.0%} by {request.user}", user=request.user)
+        self._ledger.notices.append(
+            Notice("service", "info", f"override {rate:.0%} by {request.user}", user=request.user)
+        )
 
     def _acquire(self, request: CommandRequest) -> None:
         """Let a user have the lease, or keep it."""
@@ -109,13 +111,12 @@ class Commands:
             self._change_lease(change)
 
     def _release(self, request: CommandRequest) -> None:
-        """Let a user give the lease back."""
         self._change_lease(self._lease.release(request.user, request.content))
 
     def _change_lease(self, change: LeaseChange) -> None:
         """Tell who holds the lease from now on; what others have under way stops, and does not begin any more."""
         user = self._lease.user
-        self._ledger.announce("lease", change.level, change.message, user=user)
+        self._ledger.notices.append(Notice("lease", change.level, change.message, user=user))
         if user is None or not self._ledger.is_all_of(user):
             self._modes.go(ModeEvent.STOP, change.message)
             self._modes.withdraw(ModeEvent.STOP, change.message)

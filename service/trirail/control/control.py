@@ -30,7 +30,7 @@ from trirail.motion.limits import EDGE, Bounds
 from trirail.motion.runs import STILL, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames
-from trirail.wire.messages import FaultDetail, Outcome
+from trirail.wire.messages import FaultDetail, Notice, Outcome
 from trirail.wire.packets import (
     CommandRequest,
     Disturbance,
@@ -200,7 +200,7 @@ class Control:
             drive, cause, code, message = feedback.fault
             if mode is Mode.FAULT and feedback.fault != before.fault:
                 # The first one stays, but this came of it.
-                self.ledger.announce("fault", "error", message, fault=FaultDetail(cause, drive, code))
+                self.ledger.notices.append(Notice("fault", "error", message, fault=FaultDetail(cause, drive, code)))
             self.modes.trip(message, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
@@ -219,7 +219,7 @@ class Control:
     def _tell_warnings(self, feedback: Feedback) -> None:
         """Tell what people should know of the drives: they say it in one feedback only, some in the first."""
         for warning in feedback.warnings:
-            self.ledger.announce("service", "warning", warning)
+            self.ledger.notices.append(Notice("service", "warning", warning))
 
     def solve(self) -> None:
         """Move the commanded motion on by one period, solve the sliders by the paper's recursion, pass the last gate.
@@ -304,14 +304,14 @@ class Control:
             elif isinstance(request, CommandRequest):
                 self._commands.carry_out(request)
             elif isinstance(request, PoseChanged):
-                self.ledger.announce("pose", "info", request.message, user=request.user)
+                self.ledger.notices.append(Notice("pose", "info", request.message, user=request.user))
             elif isinstance(request, Looked):
                 look, words = request.look, request.message
-                self.ledger.announce("alignment", request.level, words, user=request.user, alignment=look)
+                self.ledger.notices.append(Notice("alignment", request.level, words, user=request.user, alignment=look))
             elif isinstance(request, Remark):
-                self.ledger.announce("service", request.level, request.message)
+                self.ledger.notices.append(Notice("service", request.level, request.message))
             else:
-                self.ledger.announce("refused", "warning", request.message, user=request.user)
+                self.ledger.notices.append(Notice("refused", "warning", request.message, user=request.user))
         except RefusedError as refusal:
             self.ledger.refuse(request, refusal)
 

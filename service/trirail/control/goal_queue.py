@@ -16,7 +16,7 @@ from trirail.motion.goal_planner import meant
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goals import Goal
-from trirail.wire.messages import Outcome
+from trirail.wire.messages import Notice, Outcome
 from trirail.wire.packets import GoalRequest
 
 FURTHEST = 0.5
@@ -216,7 +216,9 @@ class GoalQueue:
         """Tell everyone, once until it has said something, that a goal waits for a planner that is busy."""
         busy = self._planner.how_busy
         if busy and not self._told_busy:
-            self._ledger.announce("service", "warning", f"{busy}: goal {request.id} waits", user=request.user)
+            self._ledger.notices.append(
+                Notice("service", "warning", f"{busy}: goal {request.id} waits", user=request.user)
+            )
         self._told_busy = bool(busy)
 
     def _check_age(self, sent: _Sent, cycle: int) -> None:

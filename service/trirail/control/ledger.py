@@ -7,15 +7,14 @@ from collections import deque
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+from msgspec import structs
 from trirail_drivers.interface import Triple
 
 from trirail.control.in_position import Settled
-from trirail.control.notices import REMEMBERED_IDS, Notice
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.goals import Goal
-from trirail.wire.looks import AlignmentLook
-from trirail.wire.messages import FaultDetail, Level, Outcome
+from trirail.wire.messages import REMEMBERED_IDS, Level, Notice, Outcome
 from trirail.wire.packets import (
     Accepted,
     Answer,
@@ -165,7 +164,7 @@ class Ledger:
         goal, told = request.goal, self.goals[0]
         if goal.target is not None and taken.bound not in (None, told.bound):
             text = f"the target of goal {told.id} is beyond the limit of {taken.bound}: the robot waits there"
-            self.announce("service", "warning", text, user=told.user)
+            self.notices.append(Notice("service", "warning", text, user=told.user))
         bound = taken.bound or (told.bound if goal.target is not None else None)  # a limit is told of once
         self.goals[0] = told._replace(bound=bound, target=goal.target, lag=taken.lag)
 
@@ -209,18 +208,18 @@ class Ledger:
         text = str(refusal)
         self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
         if isinstance(request, CommandRequest):
-            self.announce("refused", "warning", f"{request.name} refused: {text}", user=request.user)
+            self.notices.append(Notice("refused", "warning", f"{request.name} refused: {text}", user=request.user))
             return
         if request.goal.frequent:
             before, self._refused = self._refused, (request.id, refusal.code)
             if before == self._refused:
                 return
         if refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER):
-            self.announce("refused", "warning", text, user=request.user)
+            self.notices.append(Notice("refused", "warning", text, user=request.user))
         else:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
-                self.announce("refused", "warning", text, user=request.user)
+                self.notices.append(Notice("refused", "warning", text, user=request.user))
                 if not request.goal.frequent:  # whoever asked for that is not to have the old one either
                     self.keep_alive(request, -math.inf)
             else:
@@ -254,7 +253,7 @@ class Ledger:
             del self._ended[next(iter(self._ended))]
         words = f"goal {goal_id} {outcome}: {reason}"
         said = Notice("goal", level, words, id=goal_id, outcome=outcome, reason=reason, user=user)
-        self.notices.append(said._replace(**settled._asdict()) if settled is not None else said)
+        self.notices.append(structs.replace(said, **settled._asdict()) if settled is not None else said)
 
     # ------------------------------------------------------------------ commands
 
@@ -281,27 +280,6 @@ class Ledger:
                     self.answers.append(Refused(request.ticket, RefusalCode.FAILED, f"{name} failed: {why}"))
                 else:
                     self.answers.append(Confirmed(request.ticket, name, mode, cycle))
-
-    # ------------------------------------------------------------------ everyone
-
-    def announce(
-        self,
-        kind: str,
-        level: Level,
-        message: str,
-        *,
-        mode: str | None = None,
-        id: str | None = None,  # noqa: A002 - the field's name on the wire
-        outcome: Outcome | None = None,
-        reason: str | None = None,
-        goal: str | None = None,
-        user: str | None = None,
-        fault: FaultDetail | None = None,
-        alignment: AlignmentLook | None = None,
-    ) -> None:
-        """Note something that everyone is to know."""
-        said = Notice(kind, level, message, mode, id, outcome, reason, goal, user, fault=fault, alignment=alignment)
-        self.notices.append(said)
 
 
 def _not_renewed(goal_id: str) -> RefusedError:

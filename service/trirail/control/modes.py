@@ -87,20 +87,6 @@ PAUSED = ModeState(Mode.HOLDING, paused=True)
 RELEASING = ModeState(Mode.STOPPING, released=True)
 FAULT = ModeState(Mode.FAULT)
 
-STATES = (
-    DISABLED,
-    ENABLING,
-    HOMING,
-    HOLDING,
-    MOVING,
-    STOPPING,
-    STOPPING_TO_DISABLE,
-    PAUSING,
-    PAUSED,
-    RELEASING,
-    FAULT,
-)
-
 _NO_FAULT = Refusal(RefusalCode.NO_FAULT, "there is no fault to reset")
 _DISABLED = Refusal(RefusalCode.NOT_ENABLED, "the robot is disabled: send enable first")
 _ENABLING = Refusal(RefusalCode.NOT_ENABLED, "the drives are still powering up: send it again when the mode is holding")
@@ -119,138 +105,113 @@ _NOT_PAUSED = Refusal(RefusalCode.NOT_PAUSED, "there is no paused goal to resume
 _POWER_OFF = Step(DISABLED, Action.POWER_DOWN)
 _TRIP = Step(FAULT, Action.QUICK_STOP)
 
+_ALWAYS: dict[ModeEvent, Step | Refusal] = {
+    ModeEvent.RESET: _NO_FAULT,
+    ModeEvent.QUICK_STOP: _TRIP,
+    ModeEvent.FAULT: _TRIP,
+}
+_WITHOUT_GOAL = _ALWAYS | {ModeEvent.PAUSE: _NO_GOAL, ModeEvent.RESUME: _NOT_PAUSED}
+
 _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
-    DISABLED: {
+    DISABLED: _WITHOUT_GOAL
+    | {
         ModeEvent.ENABLE: Step(ENABLING, Action.POWER_UP),
         ModeEvent.GOAL: _DISABLED,
-        ModeEvent.PAUSE: _NO_GOAL,
-        ModeEvent.RESUME: _NOT_PAUSED,
         ModeEvent.HOME: _DISABLED,
-        ModeEvent.RESET: _NO_FAULT,
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    ENABLING: {
+    ENABLING: _WITHOUT_GOAL
+    | {
         ModeEvent.DISABLE: _POWER_OFF,
         ModeEvent.GOAL: _ENABLING,
-        ModeEvent.PAUSE: _NO_GOAL,
-        ModeEvent.RESUME: _NOT_PAUSED,
         ModeEvent.STOP: _POWER_OFF,
         ModeEvent.HOME: _ENABLING,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.POWERED: Step(HOLDING),
         ModeEvent.GATEWAY_LOST: _POWER_OFF,
         ModeEvent.LATE: _POWER_OFF,
         ModeEvent.SHUTDOWN: _POWER_OFF,
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    HOMING: {
+    HOMING: _WITHOUT_GOAL
+    | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
         ModeEvent.GOAL: _HOMING,
         ModeEvent.STOP: Step(STOPPING, Action.STOP_HOMING),
-        ModeEvent.PAUSE: _NO_GOAL,
-        ModeEvent.RESUME: _NOT_PAUSED,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.HOMED: Step(HOLDING),
         ModeEvent.GATEWAY_LOST: Step(STOPPING, Action.STOP_HOMING),
         ModeEvent.LATE: Step(STOPPING, Action.STOP_HOMING),
         ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.STOP_HOMING),
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    HOLDING: {
+    HOLDING: _WITHOUT_GOAL
+    | {
         ModeEvent.DISABLE: _POWER_OFF,
         ModeEvent.GOAL: Step(MOVING, Action.START),
-        ModeEvent.PAUSE: _NO_GOAL,
-        ModeEvent.RESUME: _NOT_PAUSED,
         ModeEvent.HOME: Step(HOMING, Action.HOME),
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.SHUTDOWN: _POWER_OFF,
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    MOVING: {
+    MOVING: _ALWAYS
+    | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE, Action.BRAKE),
         ModeEvent.GOAL: Step(MOVING, Action.START),
         ModeEvent.STOP: Step(STOPPING, Action.BRAKE),
         ModeEvent.PAUSE: Step(PAUSING, Action.BRAKE),
         ModeEvent.NOT_RENEWED: Step(RELEASING, Action.BRAKE),
         ModeEvent.HOME: _MOVING,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.ARRIVED: Step(HOLDING),
         ModeEvent.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),
         ModeEvent.LATE: Step(STOPPING, Action.BRAKE),
         ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE, Action.BRAKE),
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    STOPPING: {
+    STOPPING: _WITHOUT_GOAL
+    | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
         ModeEvent.GOAL: _STOPPING,
-        ModeEvent.PAUSE: _NO_GOAL,
-        ModeEvent.RESUME: _NOT_PAUSED,
         ModeEvent.HOME: _STOPPING,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.STANDSTILL: Step(HOLDING),
         ModeEvent.ARRIVED: Step(HOLDING),
         ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    STOPPING_TO_DISABLE: {
+    STOPPING_TO_DISABLE: _WITHOUT_GOAL
+    | {
         ModeEvent.ENABLE: _DISABLING,
         ModeEvent.GOAL: _DISABLING,
-        ModeEvent.PAUSE: _NO_GOAL,
-        ModeEvent.RESUME: _NOT_PAUSED,
         ModeEvent.HOME: _DISABLING,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.STANDSTILL: _POWER_OFF,
         ModeEvent.ARRIVED: _POWER_OFF,
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    PAUSING: {
+    PAUSING: _ALWAYS
+    | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
         ModeEvent.GOAL: Step(MOVING, Action.START),
         ModeEvent.STOP: Step(STOPPING),
         ModeEvent.RESUME: Step(MOVING, Action.RESUME),
         ModeEvent.HOME: _PAUSED,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.STANDSTILL: Step(PAUSED),
         ModeEvent.ARRIVED: Step(HOLDING),
         ModeEvent.GATEWAY_LOST: Step(STOPPING),
         ModeEvent.LATE: Step(STOPPING),
         ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    PAUSED: {
+    PAUSED: _ALWAYS
+    | {
         ModeEvent.DISABLE: _POWER_OFF,
         ModeEvent.GOAL: Step(MOVING, Action.START),
         ModeEvent.STOP: Step(HOLDING),
         ModeEvent.RESUME: Step(MOVING, Action.RESUME),
         ModeEvent.HOME: _PAUSED,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.GATEWAY_LOST: Step(HOLDING),
         ModeEvent.SHUTDOWN: _POWER_OFF,
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
-    RELEASING: {
+    RELEASING: _ALWAYS
+    | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
         ModeEvent.GOAL: Step(MOVING, Action.START),
         ModeEvent.STOP: Step(STOPPING),
         ModeEvent.RESUME: _NOT_PAUSED,
         ModeEvent.HOME: _STOPPING,
-        ModeEvent.RESET: _NO_FAULT,
         ModeEvent.STANDSTILL: Step(HOLDING),
         ModeEvent.ARRIVED: Step(HOLDING),
         ModeEvent.GATEWAY_LOST: Step(STOPPING),
         ModeEvent.LATE: Step(STOPPING),
         ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
-        ModeEvent.QUICK_STOP: _TRIP,
-        ModeEvent.FAULT: _TRIP,
     },
     FAULT: {
         ModeEvent.ENABLE: _FAULT,
@@ -261,6 +222,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.RESET: Step(DISABLED, Action.CLEAR),
     },
 }
+STATES = tuple(_TABLE)
 
 
 def step(state: ModeState, event: ModeEvent) -> Step | Refusal:

@@ -15,7 +15,7 @@ from trirail.control.plan_requests import PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.errors import RefusedError
 from trirail.motion.schedule import Schedule
-from trirail.wire.messages import FaultDetail, Outcome
+from trirail.wire.messages import FaultDetail, Notice, Outcome
 from trirail.wire.packets import GoalRequest
 from trirail.wire.vocabulary import Command, Mode
 
@@ -104,7 +104,9 @@ class Transitions:
             self._ledger.end(outcome, arrived if outcome == "done" else reason)
         if self.state.mode is not before.mode:
             begun = goal.id if goal is not None else None
-            self._ledger.announce("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, goal=begun)
+            self._ledger.notices.append(
+                Notice("mode", "info", f"{self.state.mode}: {reason}", mode=self.state.mode, goal=begun)
+            )
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
             self._schedule.replace_runs(deque())
             self._setpoints.tell_progress(0.0, 0.0)
@@ -114,7 +116,7 @@ class Transitions:
         """Let something happen that nobody asked for: the gateway is lost, ticks are late, the service ends."""
         decided = step(self.state, event)
         if not isinstance(decided, Refusal) and decided.state != self.state:
-            self._ledger.announce("service", "warning", reason)
+            self._ledger.notices.append(Notice("service", "warning", reason))
             self.go(event, reason)
         self.withdraw(event, reason)
 
@@ -123,7 +125,7 @@ class Transitions:
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason
-        self._ledger.announce("fault", "error", reason, fault=FaultDetail(cause, drive, code))
+        self._ledger.notices.append(Notice("fault", "error", reason, fault=FaultDetail(cause, drive, code)))
         self.go(ModeEvent.FAULT, reason)
         self.withdraw(ModeEvent.FAULT, reason)
 

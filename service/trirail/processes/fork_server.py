@@ -77,14 +77,9 @@ class _Request(NamedTuple):
 class ForkServer:
     """Forks on request until the supervisor has gone; `work` is what a child does, and returns its exit code."""
 
-    def __init__(
-        self, control: socket.socket, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int]
-    ) -> None:
-        self._control = control
-        self._order = order
-        self._runtime = runtime
-        self._heartbeats = heartbeats
-        self._sockets = sockets
+    def __init__(self, inherited: Inheritance) -> None:
+        self._inherited = inherited
+        self._control = inherited.control
         self._requests: list[_Request] = []
         """Those whose child has not been forked yet."""
         self._children: dict[int, int] = {}
@@ -94,7 +89,7 @@ class ForkServer:
         self._kept = True
         """False where what is compiled cannot be kept: then each that needs it compiles for itself."""
         self._poll = select.poll()
-        self._poll.register(control, select.POLLIN)
+        self._poll.register(self._control, select.POLLIN)
 
     def serve(self, work: Callable[[Child], int]) -> None:
         """Serve until the supervisor has gone."""
@@ -158,12 +153,13 @@ class ForkServer:
             name_process(name if work is not _compile else "compiler")
             self._control.close()
             others = [waiting.voice for waiting in self._requests if waiting is not request]
-            for descriptor in (*self._children, *others, *([] if name == "loop" else self._sockets)):
+            for descriptor in (*self._children, *others, *([] if name == "loop" else self._inherited.sockets)):
                 os.close(descriptor)
             gc.enable()
             signal.pthread_sigmask(signal.SIG_SETMASK, [])
-            order = structs.replace(self._order, record=request.fork.record)
-            code = work(Child(name, order, self._runtime, self._heartbeats, self._sockets, request.voice))
+            _, order, runtime, heartbeats, sockets = self._inherited
+            order = structs.replace(order, record=request.fork.record)
+            code = work(Child(name, order, runtime, heartbeats, sockets, request.voice))
         except BaseException:  # noqa: BLE001 - nothing of this process may return into that of the parent
             traceback.print_exc()
         finally:
@@ -172,7 +168,6 @@ class ForkServer:
             os._exit(code)
 
     def _reap(self, pidfd: int) -> None:
-        """Take in that a child has ended."""
         ended = os.waitid(os.P_PIDFD, pidfd, os.WEXITED)
         code = 0 if ended is None else ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
         self._poll.unregister(pidfd)
@@ -221,7 +216,7 @@ def serve(inheritance: Inheritance, work: Callable[[Child], int] = run) -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, [signal.SIGTERM])
     os.environ.update(AS_NEEDED)
     gc.disable()
-    ForkServer(*inheritance).serve(work)
+    ForkServer(inheritance).serve(work)
 
 
 def fork(inheritance: Inheritance) -> int:

@@ -189,7 +189,6 @@ class Gateway:
     # ------------------------------------------------------------------ loop to Zenoh
 
     def _hear(self, packet: bytes, ready: Callable[[], None]) -> None:
-        """Take a packet of the loop's."""
         content = memoryview(packet)[1:]
         try:
             if packet[0] == Kind.RECORDS:

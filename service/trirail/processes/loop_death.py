@@ -8,8 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from trirail.control.notices import REMEMBERED_IDS, Notice
-from trirail.wire.messages import Event, FaultDetail
+from trirail.wire.messages import REMEMBERED_IDS, Event, FaultDetail, Notice
 from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
 from trirail.wire.vocabulary import FaultCause, Mode
 
@@ -79,4 +78,4 @@ class LoopDeath:
             missing.append(Notice("goal", "error", words, id=goal_id, outcome="faulted", reason=reason, user=user))
         missing.append(Notice("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT))
         t, wall = cycle * self._period, time.time()
-        return [Event(self._seq + n, t, cycle, wall, **what._asdict()) for n, what in enumerate(missing, 1)]
+        return [what.event(self._seq + n, t, cycle, wall) for n, what in enumerate(missing, 1)]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from msgspec import structs
 from prometheus_client import Metric
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.registry import Collector
@@ -17,8 +18,9 @@ from trirail.processes.zenoh_links import InUse
 from trirail.wire.vocabulary import MODES
 
 PREFIX: Final = "trirail"
-FRAMES: Final = ("feedback_late", "feedback_lost", "setpoints_late", "setpoints_lost")
-"""Fields of trirail.wire.state.FrameCounts, as labels."""
+Values = Mapping[Any, float]
+"""By a label's value, or where a metric has several labels, by a tuple of theirs."""
+NONE_YET: Final[Values] = {}
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 TICKS: Final = os.sysconf("SC_CLK_TCK")
 
@@ -33,9 +35,8 @@ class ServiceMetrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric; what has not been measured yet is left out."""
-        info = _gauge("service_info", "The robot and the software that runs.", ["robot", "version"])
-        info.add_metric([self._robot, self._version], 1.0)
-        yield info
+        words = "The robot and the software that runs."
+        yield _gauge("service_info", words, ["robot", "version"], {(self._robot, self._version): 1.0})
         yield from self._processes()
         if (service := self._health.service) is not None:
             yield from _loop(service)
@@ -43,18 +44,16 @@ class ServiceMetrics(Collector):
             yield from _can(service)
             yield from _use(service.use)
         if (recorder := self._health.recorder) is not None:
-            lost = _counter("recorder_lost_batches", "Batches that are missing, by where they should be.", ["sink"])
-            lost.add_metric(["file"], recorder.lost)
-            lost.add_metric(["live"], recorder.skipped)
-            yield lost
+            words = "Batches that are missing, by where they should be."
+            lost = {"file": recorder.lost, "live": recorder.skipped}
+            yield _counter("recorder_lost_batches", words, ["sink"], lost)
             words = "Cycles that are in no recording, since the recorder was too slow for them."
             yield _counter("recorder_missing_cycles", words, value=recorder.absent)
 
     def _processes(self) -> Iterator[Metric]:
-        healthy = _gauge("process_healthy", "Whether a process does its work, as /healthz says it.", ["process"])
-        for name, trouble in self._health.troubles().items():
-            healthy.add_metric([name], float(not trouble))
-        yield healthy
+        words = "Whether a process does its work, as /healthz says it."
+        healthy = {name: float(not trouble) for name, trouble in self._health.troubles().items()}
+        yield _gauge("process_healthy", words, ["process"], healthy)
         restarts = _counter("process_restarts", "How often a process was started again.", ["process"])
         memory = _gauge("process_resident_memory_bytes", "Memory of a process.", ["process"])
         busy = _counter("process_cpu_seconds", "Processor time of a process since its start.", ["process"])
@@ -65,17 +64,13 @@ class ServiceMetrics(Collector):
                 memory.add_metric([name], used[0])
                 busy.add_metric([name], used[1])
         yield from (restarts, memory, busy)
-        age = _gauge("measurement_age_seconds", "How old the metrics are that a process measures.", ["process"])
-        for name, seconds in self._health.ages().items():
-            age.add_metric([name], seconds)
-        yield age
+        words = "How old the metrics are that a process measures."
+        yield _gauge("measurement_age_seconds", words, ["process"], self._health.ages())
 
 
 def _loop(service: ServiceMeasured) -> Iterator[Metric]:
-    mode = _gauge("mode", "1 for the mode that the robot is in, 0 for the others.", ["mode"])
-    for name in MODES:
-        mode.add_metric([name], float(name == service.mode))
-    yield mode
+    modes = {name: float(name == service.mode) for name in MODES}
+    yield _gauge("mode", "1 for the mode that the robot is in, 0 for the others.", ["mode"], modes)
     yield _counter("loop_cycles", "SYNCs sent since the start.", value=service.cycles)
     yield _counter("loop_missed_ticks", "Ticks missed since the start.", value=service.overruns)
     yield _histogram("loop_lateness_seconds", "How much after its deadline a cycle began.", service.lateness)
@@ -83,10 +78,7 @@ def _loop(service: ServiceMeasured) -> Iterator[Metric]:
 
 
 def _goals(service: ServiceMeasured) -> Iterator[Metric]:
-    goals = _counter("goals", "Goals that have ended, by outcome.", ["outcome"])
-    for outcome, times in service.goals.items():
-        goals.add_metric([outcome], times)
-    yield goals
+    yield _counter("goals", "Goals that have ended, by outcome.", ["outcome"], service.goals)
     yield _histogram("goal_settle_seconds", "From the end of a goal's path until it was in position.", service.settle)
     faults = _counter("faults", "Faults, by cause, drive and the drive's own code.", ["cause", "drive", "code"])
     for count in service.faults:
@@ -96,33 +88,39 @@ def _goals(service: ServiceMeasured) -> Iterator[Metric]:
 
 
 def _can(service: ServiceMeasured) -> Iterator[Metric]:
-    load = _gauge("can_load_ratio", "Share of the bus in use; 1 is full.", ["kind"])
-    load.add_metric(["measured"], service.bus_load_measured)
-    load.add_metric(["worst"], service.bus_load)
-    yield load
-    frames = _counter("can_troubled_frames", "Cyclic frames of a drive that were late or lost.", ["drive", "kind"])
-    for drive, counts in zip(NAMES, service.traffic, strict=True):
-        for kind in FRAMES:
-            frames.add_metric([drive, kind], getattr(counts, kind))
-    yield frames
+    load = {"measured": service.bus_load_measured, "worst": service.bus_load}
+    yield _gauge("can_load_ratio", "Share of the bus in use; 1 is full.", ["kind"], load)
+    frames = {
+        (drive, kind): count
+        for drive, counts in zip(NAMES, service.traffic, strict=True)
+        for kind, count in structs.asdict(counts).items()
+    }
+    words = "Cyclic frames of a drive that were late or lost."
+    yield _counter("can_troubled_frames", words, ["drive", "kind"], frames)
 
 
 def _use(use: InUse) -> Iterator[Metric]:
-    used = _gauge("gateway_used", "What is in use of what the gateway has so many of.", ["what"])
-    most = _gauge("gateway_most", "How many of it there are.", ["what"])
-    used.add_metric(["sessions"], use.sessions)
-    most.add_metric(["sessions"], use.sessions_most)
-    used.add_metric(["descriptors"], use.descriptors)
-    most.add_metric(["descriptors"], use.descriptors_most)
-    yield from (used, most)
+    used = {"sessions": use.sessions, "descriptors": use.descriptors}
+    most = {"sessions": use.sessions_most, "descriptors": use.descriptors_most}
+    yield _gauge("gateway_used", "What is in use of what the gateway has so many of.", ["what"], used)
+    yield _gauge("gateway_most", "How many of it there are.", ["what"], most)
 
 
-def _gauge(name: str, words: str, labels: list[str]) -> GaugeMetricFamily:
-    return GaugeMetricFamily(f"{PREFIX}_{name}", words, labels=labels)
+def _gauge(name: str, words: str, labels: list[str], values: Values = NONE_YET) -> GaugeMetricFamily:
+    """Return a metric with a value for each of its labels' values."""
+    made = GaugeMetricFamily(f"{PREFIX}_{name}", words, labels=labels)
+    for each, value in values.items():
+        made.add_metric([each] if isinstance(each, str) else each, value)
+    return made
 
 
-def _counter(name: str, words: str, labels: list[str] | None = None, value: float | None = None) -> CounterMetricFamily:
-    return CounterMetricFamily(f"{PREFIX}_{name}", words, value=value, labels=labels)
+def _counter(
+    name: str, words: str, labels: list[str] | None = None, values: Values = NONE_YET, value: float | None = None
+) -> CounterMetricFamily:
+    made = CounterMetricFamily(f"{PREFIX}_{name}", words, value=value, labels=labels)
+    for each, count in values.items():
+        made.add_metric([each] if isinstance(each, str) else each, count)
+    return made
 
 
 def _histogram(name: str, words: str, values: Histogram) -> HistogramMetricFamily:

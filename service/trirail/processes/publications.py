@@ -99,7 +99,7 @@ class StateMaker:
         self._newest: Any = None
         self._velocity = self._acceleration = np.zeros(3)
         self._error_max = np.zeros(3)
-        self._welcome = Welcome((), 0.0, 0.0)
+        self._welcome = Welcome((), 0.0)
         self._status = Status(None, 1.0, None)
 
     def update(self, news: Status | Welcome) -> None:

@@ -113,7 +113,6 @@ _STATE = from_dtype(STATE)[::1]
 
 @compiled()
 def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
-    """Return the time [ns]."""
     if state[0].injected_ns >= 0:
         return int(state[0].injected_ns)
     return int(now_ns(moment))

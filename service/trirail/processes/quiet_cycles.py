@@ -163,7 +163,6 @@ class QuietCycles:
         self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, LONGEST)
 
     def _write_state(self, calm: Calm) -> None:
-        """Write what cycles come to into the state."""
         state, run = self._state[0], calm.run
         state["source"] = quiet.FOLLOW if calm.follows else quiet.HOLD if run is None else quiet.COMMAND
         state["cycle"], state["mode"] = self._control.cycles, MODES.index(self._control.state.mode)

@@ -16,7 +16,7 @@ from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.clock import Tick
 from trirail.wire.links import Port
-from trirail.wire.messages import Event
+from trirail.wire.messages import Notice
 from trirail.wire.packets import (
     ControlInput,
     GivenInput,
@@ -63,7 +63,7 @@ class Reports:
         self._recorder = recorder
         self._capture = capture
         self._period = config.period
-        self._welcome = message(Welcome(lacking, drives.bus_load, time.time(), drives.missing_protections))
+        self._welcome = message(Welcome(lacking, drives.bus_load, drives.missing_protections))
         self._status = Status(None, 1.0, None)
         self._bitrate = config.can.bitrate
         self._bus_load = 0.0
@@ -172,7 +172,7 @@ class Reports:
         if self._recorder.take_lost() and self._recorded:
             self._recorded = False
             self._unrecorded = "the recorder has gone: nothing is recorded until it is back"
-            self._control.ledger.announce("service", "warning", self._unrecorded)
+            self._control.ledger.notices.append(Notice("service", "warning", self._unrecorded))
             self._publish_status()
         if packet is None:
             return
@@ -181,10 +181,12 @@ class Reports:
         try:
             said = decode_recorder(memoryview(packet)[1:])
         except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
-            self._control.ledger.announce("service", "warning", f"the recorder said something unreadable: {error}")
+            self._control.ledger.notices.append(
+                Notice("service", "warning", f"the recorder said something unreadable: {error}")
+            )
             return
         if isinstance(said, Remark):
-            self._control.ledger.announce("service", said.level, said.message)
+            self._control.ledger.notices.append(Notice("service", said.level, said.message))
         else:
             self._unrecorded = quoted(said.why) if said.why else ""
         self._publish_status()
@@ -197,8 +199,7 @@ class Reports:
         for number, notice in enumerate(ledger.notices):
             self._events += 1
             cycle = earlier if number < postponed else control.modes.cycle
-            event = Event(self._events, cycle * self._period, cycle, time.time(), **notice._asdict())
-            packet = event_packet(event)
+            packet = event_packet(notice.event(self._events, cycle * self._period, cycle, time.time()))
             self._kept.append(packet)
             self._recorder.send(packet)
         ledger.notices.clear()

@@ -158,7 +158,6 @@ class StopDoor:
         self._reserve.refill(len(self._callers))
 
     def _enter(self, caller: _Caller, stage: _Stage, share: str) -> None:
-        """Let a connection come to its next stage."""
         self._leave(caller)
         caller.stage, caller.share = stage, share
         self._shares.setdefault((stage, share), {})[caller] = None
@@ -198,7 +197,6 @@ class StopDoor:
     # ------------------------------------------------------------------ what one says, and is told
 
     def _go_on(self, caller: _Caller) -> None:
-        """Take what a connection says."""
         if self._callers.get(caller.number) is not caller:
             return
         try:
@@ -236,7 +234,6 @@ class StopDoor:
                 raise ConnectionError
 
     def _pass_on(self, caller: _Caller, line: bytes) -> None:
-        """Pass a request on."""
         answer = partial(self._answer, caller)
         try:
             request = decoded(line, StopRequest)

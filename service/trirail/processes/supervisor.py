@@ -240,7 +240,6 @@ class Supervisor:
         return loop is None or (loop.ready_with is not None and not self._heartbeats.of("loop").count)
 
     def _start_due(self) -> None:
-        """Start again what is due."""
         for name in [name for name, due in self._due.items() if due <= time.monotonic()]:
             del self._due[name]
             self._start(name)

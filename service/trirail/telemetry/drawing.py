@@ -32,28 +32,9 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
     yield "/robot/rails", _lines(parts.rails, [palette.FRAME], 4.5, order=10)
     yield "/robot/travel", _lines(parts.travel, [palette.dark(c) for c in palette.SLIDERS], 3.0, order=11)
     yield "/robot/stops", _lines(parts.stops, [palette.LIMIT], 1.2, order=12)
-    yield (
-        "/robot/anchors",
-        rr.Points2D(
-            parts.anchors,
-            radii=rr.Radius.ui_points(6.0),
-            colors=[palette.ANCHORS],
-            labels=[f"{name}₀" for name in names],
-            show_labels=True,
-            draw_order=13,
-        ),
-    )
-    yield (
-        "/robot/names",
-        rr.Points2D(
-            parts.names,
-            radii=rr.Radius.ui_points(0.0),
-            colors=palette.SLIDERS,
-            labels=list(names),
-            show_labels=True,
-            draw_order=13,
-        ),
-    )
+    zeros = [f"{name}₀" for name in names]
+    yield "/robot/anchors", _labelled(parts.anchors, zeros, [palette.ANCHORS], 6.0, order=13)
+    yield "/robot/names", _labelled(parts.names, list(names), palette.SLIDERS, 0.0, order=13)
     cross = ORIGIN * np.ptp(parts.bounds)
     yield "/robot/origin", _lines([axis * cross for axis in _CROSS], [palette.ARMS], 0.8, order=14)
     yield from _named(frames, cross)
@@ -61,24 +42,11 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
     yield "/robot/platform/arms", _lines(parts.arms, [palette.ARMS], 0.8, order=21)
     yield "/robot/platform/outline", _lines(parts.outline, [palette.PLATFORM], 2.2, order=22)
     yield "/robot/platform/stops", _lines(parts.edge_stops, [palette.LIMIT], 1.2, order=23)
-    yield (
-        "/robot/workspace",
-        rr.LineStrips2D.from_fields(colors=[palette.WORKSPACE], radii=rr.Radius.ui_points(0.8), draw_order=15),
-    )
-    yield (
-        "/robot/goal",
-        rr.LineStrips2D.from_fields(colors=[palette.GOAL], radii=rr.Radius.ui_points(1.0), draw_order=24),
-    )
-    yield (  # sleeves in which the platform's edges slide, or the carriages' cross slides
-        "/robot/passive",
-        rr.LineStrips2D.from_fields(
-            colors=[palette.dark(c) for c in palette.SLIDERS], radii=rr.Radius.ui_points(5.5), draw_order=25
-        ),
-    )
-    yield (
-        "/robot/trace",
-        rr.LineStrips2D.from_fields(colors=[palette.CENTRE], radii=rr.Radius.ui_points(1.2), draw_order=30),
-    )
+    yield "/robot/workspace", _strips([palette.WORKSPACE], 0.8, order=15)
+    yield "/robot/goal", _strips([palette.GOAL], 1.0, order=24)
+    # Sleeves in which the platform's edges slide, or the carriages' cross slides.
+    yield "/robot/passive", _strips([palette.dark(c) for c in palette.SLIDERS], 5.5, order=25)
+    yield "/robot/trace", _strips([palette.CENTRE], 1.2, order=30)
     yield (
         "/robot/platform/centre",
         rr.Points2D([[0.0, 0.0]], radii=rr.Radius.ui_points(4.0), colors=[palette.CENTRE], draw_order=31),
@@ -119,17 +87,8 @@ def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
 def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsComponents]]:
     """Yield the tools on the platform and the axes of work frames, each with its name."""
     if frames.tool:
-        yield (
-            "/robot/platform/tools",
-            rr.Points2D(
-                list(frames.tool.values()),
-                radii=rr.Radius.ui_points(3.0),
-                colors=[palette.CENTRE],
-                labels=list(frames.tool),
-                show_labels=True,
-                draw_order=31,
-            ),
-        )
+        tools = np.array(list(frames.tool.values()))
+        yield "/robot/platform/tools", _labelled(tools, list(frames.tool), [palette.CENTRE], 3.0, order=31)
     for name, frame in frames.work.items():
         axes = part_positions.placed([np.array([[0.0, 0.0], [size, 0.0]]), np.array([[0.0, 0.0], [0.0, size]])], frame)
         yield (
@@ -147,6 +106,18 @@ def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsCompone
 
 def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:
     return rr.LineStrips2D(lines, colors=colours, radii=rr.Radius.ui_points(radius), draw_order=order)
+
+
+def _strips(colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:
+    """Return how lines look that come later."""
+    return rr.LineStrips2D.from_fields(colors=colours, radii=rr.Radius.ui_points(radius), draw_order=order)
+
+
+def _labelled(
+    points: Points, labels: list[str], colours: Sequence[Colour], radius: float, *, order: float
+) -> rr.Points2D:
+    look = {"colors": colours, "radii": rr.Radius.ui_points(radius), "draw_order": order}
+    return rr.Points2D(points, labels=labels, show_labels=True, **look)
 
 
 def _placed(path: str, pose: Points) -> list[Column]:

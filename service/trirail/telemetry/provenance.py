@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import trirail_drivers
@@ -22,6 +23,7 @@ from trirail.wire.decoding import decoded, prepare
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
 """Where a recording has what made it, as text documents: entity paths."""
 LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
+Tables = dict[str, Any]
 _PACKAGES = (Path(__file__).parents[1], Path(trirail_drivers.__path__[0]))
 
 
@@ -83,29 +85,46 @@ def recorded_by(found: Mapping[str, str]) -> Software | None:
 
 def toml(config: Config) -> str:
     """Write a configuration as TOML: all of it, defaults included; parse(toml(config)) == config."""
-    return "\n".join(_table("", msgspec.to_builtins(config))).lstrip() + "\n"
+    tables = msgspec.to_builtins(config)
+    return "\n".join(toml_lines(tables, tables, "")).lstrip() + "\n"
 
 
-def _table(path: str, table: dict[str, object]) -> Iterator[str]:
-    """Yield the lines of a table: first its values, then the tables in it."""
-    values = {name: value for name, value in table.items() if value is not None and not isinstance(value, dict)}
-    if values and path:
-        yield from ("", f"[{path}]")
-    for name, value in values.items():
-        yield f"{name} = {_value(value)}"
-    for name, value in table.items():
+def toml_lines(tables: Tables, other: Tables, base: str, path: str = "") -> Iterator[str]:
+    """Write tables as TOML; a comment says where `other`, of the name `base`, has something else."""
+    inner = {key: value for key, value in tables.items() if _is_tables(value)}
+    plain = {key: value for key, value in tables.items() if key not in inner}
+    if path and (plain or not inner):
+        yield ""
+        yield f"[{path}]"
+    for key, value in plain.items():
+        was = other.get(key)
+        if value is not None:
+            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {base}: {_said(was)}")
+        elif was is not None:
+            yield f"# no {key}; {base}: {_said(was)}"
+    for key, value in inner.items():
+        name, was = f"{path}.{key}" if path else key, other.get(key)
         if isinstance(value, dict):
-            yield from _table(f"{path}.{name}" if path else name, value)
+            yield from toml_lines(value, was if isinstance(was, dict) else {}, base, name)
+            continue
+        for number, table in enumerate(value):
+            yield ""
+            yield f"[[{name}]]"
+            beside = was[number] if isinstance(was, list | tuple) and number < len(was) else {}
+            yield from toml_lines(table, beside, base)
 
 
-def _value(value: object) -> str:
-    if isinstance(value, dict):
-        inner = (f"{name} = {_value(inner)}" for name, inner in value.items() if inner is not None)
-        return "{ " + ", ".join(inner) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    # Strings, numbers and truth values are written in TOML as in JSON; repr of a number is exact in both.
-    return json.dumps(value, ensure_ascii=False)
+def _is_tables(value: object) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list | tuple) and bool(value) and isinstance(value[0], dict))
+
+
+def _literal(value: object) -> str:
+    """Write a value as TOML; its strings, numbers, booleans and arrays are written as in JSON."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _said(value: object) -> str:
+    return "none" if value is None else _literal(value)
 
 
 def sources() -> Iterator[Path]:

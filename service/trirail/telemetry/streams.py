@@ -187,13 +187,8 @@ class Shortfall:
 
     def check(self) -> None:
         """Say it if it is time to."""
-        if self._streams.t >= self._next:
-            self.say()
-
-    def say(self) -> None:
-        """Say it now."""
         missing = self._counts()
-        if missing != self._said:
+        if missing != self._said and self._streams.t >= self._next:
             self._said, self._next = missing, self._streams.t + REPORT_EVERY
             self._streams.say("warning", self._words.format(*missing))
 

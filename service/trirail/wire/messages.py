@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, structs
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode
@@ -16,6 +16,9 @@ from trirail.wire.looks import AlignmentLook
 
 Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"]
+
+REMEMBERED_IDS = 10_000
+"""Goals whose ids may not be used again; older ones are forgotten."""
 
 
 class GoalReply(Struct, frozen=True):
@@ -95,17 +98,9 @@ class FaultDetail(Struct, frozen=True, omit_defaults=True):
     """The drive's own: EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
 
 
-class Event(Struct, frozen=True, omit_defaults=True):
-    """Something that happened, in order, numbered without gaps by the loop."""
+class Notice(Struct, frozen=True, omit_defaults=True):
+    """Something to tell everyone, before it is numbered as an event."""
 
-    seq: int
-    """Numbered from 1 since the service's start."""
-    t: float
-    """Nominal time since the loop's start [s]; the same as in records."""
-    cycle: int
-    """Its cycle, as in records."""
-    time: float
-    """Wall clock [s since 1970]."""
     kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "alignment", "service"]
     """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
     removed, a new holder of the lease, a look of an alignment, the service itself."""
@@ -139,3 +134,20 @@ class Event(Struct, frozen=True, omit_defaults=True):
     """What it is about, with kind fault."""
     alignment: AlignmentLook | None = None
     """The look, with kind alignment."""
+
+    def event(self, seq: int, t: float, cycle: int, time: float) -> Event:
+        """Return it with its number and time."""
+        return Event(**structs.asdict(self), seq=seq, t=t, cycle=cycle, time=time)
+
+
+class Event(Notice, frozen=True, omit_defaults=True, kw_only=True):
+    """Something that happened, in order, numbered without gaps by the loop."""
+
+    seq: int
+    """Numbered from 1 since the service's start."""
+    t: float
+    """Nominal time since the loop's start [s]; the same as in records."""
+    cycle: int
+    """Its cycle, as in records."""
+    time: float
+    """Wall clock [s since 1970]."""

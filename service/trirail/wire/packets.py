@@ -129,8 +129,6 @@ class Welcome(Struct, frozen=True, tag=True):
     """What the loop runs without: real-time rights and the like, each with its remedy."""
     bus_load: float
     """Worst-case share of the bus that the cycle takes; 1 is full."""
-    epoch: float
-    """Wall clock of nominal time zero [s since 1970]."""
     missing_protections: tuple[MissingProtection, ...] = ()
     """What the drives do without."""
 

@@ -71,13 +71,16 @@ class RobotParts:
             rails=rails,
             travel=[_on_rail(leg, *own) for leg, own in zip(legs, ends_of, strict=True)],
             stops=[
-                _across(leg, position, STOP * longest)
+                _across(_on_rail(leg, position), leg.rail_angle, STOP * longest)
                 for leg, own in zip(legs, ends_of, strict=True)
                 for position in own
             ],
             outline=outline,
             edge_stops=[
-                _across_edge(leg, at, STOP * longest) for leg in legs if leg.crossing.turns for at in limits.passive
+                _across(_on_edge(leg, at), leg.crossing.angle, STOP * longest)
+                for leg in legs
+                if leg.crossing.turns
+                for at in limits.passive
             ],
             arms=[np.array([np.zeros(2), end]) for end in ends],
             names=middles + 0.07 * longest * np.array(away),
@@ -133,16 +136,10 @@ def _on_edge(leg: AnyLeg, *positions: float) -> Points:
     return np.array([np.array(point) - at * _u(angle) for at in positions])
 
 
-def _across(leg: AnyLeg, position: float, length: float) -> Points:
-    across = length / 2.0 * _u(leg.rail_angle + math.pi / 2.0)
-    (middle,) = _on_rail(leg, position)
-    return np.array([middle - across, middle + across])
-
-
-def _across_edge(leg: AnyLeg, position: float, length: float) -> Points:
-    across = length / 2.0 * _u(leg.crossing.angle + math.pi / 2.0)
-    (middle,) = _on_edge(leg, position)
-    return np.array([middle - across, middle + across])
+def _across(place: Points, angle: float, length: float) -> Points:
+    """Return a mark across a line of an angle [rad], at a place, (1, 2)."""
+    across = length / 2.0 * _u(angle + math.pi / 2.0)
+    return np.concatenate([place - across, place + across])
 
 
 def _away(leg: AnyLeg, outward: Points) -> Points:

@@ -95,7 +95,6 @@ def _slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, p
 
 
 def _shade(panel: Axes, geometry: Geometry, polygon: Array, phi: float, opacity: float) -> None:
-    """Fill a polygon with the conditioning at its points."""
     if len(polygon) == 0:
         return
     (left, bottom), (right, top) = polygon.min(axis=0), polygon.max(axis=0)
