@@ -1,4 +1,4 @@
-"""An SDO server: expedited and segmented transfers (CiA 301, service data objects)."""
+"""An SDO server: expedited and segmented transfers, and to whom block transfers go (CiA 301, service data objects)."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from trirail_drivers.simulated.dictionary import (
     ObjectEntry,
     SdoAbort,
 )
+from trirail_drivers.simulated.sdo_block import CRC_WANTED, BlockDownload, BlockUpload
 
 TOGGLE_NOT_ALTERNATED = 0x05030000
 UNKNOWN_COMMAND = 0x05040001
@@ -39,12 +40,16 @@ class SdoServer:
         self._toggle = 0
         self._upload: bytes | None = None
         self._download: bytearray | None = None
+        self._block: BlockUpload | BlockDownload | None = None
 
     def request(self, data: bytes) -> None:
         """Answer one frame of the client; one that is not eight bytes long is none (CiA 301)."""
         if len(data) != 8:
             return
         try:
+            if self._block is not None and self._block.takes(data):
+                self._go_on_in_blocks(self._block, data)
+                return
             match data[0] >> 5:
                 case 0:
                     self._download_segment(data)
@@ -56,7 +61,11 @@ class SdoServer:
                     self._upload_segment(data)
                 case 4:
                     self.reset()
-                case _:  # block transfers among them, which are optional
+                case 5:
+                    self._start_block_upload(data)
+                case 6:
+                    self._start_block_download(data)
+                case _:
                     self._refuse(data)
         except SdoAbort as abort:
             key = self._key
@@ -73,13 +82,23 @@ class SdoServer:
         self._key = index, subindex
         return self._objects[index, subindex], payload
 
-    def _start_upload(self, data: bytes) -> None:
+    def _readable(self, data: bytes) -> bytes:
+        """What the object holds that a request to read names."""
         entry, _ = self._start(data)
         if not entry.readable:
             raise SdoAbort(WRITE_ONLY)
         if entry.index == 0x1003 and entry.subindex > self._objects.internal(0x1003, 0).value:
             raise SdoAbort(NO_DATA)  # CiA 301, 1003h: no such error in the history
-        content = entry.encode()
+        return entry.encode()
+
+    def _writable(self, data: bytes) -> tuple[ObjectEntry, bytes]:
+        entry, payload = self._start(data)
+        if not entry.writable:
+            raise SdoAbort(READ_ONLY)
+        return entry, payload
+
+    def _start_upload(self, data: bytes) -> None:
+        content = self._readable(data)
         if 0 < len(content) <= 4:
             command = 0x43 | (4 - len(content)) << 2
             self._respond(_HEADER.pack(command, *self._key, content))
@@ -96,9 +115,7 @@ class SdoServer:
         self._respond(bytes([toggle | (7 - len(segment)) << 1 | last]) + segment.ljust(7, b"\0"))
 
     def _start_download(self, data: bytes) -> None:
-        entry, payload = self._start(data)
-        if not entry.writable:
-            raise SdoAbort(READ_ONLY)
+        entry, payload = self._writable(data)
         expedited, sized = data[0] & 0x02, data[0] & 0x01
         if expedited:
             length = 4 - (data[0] >> 2 & 0x03) if sized else min(entry.size or 4, 4)
@@ -121,6 +138,31 @@ class SdoServer:
             content, self._download = bytes(self._download), None
             entry.load(content)
         self._respond(bytes([0x20 | toggle]).ljust(8, b"\0"))
+
+    def _start_block_upload(self, data: bytes) -> None:
+        if data[0] & 0x03:
+            raise SdoAbort(UNKNOWN_COMMAND)
+        content = self._readable(data)
+        self._block = BlockUpload(content, data)
+        self._respond(_HEADER.pack(0xC2 | data[0] & CRC_WANTED, *self._key, len(content).to_bytes(4, "little")))
+
+    def _start_block_download(self, data: bytes) -> None:
+        if data[0] & 0x01:
+            raise SdoAbort(UNKNOWN_COMMAND)
+        entry, payload = self._writable(data)
+        if data[0] & 0x02 and entry.size not in (None, int.from_bytes(payload, "little")):
+            raise SdoAbort(WRONG_LENGTH)
+        self._block = block = BlockDownload(data, entry.size or LONGEST)
+        self._respond(_HEADER.pack(0xA0 | data[0] & CRC_WANTED, *self._key, bytes([block.size])))
+
+    def _go_on_in_blocks(self, block: BlockUpload | BlockDownload, data: bytes) -> None:
+        answers = block.answers(data)
+        if block.over:
+            self._block = None
+            if isinstance(block, BlockDownload):
+                self._objects[self._key].load(block.content)
+        for answer in answers:
+            self._respond(answer)
 
     def _take_toggle(self, data: bytes) -> int:
         toggle = data[0] & 0x10
