@@ -183,11 +183,11 @@ class DriverRig(Cycles[AnyDriver], ABC, Generic[AnyDevice, AnyDriver]):
     off: Any
     """The command that takes power off."""
     positions: str
-    """The frames that fault lines call so."""
+    """What fault lines call the frames with positions."""
     first_asked: str
     """What a drive is asked for first."""
     keeps_power: str
-    """What is said of a drive that keeps its power {} after it was told not to."""
+    """What is said of a drive that keeps its power, {} being after which word."""
 
     def __init__(
         self,

@@ -47,7 +47,23 @@ def set_ups(key: Key) -> bool:
     return 0x1400 <= key[0] < 0x1C00 or key[0] in OWNED
 
 
-class Line:
+class Kept:
+    """Three drives on a bus, of which A is saved and restored."""
+
+    bus: can.BusABC
+    drives: Drives
+    clock: Clock
+
+    def save(self) -> Saved:
+        found = backup.save(self.bus, self.drives, self.clock, ["A"])["A"]
+        assert isinstance(found, Saved), found
+        return found
+
+    def restore(self, saved: Saved, **options: bool) -> Restored:
+        return backup.restore(self.bus, self.drives, self.clock, "A", saved, **options)
+
+
+class Line(Kept):
     """Drive A of a dictionary, two others, and the bus between."""
 
     def __init__(self, path: Path) -> None:
@@ -59,14 +75,6 @@ class Line:
         ]
         self.bus = Bus(devices, self.clock, CIA402.fault_frames)
         self.objects: Dictionary = devices[0].objects
-
-    def save(self) -> Saved:
-        found = backup.save(self.bus, self.drives, self.clock, ["A"])["A"]
-        assert isinstance(found, Saved), found
-        return found
-
-    def restore(self, saved: Saved, **options: bool) -> Restored:
-        return backup.restore(self.bus, self.drives, self.clock, "A", saved, **options)
 
     def __enter__(self) -> Line:
         return self
@@ -235,13 +243,14 @@ def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
 SPEED, LOW, HIGH, NODE_ID = (0x6081, 0), (0x607D, 1), (0x607D, 2), (0x2000, 0)
 
 
-class Foreign:
-    """Three drives of a make, and what a restore of A came to."""
+class Foreign(Kept):
+    """Three drives of a make."""
 
     def __init__(self, folder: Path, make: str = "maxon_epos4_compact50_5", habits: Habits | None = None) -> None:
         habits = habits or Habits()
         habits.values = {(0x1018, at): at for at in range(1, 5)} | habits.values
         self.wires, self.clock = three(make, dict.fromkeys((1, 2, 3), Truth()), habits=habits)
+        self.bus = self.wires
         path = folder / "make.eds"
         path.write_text(eds([*rows(make), *habits.more], FITTED[make]))
         self.drives = drives(path)
@@ -249,14 +258,6 @@ class Foreign:
     @property
     def a(self) -> ForeignDrive:
         return self.wires.nodes[0]
-
-    def save(self) -> Saved:
-        found = backup.save(self.wires, self.drives, self.clock, ["A"])["A"]
-        assert isinstance(found, Saved), found
-        return found
-
-    def restore(self, saved: Saved, **options: bool) -> Restored:
-        return backup.restore(self.wires, self.drives, self.clock, "A", saved, **options)
 
 
 @pytest.fixture

@@ -167,15 +167,6 @@ def test_a_second_node_that_is_plugged_in_is_named(rig: Rig, data: bytes, after:
     assert rig.cycles(100).fault is None, "it has gone"
 
 
-def test_a_second_drive_that_is_plugged_in_is_named(rig: Rig) -> None:
-    first = rig.nodes[1]
-    second = ForeignDrive("elmo_gold", first.node, stranger(rig), rig.clock, first.truth, 0.2)
-    rig.wires.nodes.append(second)
-    second.boot()
-    assert "drive B: has restarted" in rig.found("state", within=1).message
-    assert "drive B: a second node with id 2 on the bus" in rig.last_fault(6)
-
-
 @pytest.mark.parametrize("in_flight", [False, True])
 def test_a_drive_that_has_left_operational_is_no_second_one(rig: Rig, in_flight: bool) -> None:
     node, way = rig.nodes[1], rig.drives._axes[1].way

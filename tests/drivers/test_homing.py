@@ -424,15 +424,6 @@ def test_no_drive_gets_power_in_homing_mode(rig: Rig) -> None:
     assert all(drive.state is PowerState.SWITCH_ON_DISABLED for drive in rig.drives)
 
 
-def test_a_missing_switch_is_named(robots: Robots) -> None:
-    rig = robots(incremental(timeout=1.0))
-    rig.enable()
-    rig.drives[1].homing.switch = None
-    answer = refusal(rig.command("home"))
-    assert "drive B: homing: home was not attained within 1 s" in answer.message
-    assert rig.mode is Mode.FAULT
-
-
 def test_a_homing_error_is_named(rig: Rig) -> None:
     rig.enable()
     begin(rig, 100)
@@ -461,14 +452,6 @@ def test_an_object_that_is_not_answered_about_is_waited_for_until_its_time_is_ov
     assert a.sdo_asked is None
     assert len(sent) == 1
     assert not homing.under_way
-
-
-def test_a_slider_that_is_pushed_stops_it(rig: Rig) -> None:
-    rig.enable()
-    begin(rig, 100)
-    rig.drives[2].servo.position += 0.0045 * 1e7
-    rig.until(lambda: rig.mode is Mode.FAULT, 3)
-    assert "slider C: following error" in (rig.control.fault or "")
 
 
 def test_homes_outside_the_limits_are_said(robots: Robots) -> None:

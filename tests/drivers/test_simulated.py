@@ -12,7 +12,6 @@ from trirail_drivers import config
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Servo, SimulatedBus, SimulatedDrive
-from trirail_drivers.simulated.drive import EDS
 
 NODE = 5
 PERIOD = 0.001
@@ -209,20 +208,6 @@ def test_reset_node_restores_everything_and_reset_communication_its_own(rig: Rig
 
 
 # SDO.
-
-
-def test_every_object_of_the_eds_answers_as_its_access_says(rig: Rig) -> None:
-    canopen = pytest.importorskip("canopen")
-    for index, item in canopen.import_od(str(EDS), NODE).items():
-        for variable in getattr(item, "subindices", {0: item}).values():
-            if index == 0x1003 and variable.subindex:
-                assert rig.refused(index, variable.subindex) == 0x08000024
-                continue
-            first = rig.sdo(0x40, *pack("<HB", index, variable.subindex))[0]
-            assert first in (0x41, 0x43, 0x47, 0x4B, 0x4F)
-            if not variable.writable:
-                data = bytes(len(variable) // 8)
-                assert rig.write_refused(index, variable.subindex, data) == 0x06010002
 
 
 @pytest.mark.parametrize(

@@ -158,13 +158,8 @@ def test_every_statusword(word: int) -> None:
 
 
 def test_modes_of_operation_and_bits_of_objects() -> None:
-    # CiA 402-2: 6060h, 6061h, 6041h; statusword bits 10, 12, 13 in homing mode.
+    # CiA 402-2: 6060h, 6061h.
     assert (homing.HOMING, process_data.INTERPOLATED_POSITION, process_data.CYCLIC_SYNCHRONOUS_POSITION) == (6, 7, 8)
-    assert (homing._MODE, homing._MODE_DISPLAY, homing._STATUSWORD) == (0x6060, 0x6061, 0x6041)
-    assert (homing._REACHED, homing._ATTAINED, homing._ERROR) == (0x0400, 0x1000, 0x2000)
-    # CiA 301, 7.2.4: initiate download of one byte, initiate upload, abort; index, subindex, data.
-    assert (homing._WRITE_BYTE, homing._READ, homing._ABORTED) == (0x2F, 0x40, 0x80)
-    assert homing._SDO.format == "<BHB4s"
     # CiA 301, 7.5.2: a PDO's COB-ID, bits 31 and 30; 7.2.4: abort codes of an object or subindex that is not there.
     assert (sdo.INVALID, sdo.NO_REMOTE_REQUEST) == (0x8000_0000, 0x4000_0000)
     assert sdo.NO_SUCH_OBJECT == (0x0602_0000, 0x0609_0011)
