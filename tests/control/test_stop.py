@@ -267,6 +267,17 @@ def test_a_stop_begins_in_the_cycle_in_which_it_is_asked_for(rig: ControlRig) ->
     assert rig.control.commanded.velocity[0] < speed
 
 
+def test_a_jog_that_was_let_go_does_not_come_back(rig: ControlRig) -> None:
+    rig.enable()
+    rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))
+    rig.until(lambda: rig.mode is Mode.STOPPING)
+    answer = rig.send("j1", VelocityGoal(0.2, 0.0, 0.0, timeout=0.1))
+    assert isinstance(answer, Refused)
+    assert answer.code == "jog_over"
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("j1", "done")]
+
+
 @pytest.mark.parametrize(
     "goal", [VelocityGoal(0.05, 0.0, 0.0, timeout=0.2), TrackGoal(0.05, 0.0, 0.0)], ids=["jog", "track"]
 )

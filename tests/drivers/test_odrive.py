@@ -410,6 +410,15 @@ class TestReset:
         assert enabled.commands() == [[], [], [(cansimple.CLEAR_ERRORS, 0)]]
         enabled.enable()
 
+    def test_while_the_cause_lasts_the_fault_comes_back(self, ready: Rig) -> None:
+        ready.cycle()
+        ready.devices[1]._handlers[cansimple.CLEAR_ERRORS] = lambda data: None
+        ready.devices[1].fail(Error.MOTOR_OVER_TEMP)
+        ready.found("fault", within=40)
+        ready.drives.reset()
+        assert ready.cycle().fault is None
+        ready.found("fault", within=100)
+
     def test_what_a_drive_said_before_its_errors_were_cleared_is_no_new_fault(self, ready: Rig) -> None:
         ready.cycle()
         ready.devices[1].fail(Error.MOTOR_OVER_TEMP)
