@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
-from processes.test_service import SLOWLY, Service, until
+from processes.test_service import SLOWLY, Service, shared, until
 from refusals import refused_as
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
@@ -30,28 +30,12 @@ from trirail.wire.zenoh_session import open_client
 from waiting import WITHIN
 from warm import trirail
 
+__all__ = ["shared"]
+
 pytestmark = pytest.mark.slow
 
 POSE = {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}
 UNSEEN = ("\x1b[2J", "\x9b31m", "\u202eevil", "a\0b", "forged\ntrirail: line", "a\u2028b", "\u200b", "\ue000")
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, Robot, zenoh.Session]]:
-    """One enabled service, which no test may end; it has the processes afterwards that it had before."""
-    with Service(tmp_path_factory.mktemp("shared")) as service:
-        service.wait_up()
-        names = ("loop", "gateway", "planner", "recorder")
-        before = [service.child(name) for name in names]
-        with service.robot() as robot, open_client(service.locator) as session:
-            robot.enable()
-            yield service, robot, session
-            assert robot.move_to(x=0.01, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
-        assert [service.child(name) for name in names] == before, service.log.read_text()
-        assert service.end() == 0
-        log = service.log.read_text()
-        assert "Traceback" not in log
-        assert all(line.isprintable() for line in log.splitlines()), log
 
 
 def asked(session: zenoh.Session, key: str, **what: object) -> list[tuple[str, str]]:
@@ -71,6 +55,7 @@ def asked(session: zenoh.Session, key: str, **what: object) -> list[tuple[str, s
 @pytest.mark.parametrize(
     ("payload", "encoding", "code", "said"),
     [
+        (b"", "", "malformed", "not a goal"),
         (b'{"a":' * 5000, "", "malformed", "not a goal"),
         (b"[" * 100_000, "", "malformed", "not a goal"),
         (b'{"kind":' * 5000, "", "malformed", "nested too deep"),
@@ -83,6 +68,9 @@ def asked(session: zenoh.Session, key: str, **what: object) -> list[tuple[str, s
         (json.dumps(POSE | {"valid_for": 1e300}), "", "malformed", "<= 86400"),
         (json.dumps(POSE | {"limits": {"jerk": [1e-300, 1, 1]}}), "", "malformed", ">= 0.0001"),
         (json.dumps(POSE | {"x": 1e300}), "", "malformed", "<= 1000"),
+        (json.dumps(POSE | {"x": "0"}), "", "malformed", "got str"),
+        (json.dumps(POSE | {"kind": "dance"}), "", "malformed", "dance"),
+        (b'{"kind": "pose", "x": 1, "y": 2}', "", "malformed", "missing required field phi"),
         (msgspec.msgpack.encode(POSE | {"x": math.nan}), boundary.MSGPACK, "malformed", ">= -1000"),
         (json.dumps(POSE | {"id": "x" * 65}), "", "malformed", "length <= 64"),
         *((json.dumps(POSE | {"id": name}), "", "malformed", "for control or formatting") for name in UNSEEN),

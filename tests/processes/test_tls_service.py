@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import stat
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -14,9 +13,7 @@ from processes.test_service import SLOWLY, Service, until
 from refusals import refused_as
 from trirail.client import connection
 from trirail.client.client import Robot
-from trirail.errors import RefusalCode, ServiceError
-from trirail.wire import zenoh_session
-from trirail.wire.credentials import Credentials
+from trirail.errors import RefusalCode
 from trirail.wire.vocabulary import Role
 from waiting import WITHIN
 from warm import trirail
@@ -110,30 +107,6 @@ def test_everybody_with_a_role_stops_it(served: Served, ann: Robot, name: str) -
     with ann.lease(timeout=LONG), served.robot(name) as anybody:
         anybody.stop()
         assert goal.wait(WITHIN).outcome == "stopped"
-
-
-@pytest.mark.usefixtures("ann")
-def test_who_is_revoked_or_has_no_role_does_nothing(served: Served) -> None:
-    for name in ("gone", "una"):
-        with served.robot(name) as asking, refused_as(RefusalCode.NOT_ALLOWED):
-            asking.move_to(x=0.0, y=0.0, phi=0.0)
-
-
-@pytest.mark.parametrize("name", ["late", "early", "foreign", "none"])
-def test_a_certificate_that_is_no_good_opens_no_session(served: Served, name: str) -> None:
-    with pytest.raises(ServiceError):
-        served.robot(name)
-    if name != "none":
-        unseen = Credentials(user(served.folder, name), name, datetime.now(UTC), ())  # not looked at by the client
-        with pytest.raises(ServiceError, match=r"no service at tls/.*certificate.*; .*--tls"):
-            zenoh_session.open_client(served.locator, unseen)
-
-
-def test_nobody_without_a_certificate_opens_one(served: Served) -> None:
-    address = served.locator.removeprefix("tls/")
-    for protocol in ("tls", "tcp"):
-        with pytest.raises(ServiceError, match="no service at"):
-            zenoh_session.open_client(f"{protocol}/{address}")
 
 
 def test_only_a_maintainer_takes_the_lease_over(served: Served, ann: Robot) -> None:
