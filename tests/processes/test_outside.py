@@ -106,6 +106,7 @@ def test_a_key_that_names_nobody_is_refused(shared: tuple[Service, Robot, zenoh.
     _, robot, session = shared
     ((found, message),) = asked(session, key, payload=json.dumps(POSE))
     assert found == code
+    assert ("name one robot and one user" in message) == (code == "wildcard")
     assert message.isprintable()
     assert robot.state().mode == "holding"
 
