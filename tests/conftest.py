@@ -13,7 +13,8 @@ import traceback
 import tracemalloc
 import warnings
 from collections.abc import Callable, Iterator
-from typing import cast
+from contextlib import ExitStack
+from typing import Any, cast
 
 import can
 import msgspec
@@ -125,10 +126,6 @@ class Rig(ControlRig):
         return np.stack([counts[:, :, 0] / scale + offset, counts[:, :, 1] / scale], axis=1)
 
 
-FRAMES = 25
-"""How deep a stack is looked into for who has allocated."""
-
-
 class Followers:
     """Powered drives that are where they were told to be: no bus, no frames, and next to no memory of their own."""
 
@@ -213,10 +210,21 @@ def _allocated_here() -> tracemalloc.Snapshot:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
-    made = Rig()
-    yield made
-    made.bus.shutdown()  # not driver.close, which waits for standstill by a clock that stands
+def robots() -> Iterator[Callable[..., Rig]]:
+    """Makes a robot of what Rig takes; its bus is shut down at the end of the test."""
+    with ExitStack() as made:
+
+        def robot(*given: Any) -> Rig:
+            rig = Rig(*given)
+            made.callback(rig.bus.shutdown)  # not driver.close, which waits for standstill by a clock that stands
+            return rig
+
+        yield robot
+
+
+@pytest.fixture
+def rig(robots: Callable[..., Rig]) -> Rig:
+    return robots()
 
 
 @pytest.fixture(scope="module")

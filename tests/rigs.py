@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import can
 from trirail_drivers import config
-from trirail_drivers.interface import DriveGroup, Feedback, PowerState, Triple
+from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, PowerState, Triple
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import Frames, Servo, SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.faults import Faults
@@ -22,6 +22,7 @@ START: Final = (0.01, -0.02, 0.03)
 """Where the sliders are at power-on [m]."""
 STANDSTILL: Final = (0.0, 0.0, 0.0)
 SYNC: Final = 0x080
+OFF: Final = (PowerState.SWITCH_ON_DISABLED,) * 3
 ENABLED: Final = (PowerState.OPERATION_ENABLED,) * 3
 
 AnyDevice = TypeVar("AnyDevice", bound=SimulatedDevice)
@@ -33,6 +34,17 @@ class Closing(Protocol):
     """Gives back a rig that it is given; its drives are closed at the end of the test."""
 
     def __call__(self, rig: AnyRig, /) -> AnyRig: ...
+
+
+def alike(counts_per_metre: float = 1e6, **keys: Any) -> tuple[config.Drive, config.Drive, config.Drive]:
+    """Drives A, B, C of the configuration: nodes 1, 2, 3, and the same keys."""
+    a, b, c = (config.Drive(node=node, counts_per_metre=counts_per_metre, **keys) for node in (1, 2, 3))
+    return a, b, c
+
+
+def frame(can_id: int, data: bytes = b"", **flags: bool) -> can.Message:
+    """A frame of python-can's, by default a data frame with 11 bits of identifier."""
+    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **flags})
 
 
 # ---------------------------------------------------------------------- one drive
@@ -110,19 +122,72 @@ class Bus(SimulatedBus):
         return message
 
     def inject(self, can_id: int, data: bytes, **flags: bool) -> None:
-        message = can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **flags})
-        self._arrived.append(message)
+        self._arrived.append(frame(can_id, data, **flags))
 
     def shutdown(self) -> None:
         self.shutdowns += 1
         super().shutdown()
 
 
-class DriverRig(ABC, Generic[AnyDevice, AnyDriver]):
-    """Three simulated drives, the driver, and a loop that holds position."""
+class Cycles(Generic[AnyDriver]):
+    """A driver, and a loop that holds position or goes on with constant speed."""
+
+    drives: AnyDriver
+    clock: Clock
+    period = STEP
+    target: Triple = START
+
+    def cycle(self, position: Triple | None = None, velocity: Triple = STANDSTILL) -> Feedback:
+        self.clock.now += self.period
+        self.drives.sync()
+        feedback = self.drives.read()
+        self.drives.write(feedback.position if position is None else position, velocity)
+        return feedback
+
+    def cycles(self, number: int, position: Triple | None = None) -> Feedback:
+        for _ in range(number - 1):
+            self.cycle(position)
+        return self.cycle(position)
+
+    def move(self, cycles: int, speed: Triple) -> Feedback:
+        """Move on from where the sliders were sent last; stop looking when there is a fault."""
+        for _ in range(cycles):
+            a, b, c = (place + rate * self.period for place, rate in zip(self.target, speed, strict=True))
+            self.target = a, b, c
+            feedback = self.cycle(self.target, speed)
+            if feedback.fault is not None:
+                break
+        return feedback
+
+    def last_fault(self, cycles: int) -> str:
+        """What is said to be the fault after so many cycles."""
+        fault = self.cycles(cycles, self.target).fault
+        assert fault is not None
+        return fault.message
+
+    def found(self, cause: str, within: int) -> DriveFault:
+        """Cycle until there is a fault, and see that it has this cause."""
+        for _ in range(within):
+            feedback = self.cycle()
+            if feedback.fault is not None:
+                assert feedback.fault.cause == cause
+                return feedback.fault
+        raise AssertionError(f"no fault: {feedback}")
+
+
+class DriverRig(Cycles[AnyDriver], ABC, Generic[AnyDevice, AnyDriver]):
+    """Three simulated drives, the driver, and what each was told; what differs in their protocol has a name here."""
 
     enabled_within: int
     """Cycles in which drives get power."""
+    off: Any
+    """The command that takes power off."""
+    positions: str
+    """What fault lines call the frames with positions."""
+    first_asked: str
+    """What a drive is asked for first."""
+    keeps_power: str
+    """What is said of a drive that keeps its power, {} being after which word."""
 
     def __init__(
         self,
@@ -142,17 +207,13 @@ class DriverRig(ABC, Generic[AnyDevice, AnyDriver]):
     def device(self, drive: config.Drive, counts: float) -> AnyDevice:
         """Make a simulated drive that stands at a position in its own unit."""
 
-    def cycle(self, position: Triple | None = None, velocity: Triple = STANDSTILL) -> Feedback:
-        self.clock.now += STEP
-        self.drives.sync()
-        feedback = self.drives.read()
-        self.drives.write(feedback.position if position is None else position, velocity)
-        return feedback
+    @abstractmethod
+    def commands(self) -> list[list[Any]]:
+        """What each drive was told since the bus's record was cleared, without setpoints and requests."""
 
-    def cycles(self, number: int) -> Feedback:
-        for _ in range(number - 1):
-            self.cycle()
-        return self.cycle()
+    @abstractmethod
+    def keep_power(self, index: int) -> None:
+        """Let a drive not obey what would take its power."""
 
     def enable(self) -> Feedback:
         self.drives.enable()
@@ -161,15 +222,6 @@ class DriverRig(ABC, Generic[AnyDevice, AnyDriver]):
             if feedback.state == ENABLED:
                 return feedback
         raise AssertionError(f"not enabled: {feedback}")
-
-    def found(self, cause: str, within: int) -> Feedback:
-        """Cycle until there is a fault, and see that it has this cause."""
-        for _ in range(within):
-            feedback = self.cycle()
-            if feedback.fault is not None:
-                assert feedback.fault.cause == cause
-                return feedback
-        raise AssertionError(f"no fault: {feedback}")
 
     def ready(self) -> None:
         """Set the drives up, without power."""

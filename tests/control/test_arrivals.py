@@ -10,22 +10,20 @@ import math
 import os
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import pytest
-from control_rig import CONFIG, PerfectDrives
+from control_rig import CONFIG, ControlRig, PerfectDrives
 from trirail.config import geometry
-from trirail.control.control import Control, Given
-from trirail.control.local_planner import LocalPlanner
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
 from trirail.wire.messages import Notice
-from trirail.wire.packets import CommandRequest, GoalRequest
+from trirail.wire.packets import Request
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import Feedback, PowerState, Triple
 
@@ -137,55 +135,38 @@ class Target(NamedTuple):
         return bool(off.all() and (np.abs(pose - self.pose) <= WINDOWS.pose).all())
 
 
-class Session:
+class Session(ControlRig):
     """A robot under goals, in simulated time; keeps what was measured and commanded in every cycle."""
 
     def __init__(self, seed: int) -> None:
         self.chance = random.Random(seed)
-        self._drives = Sliders(self.chance)
-        self._planner = LocalPlanner(CONFIGURED)
-        self.control = Control(CONFIGURED, self._drives, self._planner)
-        self._drives.sync()
-        self.control.start(self._drives.read())
         self.measured: list[Triple] = [(0.0, 0.0, 0.0)]
-        self.commanded: list[MotionState] = [self.control.commanded]
+        self.commanded: list[MotionState] = []
         self.ended: dict[str, tuple[Notice, int]] = {}
         self.sent: dict[str, Goal] = {}
         self.since: dict[str, int] = {}
-        self.cycle(CommandRequest(1, "ann", Command.ENABLE))
-        self.until(lambda: self.control.state.mode is Mode.HOLDING)
+        super().__init__(CONFIGURED, Sliders(self.chance))
+        self.commanded.append(self.control.commanded)
+        self.enable()
 
-    def cycle(self, *requests: GoalRequest | CommandRequest) -> None:
-        """Run one."""
-        now_ns = self.control.cycles * 1_000_000_000 // RATE
-        given: list[Given] = [(request, now_ns) for request in requests]
-        given += [(answer, now_ns) for answer in self._planner.answers()]
-        self._drives.sync()
-        self.control.cycle(self._drives.read, given)
+    def cycle(self, request: Request | None = None) -> None:
+        """Run one, with a request or without."""
+        super().cycle(request)
         self.measured.append(self.control.measured.feedback.position)
         self.commanded.append(self.control.commanded)
-        for said in self.control.ledger.notices:
+        for said in self.notices:
             if said.kind == "goal":
                 assert said.id is not None
                 assert said.id not in self.ended, f"{said.id} has ended twice"
                 self.ended[said.id] = said, self.control.cycles
-        self.control.ledger.notices.clear()
-        self.control.ledger.answers.clear()
+        self.notices.clear()
 
-    def until(self, condition: Callable[[], bool]) -> None:
-        """Run cycles until something holds."""
-        for _ in range(MOST_CYCLES):
-            if condition():
-                return
-            self.cycle()
-        raise AssertionError(f"not within {MOST_CYCLES} cycles; the mode is {self.control.state.mode}")
-
-    def send(self, goal: Goal) -> str:
+    def begin(self, goal: Goal) -> str:
         """Send a goal; return its id."""
         name = f"g{len(self.sent)}"
         self.sent[name] = goal
         self.since[name] = self.control.cycles
-        self.cycle(GoalRequest(1, "ann", name, goal, self.control.cycles * 1_000_000_000 // RATE))
+        self.post(name, goal)
         return name
 
     def any_goal(self, blend: float | None = None) -> Goal:
@@ -202,17 +183,16 @@ class Session:
         """Send a goal, and let it end: by itself, or by what comes while it moves or settles."""
         chance = self.chance
         kind = chance.random()
-        name = self.send(self.any_goal(blend=0.002 if kind < 0.1 else None))
+        name = self.begin(self.any_goal(blend=0.002 if kind < 0.1 else None))
         if kind < 0.3:
-            for _ in range(chance.randrange(1, 120)):
-                self.cycle()
+            self.cycles(chance.randrange(1, 120))
         if kind < 0.2:
-            name = self.send(self.any_goal())
+            name = self.begin(self.any_goal())
         elif kind < 0.3 and name not in self.ended:
-            self.cycle(CommandRequest(1, "ann", chance.choice((Command.STOP, Command.PAUSE)), None))
-            self.until(lambda: self.control.state.mode is not Mode.STOPPING)
-            self.cycle(CommandRequest(1, "ann", Command.RESUME))
-        self.until(lambda: name in self.ended)
+            self.order(chance.choice((Command.STOP, Command.PAUSE)))
+            self.until(lambda: self.mode is not Mode.STOPPING, MOST_CYCLES)
+            self.order(Command.RESUME)
+        self.until(lambda: name in self.ended, MOST_CYCLES)
 
 
 def judged(session: Session) -> Iterator[str]:

@@ -241,19 +241,8 @@ SLOW = msgspec.structs.replace(CONFIG, loop=msgspec.structs.replace(CONFIG.loop,
 TIMEOUT = 0.2
 Act = Literal["acquire", "sign", "force", "release", "goal", "jog", "stop", "die", "wait"]
 ACTS: tuple[Act, ...] = (
-    "acquire",
-    "sign",
-    "force",
-    "release",
-    "goal",
-    "goal",
-    "goal",
-    "jog",
-    "stop",
-    "die",
-    "wait",
-    "wait",
-)
+    "acquire", "sign", "force", "release", "goal", "goal", "goal", "jog", "stop", "die", "wait", "wait",
+)  # fmt: skip
 
 
 class Expected(NamedTuple):

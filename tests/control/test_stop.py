@@ -14,8 +14,6 @@ from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Go
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override, Stop
 
 PERIOD = CONFIG.period
-NEVER = 10**9
-"""Cycles after which a planner answers that is lost."""
 PROMPT = round(0.05 / PERIOD)
 """What a stop may take beside braking [cycles]."""
 
@@ -76,19 +74,6 @@ def test_goals_blended_at_override_zero_are_run_when_it_is_raised(rig: ControlRi
     rig.until(rig.holds)
     assert rig.control.commanded.pose == pytest.approx((0.03, 0.0, 0.0))
     assert rig.outcomes() == [("g0", "done"), ("g1", "done"), ("g2", "done")]
-
-
-def test_a_plan_that_does_not_end_is_refused(rig: ControlRig) -> None:
-    rig.enable()
-    rig.planner.delay = NEVER
-    rig.post("g1", PoseGoal(0.01, 0.0, 0.0))
-    assert confirmed_after(rig, "override", 3) <= 1
-    rig.until(lambda: bool(rig.outcomes()), round(8.1 / rig.config.period))
-    assert rig.outcomes() == [("g1", "expired")]
-    refused = rig.answers[-1]
-    assert isinstance(refused, Refused)
-    assert refused.code == "expired"
-    assert "the planner is busy" in refused.message
 
 
 # ---------------------------------------------------------------------- what has been sent but not begun
@@ -381,19 +366,6 @@ def test_another_goal_may_follow_a_jog_that_brakes(rig: ControlRig) -> None:
     assert isinstance(rig.goal("g1", 0.0, 0.0, 0.0), Accepted)
     rig.until(rig.holds)
     assert rig.outcomes() == [("j1", "preempted"), ("g1", "done")]
-
-
-def test_a_pause_ends_a_jog(rig: ControlRig) -> None:
-    rig.enable()
-    rig.send("j1", VelocityGoal(0.1, 0.0, 0.0, timeout=2.0))
-    rig.cycles(300)
-    assert isinstance(rig.command("pause"), Confirmed)
-    assert rig.outcomes() == [("j1", "stopped")]
-    assert isinstance(rig.command("resume"), Refused)
-    stood = stands_from(rig)
-    assert isinstance(rig.send("j1", VelocityGoal(0.1, 0.0, 0.0, timeout=2.0)), Refused)
-    rig.cycles(300)
-    assert stands_from(rig) == stood
 
 
 @pytest.mark.parametrize(

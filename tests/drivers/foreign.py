@@ -6,22 +6,20 @@ servo believes only its own units. No threads: whoever waits for a frame turns t
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
-from pathlib import Path
 from typing import Any, Final
 
 import can
 import canopen
 from canopen.objectdictionary import ODRecord, ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
+from edsfiles import rows
 from rigs import Clock
 
-DRIVES: Final = Path(__file__).parents[1] / "data" / "drives"
 Key = tuple[int, int]
 
 FITTED: Final[dict[str, dict[Key, int]]] = {
@@ -75,15 +73,6 @@ class Habits:
     """It sends EMCY 0000 when errors are over."""
 
 
-def rows(name: str) -> list[tuple[int, int, int, str, int | None, bool]]:
-    """The facts of one dictionary."""
-    read = json.loads((DRIVES / f"{name}.json").read_text())
-    return [
-        (int(index, 16), subindex, kind, access, default, mappable)
-        for index, subindex, kind, access, default, mappable in read
-    ]
-
-
 def dictionary(name: str, node: int, habits: Habits, *, rebased: bool = True) -> canopen.ObjectDictionary:
     """An object dictionary of canopen with one drive's objects."""
     objects = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
@@ -97,6 +86,7 @@ def dictionary(name: str, node: int, habits: Habits, *, rebased: bool = True) ->
             variable.access_type = "ro"
         variable.pdo_mappable = mappable
         value = habits.values.get((index, subindex), FITTED[name].get((index, subindex), default))
+        assert isinstance(value, int | None)
         if (
             rebased
             and isinstance(value, int)

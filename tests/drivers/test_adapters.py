@@ -19,6 +19,7 @@ import can
 import msgspec
 import pytest
 from drivers.real_time import cycle, cycle_until
+from rigs import frame
 from trirail.config import SIM, load
 from trirail_drivers.config import Can, Simulated
 from trirail_drivers.connection import opening
@@ -47,14 +48,9 @@ KNOWN = sorted(can.VALID_INTERFACES - {"socketcan", "virtual", "udp_multicast"})
             Can(interface="pcan", channel="PCAN_USBBUS2", bitrate=500_000, options={"auto_reset": True}),
             {"interface": "pcan", "channel": "PCAN_USBBUS2", "bitrate": 500_000, "auto_reset": True},
         ),
-        (
-            Can(interface="slcan", channel="/dev/ttyACM0", options={"tty_baudrate": 921_600, "sleep_after_open": 0.5}),
-            {"interface": "slcan", "channel": "/dev/ttyACM0", "bitrate": 1_000_000, "tty_baudrate": 921_600,
-             "sleep_after_open": 0.5},
-        ),
     ],
     ids=lambda value: value.interface if isinstance(value, Can) else "",
-)  # fmt: skip
+)
 def test_options_reach_python_can_as_they_are(
     section: Can, given: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,7 +87,7 @@ def test_socketcand_by_host_and_port() -> None:
     )
     opened = opening.open_bus(section, SIMULATED.drives)
     try:
-        opened.send(can.Message(arbitration_id=0x602, data=b"\x40", is_extended_id=False))
+        opened.send(frame(0x602, b"\x40"))
         answer = opened.recv(5.0)
     finally:
         opened.shutdown()
@@ -224,16 +220,15 @@ class SerialLineAdapter:
                 for command in commands:
                     self._obey(bytes(command))
             while (answer := self._drives.recv(0)) is not None:
-                frame = f"t{answer.arbitration_id:03X}{len(answer.data)}{answer.data.hex().upper()}\r"
-                os.write(self._line, frame.encode())
+                line = f"t{answer.arbitration_id:03X}{len(answer.data)}{answer.data.hex().upper()}\r"
+                os.write(self._line, line.encode())
 
     def _obey(self, command: bytes) -> None:
         if not command.startswith(b"t"):
             os.write(self._line, b"\r")
             return
         os.write(self._line, self._taken)
-        data = bytes.fromhex(command[5:].decode())
-        self._drives.send(can.Message(arbitration_id=int(command[1:4], 16), data=data, is_extended_id=False))
+        self._drives.send(frame(int(command[1:4], 16), bytes.fromhex(command[5:].decode())))
 
 
 @pytest.mark.long
@@ -262,7 +257,7 @@ def test_a_virtual_bus_ends_with_its_process() -> None:
     section = Can(interface="virtual", channel="one-process", options={"preserve_timestamps": True})
     here, there = opening.open_bus(section, SIMULATED.drives), opening.open_bus(section, SIMULATED.drives)
     try:
-        here.send(can.Message(arbitration_id=0x080, is_extended_id=False))
+        here.send(frame(0x080))
         heard = there.recv(1.0)
         assert heard is not None
         assert heard.arbitration_id == 0x080

@@ -39,12 +39,6 @@ def state_of(axis: Cia402Axis) -> PowerState:
     return axis.state
 
 
-def test_position_and_counts_are_those_of_the_frame() -> None:
-    axis = made()
-    assert axis.actual == 1000
-    assert axis.position == pytest.approx(0.099)
-
-
 def test_statuswords_may_be_missing_for_three_of_their_periods() -> None:
     axis = made()
     assert axis.fault(T + 0.299, WANTED) is None

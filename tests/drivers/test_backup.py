@@ -5,27 +5,27 @@ from __future__ import annotations
 import random
 import string
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import can
-import msgspec
 import pytest
 from drivers.foreign import DISABLED, ENABLED, FITTED, QUICK_STOP, ForeignDrive, Habits, Truth, Wires, three
 from drivers.slow import Slowness, three_slow
 from edsfiles import MAKES, Row, eds, make_eds, rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import Bus, Clock, ideal_servo
+from msgspec.structs import replace as replaced
+from rigs import Bus, Clock, alike, frame, ideal_servo
 from trirail_drivers.cia402 import backup, parameter_file
 from trirail_drivers.cia402.backup import Restored
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.objects import USES, Key
 from trirail_drivers.cia402.parameter_file import Saved
 from trirail_drivers.cia402.parameters import named, of_kind
-from trirail_drivers.config import Drive, Drives
+from trirail_drivers.config import Drives
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.protocols import CIA402
 from trirail_drivers.simulated import SimulatedDrive
@@ -47,20 +47,12 @@ def set_ups(key: Key) -> bool:
     return 0x1400 <= key[0] < 0x1C00 or key[0] in OWNED
 
 
-class Line:
-    """Drive A of a dictionary, two others, and the bus between."""
+class Kept:
+    """Three drives on a bus, of which A is saved and restored."""
 
-    def __init__(self, path: Path) -> None:
-        a = Drive(node=1, counts_per_metre=1e6, eds=str(path))
-        b, c = (Drive(node=node, counts_per_metre=1e6) for node in (2, 3))
-        self.drives = Drives("cia402", a, b, c, sdo_timeout=0.01)
-        self.clock = Clock()
-        devices = [
-            SimulatedDrive(each.node, ideal_servo(each, 0), eds=path if each is a else SERVO)
-            for each in self.drives.each
-        ]
-        self.bus = Bus(devices, self.clock, CIA402.fault_frames)
-        self.objects: Dictionary = devices[0].objects
+    bus: can.BusABC
+    drives: Drives
+    clock: Clock
 
     def save(self) -> Saved:
         found = backup.save(self.bus, self.drives, self.clock, ["A"])["A"]
@@ -69,6 +61,20 @@ class Line:
 
     def restore(self, saved: Saved, **options: bool) -> Restored:
         return backup.restore(self.bus, self.drives, self.clock, "A", saved, **options)
+
+
+class Line(Kept):
+    """Drive A of a dictionary, two others, and the bus between."""
+
+    def __init__(self, path: Path) -> None:
+        a, b, c = alike()
+        self.drives = Drives("cia402", replaced(a, eds=str(path)), b, c, sdo_timeout=0.01)
+        self.clock = Clock()
+        devices = [
+            SimulatedDrive(each.node, ideal_servo(a, 0), eds=Path(each.eds or SERVO)) for each in self.drives.each
+        ]
+        self.bus = Bus(devices, self.clock, CIA402.fault_frames)
+        self.objects: Dictionary = devices[0].objects
 
     def __enter__(self) -> Line:
         return self
@@ -237,13 +243,14 @@ def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
 SPEED, LOW, HIGH, NODE_ID = (0x6081, 0), (0x607D, 1), (0x607D, 2), (0x2000, 0)
 
 
-class Foreign:
-    """Three drives of a make, and what a restore of A came to."""
+class Foreign(Kept):
+    """Three drives of a make."""
 
     def __init__(self, folder: Path, make: str = "maxon_epos4_compact50_5", habits: Habits | None = None) -> None:
         habits = habits or Habits()
         habits.values = {(0x1018, at): at for at in range(1, 5)} | habits.values
         self.wires, self.clock = three(make, dict.fromkeys((1, 2, 3), Truth()), habits=habits)
+        self.bus = self.wires
         path = folder / "make.eds"
         path.write_text(eds([*rows(make), *habits.more], FITTED[make]))
         self.drives = drives(path)
@@ -252,18 +259,16 @@ class Foreign:
     def a(self) -> ForeignDrive:
         return self.wires.nodes[0]
 
-    def save(self) -> Saved:
-        found = backup.save(self.wires, self.drives, self.clock, ["A"])["A"]
-        assert isinstance(found, Saved), found
-        return found
 
-    def restore(self, saved: Saved, **options: bool) -> Restored:
-        return backup.restore(self.wires, self.drives, self.clock, "A", saved, **options)
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Foreign]:
+    made = Foreign(tmp_path)
+    yield made
+    made.wires.shutdown()
 
 
 def drives(path: Path) -> Drives:
-    a, b, c = (Drive(node=node, counts_per_metre=1e6, eds=str(path)) for node in (1, 2, 3))
-    return Drives("cia402", a, b, c, sdo_timeout=0.05)
+    return Drives("cia402", *alike(eds=str(path)), sdo_timeout=0.05)
 
 
 @pytest.mark.parametrize("make", MAKES)
@@ -341,7 +346,7 @@ def test_no_other_master_may_be_on_the_bus(
     rig = Foreign(tmp_path)
     saved = rig.save()
     rig.a.put(0x6081, 5)
-    message = can.Message(arbitration_id=identifier, data=data, is_remote_frame=remote, is_extended_id=False)
+    message = frame(identifier, data, is_remote_frame=remote)
     rig.wires.__class__ = Overheard
     assert isinstance(rig.wires, Overheard)
     rig.wires.speaks = (rig.clock.now + 0.3, message)
@@ -357,8 +362,7 @@ def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
     saved = rig.save()
     rig.a.put(0x6081, 5)
     rig.a.put(0x6083, 5)
-    sync = can.Message(arbitration_id=0x80, is_extended_id=False)
-    rig.a.local.add_write_callback(lambda **_: rig.a.bus.send(sync))  # type: ignore[no-untyped-call]
+    rig.a.local.add_write_callback(lambda **_: rig.a.bus.send(frame(0x80)))  # type: ignore[no-untyped-call]
     with pytest.raises(DriveError, match="another master is on the bus: it sends SYNC"):
         rig.restore(saved)
     assert len(rig.a.written) == 1
@@ -378,7 +382,7 @@ def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
 def test_a_file_of_another_drive(changes: dict[str, int], refused: str, replaceable: bool, tmp_path: Path) -> None:
     rig = Foreign(tmp_path)
     saved = rig.save()
-    saved = replace(saved, origin=msgspec.structs.replace(saved.origin, **changes))
+    saved = replace(saved, origin=replaced(saved.origin, **changes))
     rig.a.put(0x6081, 5)
     with pytest.raises(DriveError, match=refused):
         rig.restore(saved)
@@ -484,11 +488,9 @@ def test_a_drive_that_falls_silent(answers: int, tmp_path: Path) -> None:
     rig.wires.shutdown()
 
 
-def test_what_a_drive_does_not_tell_is_said_with_the_reason(tmp_path: Path) -> None:
-    rig = Foreign(tmp_path)
+def test_what_a_drive_does_not_tell_is_said_with_the_reason(rig: Foreign) -> None:
     vars(rig.a.local.object_dictionary[0x6081]).update(access_type="wo")
     saved = rig.save()
     assert saved.unread == {SPEED: "Attempt to read a write only object (SDO abort 06010001)"}
     assert named(SPEED) not in {named(key) for key in saved.parameters}
     assert rig.a.state == DISABLED
-    rig.wires.shutdown()

@@ -176,13 +176,6 @@ def test_blocks_come_and_go_and_what_is_lost_is_sent_again(typed: Line, content:
     typed.lost = set()
 
 
-def test_a_domain_of_many_blocks(typed: Line) -> None:
-    content = bytes(range(256)) * 40
-    with typed.blocks("wb", size=len(content)) as out:
-        out.write(content)
-    assert typed.sdo.upload(0x2000 + DOMAIN, 0) == content
-
-
 # Frames by hand: CiA 301, SDO block download and upload, command specifiers.
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import can
 import pytest
+from rigs import frame
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.errors import DriveError
@@ -43,8 +44,8 @@ class Rig:
 
     def take(self) -> list[tuple[int, bytes]]:
         taken = []
-        while (frame := self.bus.recv(0)) is not None:
-            taken.append((frame.arbitration_id, bytes(frame.data)))
+        while (message := self.bus.recv(0)) is not None:
+            taken.append((message.arbitration_id, bytes(message.data)))
         return taken
 
     def wait(self, seconds: float) -> list[tuple[int, bytes]]:
@@ -61,8 +62,7 @@ class Rig:
 
     def upload(self, node: int) -> list[bytes]:
         """Ask a drive for its device type."""
-        request = can.Message(arbitration_id=0x600 + node, data=b"\x40\0\x10\0\0\0\0\0", is_extended_id=False)
-        self.bus.send(request)
+        self.bus.send(frame(0x600 + node, b"\x40\0\x10\0\0\0\0\0"))
         return [data for can_id, data in self.take() if can_id == 0x580 + node]
 
 
@@ -273,9 +273,9 @@ def test_a_fault_that_lasts_comes_back_after_a_fault_reset(rig: Rig) -> None:
 def test_bus_off_lets_nothing_through_and_is_told_by_error_frames(rig: Rig) -> None:
     rig.faults.add("bus-off for 0.1")
     rig.now += 0.001
-    frame = rig.bus.recv(0)
-    assert frame is not None
-    assert (frame.is_error_frame, frame.arbitration_id) == (True, 0x040)
+    told = rig.bus.recv(0)
+    assert told is not None
+    assert (told.is_error_frame, told.arbitration_id) == (True, 0x040)
     with pytest.raises(can.CanOperationError, match="No buffer space"):
         rig.bus.send(canopen_frames.nmt(canopen_frames.NMT_START, 1).message())
     assert rig.heartbeats(0.09) == [0, 0, 0]
@@ -292,48 +292,45 @@ def test_a_babbling_node_is_all_that_is_heard(rig: Rig) -> None:
     assert rig.upload(1) == []
 
 
-@pytest.mark.parametrize("how", ["file", "typed"])
-def test_virtual_drives_take_faults(how: str, tmp_path: Path) -> None:
-    bus = tmp_path / "can"
-    lines = "B emcy 4310\nB slient\n" if how == "typed" else "B emcy 4310\n"
-    (tmp_path / "faults").write_text(lines)
+def virtual_drives(bus: Path, *options: str) -> subprocess.Popen[str]:
     command = [sys.executable, "tools/virtual_drives.py", "configs/sim.toml", "--interface", "unix"]
-    command += [
-        "--channel",
-        str(bus),
-        "--seed",
-        "3",
-        *(["--faults", str(tmp_path / "faults")] if how == "file" else []),
-    ]
-    with subprocess.Popen(
-        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as program:
+    command += ["--channel", str(bus), *options]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=subprocess.STDOUT, text=True)
+
+
+@pytest.mark.parametrize("how", ["file", "typed"])
+def test_virtual_drives_serve_a_bus_take_faults_and_leave_on_sigterm(how: str, tmp_path: Path) -> None:
+    bus, typed = tmp_path / "can", how == "typed"
+    lines = "B emcy 4310\nB slient\n" if typed else "B emcy 4310\n"
+    (tmp_path / "faults").write_text(lines)
+    with virtual_drives(bus, "--seed", "3", *([] if typed else ["--faults", str(tmp_path / "faults")])) as program:
         assert program.stdin is not None
         assert program.stdout is not None
-        if how == "typed":
-            assert program.stdout.readline().startswith("A switch on disabled")
+        if typed:
+            assert program.stdout.readline() == "A switch on disabled, 0.000 mm\n"
             with UnixBus(str(bus)) as user:
-                user.send(can.Message(arbitration_id=0x602, data=b"\x40\0\x10\0\0\0\0\0", is_extended_id=False))
-                assert user.recv(WAIT) is not None  # now they know of each other
+                user.send(frame(0x602, b"\x40\0\x10\0\0\0\0\0"))
+                heard = [user.recv(WAIT)]  # now they know of each other
                 program.stdin.write(lines)
                 program.stdin.flush()
-                found = user.recv(WAIT)
-                assert found is not None
-                assert (found.arbitration_id, bytes(found.data[:2])) == (0x082, b"\x10\x43")
+                heard.append(user.recv(WAIT))
+                assert [(one.arbitration_id, bytes(one.data[:2])) for one in heard if one] == [
+                    (0x582, b"\x43\0"),
+                    (0x082, b"\x10\x43"),
+                ]
         said = ""
-        while not said.startswith('unknown fault "slient"' if how == "typed" else "is over: B emcy 4310"):
+        while not said.startswith('unknown fault "slient"' if typed else "is over: B emcy 4310"):
             said = program.stdout.readline()
             assert said
         program.send_signal(signal.SIGTERM)
         assert program.wait(WAIT) == 0
+    assert not bus.exists()
 
 
 def test_virtual_drives_refuse_a_wrong_file_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "faults").write_text("A slient\n")
-    command = [sys.executable, "tools/virtual_drives.py", "configs/sim.toml", "--interface", "unix"]
-    command += ["--channel", str(tmp_path / "can"), "--faults", str(tmp_path / "faults")]
-    ended = subprocess.run(
-        command, check=False, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=WAIT
-    )
-    assert ended.returncode == 1
-    assert ended.stderr == f'virtual_drives: {tmp_path}/faults:1: unknown fault "slient"; did you mean silent?\n'
+    with virtual_drives(tmp_path / "can", "--faults", str(tmp_path / "faults")) as program:
+        said, _ = program.communicate(timeout=WAIT)
+    assert program.returncode == 1
+    assert said == f'virtual_drives: {tmp_path}/faults:1: unknown fault "slient"; did you mean silent?\n'

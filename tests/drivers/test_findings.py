@@ -31,7 +31,7 @@ def test_what_is_found_of_one_drive_does_not_hide_what_is_found_of_another(closi
         rig.drives.configure(PERIOD)
     said = str(refused.value)
     assert said.startswith("drive A: object 1000:00 (device type) is 00000191")
-    assert "; drive B: object 6502:00" in said
+    assert "; drive B: object 6502:00 (supported drive modes) is 0000002D: neither" in said
     assert said.endswith("; drive C: the same")
     assert all(index == 0x6040 for node in rig.nodes for index, *_ in node.written)
 
@@ -61,7 +61,7 @@ def test_an_event_timer_that_is_read_only_keeps_the_statuswords_pdo(closing: Clo
     assert any("1800:05" in line and "cannot be set" in line for line in rig.warnings)
     assert any("also asked for by SDO" in line for line in rig.warnings)
     rig.enable()
-    rig.move(0.05, 200)
+    rig.go(0.05, 200)
 
 
 SECOND = ((0x1016, 2, 7, "rw", 0, False),)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
 
 import can
 import pytest
 from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, QUICK_STOP, STOPPED, ForeignDrive, Habits
 from drivers.test_foreign import MAKES, PERIOD, Rig
+from rigs import OFF, Closing, frame
 from trirail_drivers.cia402.codes import words
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
@@ -16,24 +16,16 @@ from trirail_drivers.interface import PowerState
 pytestmark = pytest.mark.long
 
 
-class Named(NamedTuple):
-    """One way to drive, by a make and how it differs from its dictionary."""
-
-    make: str
-    habits: Callable[[], Habits]
-    keys: dict[str, Any]
-
-
-WAYS = {
-    "csp with offset, statusword on change": Named("elmo_gold", Habits, {}),
-    "csp with offset, statusword beside the position": Named("maxon_epos4_compact50_5", Habits, {}),
-    "csp without offset": Named("ros2_cia402_slave", Habits, {}),
-    "interpolated position, two RPDOs, heartbeat": Named("pilz_prbt", Habits, {}),
-    "interpolated position, node guarding": Named("technosoft_ipos", Habits, {}),
-    "interpolated position, node guarding once it is set": Named(
-        "technosoft_ipos", lambda: Habits(answers_unset_guarding=False), {}
+WAYS: dict[str, tuple[str, Callable[[], Habits]]] = {
+    "csp with offset, statusword on change": ("elmo_gold", Habits),
+    "csp with offset, statusword beside the position": ("maxon_epos4_compact50_5", Habits),
+    "csp without offset": ("ros2_cia402_slave", Habits),
+    "interpolated position, two RPDOs, heartbeat": ("pilz_prbt", Habits),
+    "interpolated position, node guarding": ("technosoft_ipos", Habits),
+    "interpolated position, node guarding once it is set": (
+        "technosoft_ipos", lambda: Habits(answers_unset_guarding=False),
     ),
-    "statusword polled": Named(
+    "statusword polled": (
         "elmo_gold",
         lambda: Habits(
             values={(0x1800, 1): 0x8000_0181, (0x1A01, 0): 1, (0x1A01, 1): 0x6064_0020, (0x1801, 2): 1},
@@ -41,43 +33,35 @@ WAYS = {
                 [(0x1800, 1), *((0x1A00, n) for n in range(9)), *((0x1A01, n) for n in range(9))], "ro"
             ),
         ),
-        {},
     ),
-    "mappings that are fixed, controlword beside the setpoint": Named(
+    "mappings that are fixed, controlword beside the setpoint": (
         "elmo_gold",
         lambda: Habits(
             fixed_pdos=True,
             values={
-                (0x1400, 1): 0x8000_0201,
-                (0x1600, 0): 0,
-                (0x1601, 0): 2,
-                (0x1601, 1): 0x6040_0010,
-                (0x1601, 2): 0x607A_0020,
-                (0x1A00, 0): 1,
-                (0x1A01, 0): 2,
-                (0x1A01, 1): 0x6041_0010,
-                (0x1A01, 2): 0x6064_0020,
+                (0x1400, 1): 0x8000_0201, (0x1600, 0): 0,
+                (0x1601, 0): 2, (0x1601, 1): 0x6040_0010, (0x1601, 2): 0x607A_0020,
+                (0x1A00, 0): 1, (0x1A01, 0): 2, (0x1A01, 1): 0x6041_0010, (0x1A01, 2): 0x6064_0020,
             },
         ),
-        {},
     ),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(params=WAYS)
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     """Drives in motion."""
-    way = WAYS[request.param]
-    rig = Rig(way.make, way.habits(), **way.keys)
+    make, habits = WAYS[request.param]
+    rig = Rig(make, habits())
     rig.ready()
     rig.enable()
-    rig.move(0.05, 60)
+    rig.go(0.05, 60)
     yield rig
     rig.drives.close()
 
 
 def stranger(rig: Rig) -> can.BusABC:
-    """Another master's place on the bus."""
+    """Another's place on the bus."""
     return can.Bus(rig.nodes[0].bus.channel_info.removeprefix("Virtual bus channel "), interface="virtual")
 
 
@@ -85,13 +69,12 @@ def stopped_within(rig: Rig, cycles: int) -> str:
     """Cycle with setpoints that go on, until there is a fault; all three drives must stop, whatever they hear."""
     for _ in range(cycles):
         rig.wires.sent.clear()
-        feedback = rig.cycle(rig.commanded, (0.0, 0.0, 0.0))
+        feedback = rig.cycle(rig.target, (0.0, 0.0, 0.0))
         if feedback.fault is not None:
             break
     else:
         raise AssertionError(f"no fault within {cycles} cycles")
-    for _ in range(120):
-        rig.cycle(rig.commanded)
+    rig.cycles(120, rig.target)
     assert [node.state for node in rig.nodes if node.state == ENABLED] == []
     assert [node.servo.velocity for node in rig.nodes] == [0.0] * 3
     return feedback.fault.message
@@ -117,7 +100,7 @@ def test_nmt_by_a_stranger_stops_all_in_the_same_cycle(rig: Rig, command: int, n
     for each in rig.nodes:
         each.put(0x6007, 0)
     with stranger(rig) as bus:
-        bus.send(can.Message(arbitration_id=0, data=[command, node], is_extended_id=False))
+        bus.send(frame(0, bytes([command, node])))
         said = stopped_within(rig, 1)
     assert said.startswith("CAN bus: another master is on it: it commands ")
 
@@ -136,7 +119,7 @@ def test_two_masters_are_noticed(rig: Rig, identifier: int | None, data: bytes, 
         if identifier is None:
             identifier, data = way.setpoints.identifier, bytes(way.setpoints.size)
             rig.nodes[1].bus.recv(0)
-        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        bus.send(frame(identifier, data))
         assert said in stopped_within(rig, 1)
 
 
@@ -151,8 +134,8 @@ def test_a_second_node_with_the_same_id_is_noticed(rig: Rig, apart: int) -> None
             counts = node.value(0x6064)
             at = data.index(counts.to_bytes(4, "little", signed=True))
             data[at : at + 4] = (counts + apart).to_bytes(4, "little", signed=True)
-            bus.send(can.Message(arbitration_id=way.feedback.identifier, data=data, is_extended_id=False))
-            feedback = rig.cycle(rig.commanded)
+            bus.send(frame(way.feedback.identifier, bytes(data)))
+            feedback = rig.cycle(rig.target)
             if feedback.fault is not None:
                 break
     assert feedback.fault is not None
@@ -161,66 +144,41 @@ def test_a_second_node_with_the_same_id_is_noticed(rig: Rig, apart: int) -> None
     )
 
 
-def test_a_second_node_with_the_same_id_is_refused_by_the_set_up() -> None:
+def test_a_second_node_with_the_same_id_is_refused_by_the_set_up(closing: Closing) -> None:
     """What one is told by SDO both are told, and both answer."""
-    rig = Rig("elmo_gold")
+    rig = closing(Rig("elmo_gold"))
     first = rig.nodes[2]
-    channel = can.Bus(first.bus.channel_info.removeprefix("Virtual bus channel "), interface="virtual")
-    rig.wires.nodes.append(ForeignDrive("elmo_gold", first.node, channel, rig.clock, first.truth))
+    rig.wires.nodes.append(ForeignDrive("elmo_gold", first.node, stranger(rig), rig.clock, first.truth))
     with pytest.raises(DriveError, match="drive C: a second node with id 3 on the bus"):
         rig.ready()
-    rig.drives.close()
 
 
-@pytest.mark.parametrize("frame", [b"\x00", b"\x7f"])
+@pytest.mark.parametrize("data", [b"\x00", b"\x7f"])
 @pytest.mark.parametrize("after", [0, 7])
-def test_a_second_node_that_is_plugged_in_is_named(rig: Rig, frame: bytes, after: int) -> None:
+def test_a_second_node_that_is_plugged_in_is_named(rig: Rig, data: bytes, after: int) -> None:
     """It boots, or sends heartbeats of its own, while the drive goes on: all stop at once, and soon it is known why."""
     for _ in range(after):
-        rig.cycle(rig.commanded)
+        rig.cycle(rig.target)
     with stranger(rig) as bus:
-        bus.send(can.Message(arbitration_id=0x702, data=frame, is_extended_id=False))
+        bus.send(frame(0x702, data))
         assert stopped_within(rig, 1).startswith("drive B: ")
-        for _ in range(6):
-            feedback = rig.cycle()
-    assert feedback.fault is not None
-    assert feedback.fault.message.startswith("drive B: a second node with id 2 on the bus: one has booted, or is not")
+        assert "drive B: a second node with id 2 on the bus: one has booted, or is not" in rig.last_fault(6)
     rig.drives.reset()
-    for _ in range(100):
-        feedback = rig.cycle()
-    assert feedback.fault is None, "it has gone"
-
-
-def test_a_second_drive_that_is_plugged_in_is_named(rig: Rig) -> None:
-    first = rig.nodes[1]
-    channel = can.Bus(first.bus.channel_info.removeprefix("Virtual bus channel "), interface="virtual")
-    second = ForeignDrive("elmo_gold", first.node, channel, rig.clock, first.truth, 0.2)
-    rig.wires.nodes.append(second)
-    second.boot()
-    said = rig.cycle(rig.commanded).fault
-    assert said is not None
-    assert "drive B: has restarted" in said.message
-    for _ in range(6):
-        feedback = rig.cycle()
-    assert feedback.fault is not None
-    assert feedback.fault.message.startswith("drive B: a second node with id 2 on the bus")
+    assert rig.cycles(100).fault is None, "it has gone"
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
 def test_a_drive_that_has_left_operational_is_no_second_one(rig: Rig, in_flight: bool) -> None:
     node, way = rig.nodes[1], rig.drives._axes[1].way
     pdo = next(index for index in node._pdos(0x1800) if node.value(index, 1) & 0x7FF == way.feedback.identifier)
-    position = can.Message(arbitration_id=way.feedback.identifier, data=node._packed(pdo), is_extended_id=False)
+    position = frame(way.feedback.identifier, node._packed(pdo))
     deaf(node, PRE_OPERATIONAL)
     with stranger(rig) as bus:
-        bus.send(can.Message(arbitration_id=0x702, data=b"\x7f", is_extended_id=False))
+        bus.send(frame(0x702, b"\x7f"))
         if in_flight:
             bus.send(position)
         assert "left NMT operational" in stopped_within(rig, 1)
-        for _ in range(20):
-            feedback = rig.cycle()
-    assert feedback.fault is not None
-    assert "left NMT operational" in feedback.fault.message
+        assert "left NMT operational" in rig.last_fault(20)
 
 
 def test_a_restart_is_noticed(rig: Rig) -> None:
@@ -233,9 +191,7 @@ def test_a_drives_own_fault_stops_all(rig: Rig) -> None:
     rig.nodes[2].fail(0x4310)
     assert "drive C: emergency 0x4310 (drive too hot)" in stopped_within(rig, 2)
     rig.drives.reset()
-    for _ in range(100):
-        feedback = rig.cycle()
-    assert feedback.fault is None
+    assert rig.cycles(100).fault is None
     assert [node.state for node in rig.nodes] == [DISABLED] * 3
 
 
@@ -243,10 +199,8 @@ def test_an_emcy_that_is_never_taken_back_does_not_block_reset(rig: Rig) -> None
     rig.nodes[0].emergency(0x8210, register=0)
     assert "drive A: emergency 0x8210 (a PDO was too short to be used)" in stopped_within(rig, 2)
     rig.drives.reset()
-    for _ in range(10):
-        feedback = rig.cycle()
-    assert feedback.fault is None
-    rig.feedback = feedback
+    rig.feedback = rig.cycles(10)
+    assert rig.feedback.fault is None
     rig.enable()
 
 
@@ -255,10 +209,7 @@ def test_an_emcy_that_is_still_in_force_does(rig: Rig) -> None:
     rig.nodes[0].emergency(0x8130)
     stopped_within(rig, 2)
     rig.drives.reset()
-    for _ in range(round(0.6 / PERIOD)):
-        feedback = rig.cycle()
-    assert feedback.fault is not None
-    assert feedback.fault.message == f"drive A: emergency {words(0x8130, ' is still in force')}"
+    assert rig.last_fault(round(0.6 / PERIOD)) == f"drive A: emergency {words(0x8130, ' is still in force')}"
 
 
 def test_setpoints_that_are_not_followed_are_noticed(rig: Rig) -> None:
@@ -267,43 +218,36 @@ def test_setpoints_that_are_not_followed_are_noticed(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("option", [5, 6, 7, 8])
-@pytest.mark.parametrize("way", [way for way, named in WAYS.items() if named.make != "pilz_prbt"])  # it lacks 605Ah
-def test_a_drive_that_stays_in_quick_stop_active_loses_its_power_once_it_stands(way: str, option: int) -> None:
+@pytest.mark.parametrize("way", [way for way, (make, _) in WAYS.items() if make != "pilz_prbt"])  # it lacks 605Ah
+def test_a_drive_that_stays_in_quick_stop_active_loses_its_power_once_it_stands(
+    closing: Closing, way: str, option: int
+) -> None:
     """605Ah = 5 to 8, and read-only; power that were taken off before would let the slider coast."""
-    make, habits, keys = WAYS[way]
+    make, habits = WAYS[way]
     made = habits()
     made.values[0x605A, 0] = option
     made.access[0x605A, 0] = "ro"
     lacking = (*MAKES[make].keys.get("accept_without", ()), "605A")
-    rig = Rig(make, made, **{**keys, "accept_without": lacking})
-    try:
-        rig.ready()
-        rig.enable()
-        rig.move(0.05, 60)
-        rig.drives.quick_stop()
-        moving = set(PowerState) - {PowerState.SWITCH_ON_DISABLED}
-        for _ in range(round(0.5 / PERIOD)):
-            before = [(node.state, node.servo.velocity) for node in rig.nodes]
-            feedback = rig.cycle()
-            assert feedback.fault is None
-            for node, (state, velocity) in zip(rig.nodes, before, strict=True):
-                if node.state != state == QUICK_STOP:
-                    assert velocity == 0.0
-        assert not moving & set(feedback.state)
-        rig.feedback = feedback
-        rig.enable()
-    finally:
-        rig.drives.close()
+    rig = closing(Rig(make, made, accept_without=lacking))
+    rig.ready()
+    rig.enable()
+    rig.go(0.05, 60)
+    rig.drives.quick_stop()
+    for _ in range(round(0.5 / PERIOD)):
+        before = [(node.state, node.servo.velocity) for node in rig.nodes]
+        rig.feedback = rig.cycle()
+        assert rig.feedback.fault is None
+        for node, (state, velocity) in zip(rig.nodes, before, strict=True):
+            if node.state != state == QUICK_STOP:
+                assert velocity == 0.0
+    assert rig.feedback.state == OFF
+    rig.enable()
 
 
 def test_a_silent_drive_stops_the_others(rig: Rig) -> None:
     rig.wires.nodes.remove(node := rig.nodes[1])
-    for _ in range(5):
-        feedback = rig.cycle(rig.commanded)
-    assert feedback.fault is not None
-    assert feedback.fault.message.startswith("drive B: no position for 3 cycles")
-    for _ in range(100):
-        rig.cycle()
+    assert "drive B: no position for 3 cycles" in rig.last_fault(5)
+    rig.cycles(100)
     assert all(each.state != ENABLED for each in rig.nodes)
     node.shutdown()
 
@@ -319,8 +263,8 @@ def test_drives_stop_by_themselves_when_the_service_is_gone(rig: Rig) -> None:
             assert node.state == DISABLED
 
 
-def test_a_drive_that_never_follows_is_not_enabled() -> None:
-    rig = Rig("elmo_gold", Habits(has_bit_12=False))
+def test_a_drive_that_never_follows_is_not_enabled(closing: Closing) -> None:
+    rig = closing(Rig("elmo_gold", Habits(has_bit_12=False)))
     rig.ready()
     rig.drives.enable()
     for _ in range(round(0.4 / PERIOD)):
@@ -328,21 +272,18 @@ def test_a_drive_that_never_follows_is_not_enabled() -> None:
         assert PowerState.OPERATION_ENABLED not in feedback.state
     assert feedback.fault is not None
     assert feedback.fault.message.endswith('if it never sets that, say accept_without = ["6041"]')
-    rig.drives.close()
-    rig = Rig("elmo_gold", Habits(has_bit_12=False), accept_without=("6041",))
+    rig = closing(Rig("elmo_gold", Habits(has_bit_12=False), accept_without=("6041",)))
     rig.ready()
     rig.enable()
-    rig.move(0.05, 20)
-    rig.drives.close()
+    rig.go(0.05, 20)
 
 
-def test_each_way_is_what_its_name_says() -> None:
+def test_each_way_is_what_its_name_says(closing: Closing) -> None:
     names = []
-    for way in WAYS.values():
-        rig = Rig(way.make, way.habits(), **way.keys)
+    for make, habits in WAYS.values():
+        rig = closing(Rig(make, habits()))
         rig.ready()
         names.append(rig.drives._axes[0].way.name)
-        rig.drives.close()
     assert names == [
         "cyclic synchronous position with velocity offset, statusword event-driven, heartbeat",
         "cyclic synchronous position with velocity offset, statusword with the position, heartbeat",

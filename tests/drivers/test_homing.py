@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import can
 import canopen
@@ -34,6 +34,7 @@ from trirail_drivers.simulated.faults import Faults
 from waiting import WITHIN
 
 pytestmark = pytest.mark.long
+Robots = Callable[..., Rig]
 
 PERIOD = CONFIG.period
 HOMES = (-0.01, 0.012, 0.02)
@@ -55,10 +56,8 @@ def incremental(method: int = 19, homes: Sequence[float] = HOMES, **keys: object
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
-    made = Rig(incremental())
-    yield made
-    made.bus.shutdown()
+def rig(robots: Robots) -> Rig:
+    return robots(incremental())
 
 
 def true_positions(rig: Rig) -> list[float]:
@@ -73,6 +72,13 @@ def true_positions(rig: Rig) -> list[float]:
 
 def modes(rig: Rig) -> list[int]:
     return [drive.objects[0x6061, 0].value for drive in rig.drives]
+
+
+def is_homed(rig: Rig) -> None:
+    """Home it; then it is where it says."""
+    assert isinstance(rig.command("home"), Confirmed)
+    assert rig.control.measured.feedback.homed == (True, True, True)
+    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
 
 
 def begin(rig: Rig, cycles: int = 0) -> None:
@@ -96,38 +102,33 @@ def settled(rig: Rig) -> None:
 
 @pytest.mark.parametrize("method", [17, 18, 19, 20, 21, 22])
 @pytest.mark.parametrize("start", [START, (-0.03, 0.03, 0.03)])
-def test_afterwards_positions_are_true(method: int, start: tuple[float, float, float]) -> None:
-    rig = Rig(changed(incremental(method), start=start))
+def test_afterwards_positions_are_true(robots: Robots, method: int, start: tuple[float, float, float]) -> None:
+    rig = robots(changed(incremental(method), start=start))
     rig.enable()
     assert rig.control.measured.feedback.position == HOMES  # what counts of 0 stand for: not where they are
-    answer = rig.command("home")
-    assert isinstance(answer, Confirmed)
-    assert answer.mode == "holding"
-    assert rig.control.measured.feedback.homed == (True, True, True)
-    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    is_homed(rig)
+    assert rig.mode is Mode.HOLDING
     assert true_positions(rig) == pytest.approx(HOMES, abs=1e-4)  # it brakes behind the edge
     settled(rig)
     assert isinstance(rig.goal("g1", 0.02, 0.01, 0.1), Accepted)
     rig.until(lambda: rig.mode is Mode.HOLDING)
     assert rig.control.measured.pose == pytest.approx((0.02, 0.01, 0.1), abs=1e-6)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("method", [35, 37])
-def test_home_is_where_it_stands(method: int) -> None:
-    rig = Rig(incremental(method))
+def test_home_is_where_it_stands(robots: Robots, method: int) -> None:
+    rig = robots(incremental(method))
     rig.enable()
     rig.command("home")
     assert rig.control.measured.feedback.homed == (True, True, True)
     assert rig.control.measured.feedback.position == pytest.approx(HOMES, abs=2e-7)
     assert true_positions(rig) == pytest.approx(START)
     settled(rig)
-    rig.bus.shutdown()
 
 
-def test_only_what_is_not_absolute_is_homed() -> None:
+def test_only_what_is_not_absolute_is_homed(robots: Robots) -> None:
     drives = msgspec.structs.replace(incremental().drives, B=CONFIG.drives.B)
-    rig = Rig(msgspec.structs.replace(incremental(), drives=drives))
+    rig = robots(msgspec.structs.replace(incremental(), drives=drives))
     assert rig.control.measured.feedback.homed == (False, True, False)
     rig.enable()
     seen = set()
@@ -137,7 +138,6 @@ def test_only_what_is_not_absolute_is_homed() -> None:
         rig.cycle()
     assert seen == {(8, 8, 8), (6, 8, 8), (8, 8, 6)}
     assert rig.control.measured.feedback.homed == (True, True, True)
-    rig.bus.shutdown()
 
 
 # ---------------------------------------------------------------------- how it gets there
@@ -147,10 +147,10 @@ def test_only_what_is_not_absolute_is_homed() -> None:
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("method", [19, 37])
 @pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
-def test_one_moves_at_a_time_and_none_jumps(delay: Delay | None, method: int, direction: int) -> None:
+def test_one_moves_at_a_time_and_none_jumps(robots: Robots, delay: Delay | None, method: int, direction: int) -> None:
     robot = incremental(method)
     turned = msgspec.structs.replace(robot.drives.B, direction=direction)
-    rig = Rig(msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, B=turned)), delay)
+    rig = robots(msgspec.structs.replace(robot, drives=msgspec.structs.replace(robot.drives, B=turned)), delay)
     rig.enable()
     rig.cycles(5)
     begin(rig)
@@ -177,44 +177,35 @@ def test_one_moves_at_a_time_and_none_jumps(delay: Delay | None, method: int, di
     for target, actual in targets:
         assert abs(target - actual) <= 1  # counts of 0.1 µm
     settled(rig)
-    rig.bus.shutdown()
 
 
 def test_the_frames_of_one_drive(rig: Rig) -> None:
-    """Mode 6, start, mode 8, each only when the one before is done; and setpoints in every cycle."""
+    """Mode 6, start, mode 8, each only when the one before is done; and setpoints in every cycle.
+
+    CiA 301, SDO, initiate download and upload: e = s = 1 and n = 3 unused bytes; unused bits and bytes are zero.
+    """
     rig.enable()
     begin(rig)
-    at_first = rig.sent.copy()
-    said: list[str] = []
+    frames, said, asked = rig.sent.copy(), list[str](), list[str]()
     word = canopen_frames.ENABLE_OPERATION
-    while rig.control.measured.feedback.homing is False or not rig.control.measured.feedback.homed[0]:
-        rig.cycle()
-        for message in (*at_first, *rig.sent):
-            if message.arbitration_id == canopen_frames.SDO_REQUEST + 1 and message.data[0] == 0x2F:
-                said.append(f"mode {message.data[4]}")
-            elif message.arbitration_id == canopen_frames.RPDO1 + 1:
-                before, (word,) = word, canopen_frames.CONTROLWORD.unpack(message.data)
-                if word != before:  # else it is sent again, for it may have got lost
-                    said.append(f"controlword {word:04X}")
-        at_first.clear()
-        setpoints = [m.arbitration_id for m in rig.sent if m.arbitration_id & 0x780 == canopen_frames.RPDO2]
-        assert setpoints == [canopen_frames.RPDO2 + node for node in (1, 2, 3)]
-    assert said == ["mode 6", "controlword 001F", "controlword 000F", "mode 8"]
-
-
-def test_the_sdo_requests_of_one_drive(rig: Rig) -> None:
-    """CiA 301, initiate download and upload: e = s = 1 and n = 3 unused bytes; unused bits and bytes are zero."""
-    rig.enable()
-    begin(rig)
-    said: list[str] = []
-    at_first = rig.sent.copy()
     while not rig.control.measured.feedback.homed[0]:
         rig.cycle()
-        asked = [message.data.hex() for message in (*at_first, *rig.sent) if message.arbitration_id == 0x601]
-        at_first.clear()
-        said += [request for request in asked if said[-1:] != [request]]
+        setpoints = [m.arbitration_id for m in rig.sent if m.arbitration_id & 0x780 == canopen_frames.RPDO2]
+        assert setpoints == [canopen_frames.RPDO2 + node for node in (1, 2, 3)]
+        frames += rig.sent
+    for message in frames:
+        if message.arbitration_id == canopen_frames.SDO_REQUEST + 1:
+            if message.data[0] == 0x2F:
+                said.append(f"mode {message.data[4]}")
+            if asked[-1:] != [message.data.hex()]:
+                asked.append(message.data.hex())
+        elif message.arbitration_id == canopen_frames.RPDO1 + 1:
+            before, (word,) = word, canopen_frames.CONTROLWORD.unpack(message.data)
+            if word != before:  # else it is sent again, for it may have got lost
+                said.append(f"controlword {word:04X}")
+    assert said == ["mode 6", "controlword 001F", "controlword 000F", "mode 8"]
     to_6, to_8, display, status = "2f60600006000000", "2f60600008000000", "4061600000000000", "4041600000000000"
-    assert said == [to_6, display, status, to_8, display]
+    assert asked == [to_6, display, status, to_8, display]
 
 
 @pytest.mark.parametrize("word", [0x1F, 0x0F, 0x10F])
@@ -236,8 +227,7 @@ def test_a_controlword_that_gets_lost_is_sent_again(rig: Rig, monkeypatch: pytes
     rig.until(rig.holds, 2000)
     assert lost
     settled(rig)
-    assert isinstance(rig.command("home"), Confirmed)
-    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    is_homed(rig)
 
 
 def test_an_earlier_homing_is_not_taken_for_this_one(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,8 +270,8 @@ WHEN = [0, 1, 3, 8, 21, 150, 301, 460]
         (ModeEvent.SHUTDOWN, Mode.DISABLED),
     ],
 )
-def test_a_stop_halts_it_and_it_can_begin_again(event: str | ModeEvent, end: Mode, when: int) -> None:
-    rig = Rig(incremental(), part_of_a_cycle if when % 2 else None)
+def test_a_stop_halts_it_and_it_can_begin_again(robots: Robots, event: str | ModeEvent, end: Mode, when: int) -> None:
+    rig = robots(incremental(), part_of_a_cycle if when % 2 else None)
     rig.enable()
     begin(rig, when)
     if isinstance(event, ModeEvent):
@@ -297,9 +287,7 @@ def test_a_stop_halts_it_and_it_can_begin_again(event: str | ModeEvent, end: Mod
     if end is Mode.DISABLED:
         rig.enable()
     assert refusal(rig.goal("g1", 0.0, 0.0, 0.1)).code == "not_homed"
-    assert isinstance(rig.command("home"), Confirmed)
-    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
-    rig.bus.shutdown()
+    is_homed(rig)
 
 
 def braking_slowly(acceleration: float) -> Config:
@@ -320,26 +308,27 @@ def halted_at_rest(rig: Rig) -> None:
                 assert abs(drive.objects[0x607A, 0].value - drive.servo.position) <= 1
     assert rig.control.fault is None
     settled(rig)
-    rig.bus.shutdown()
 
 
 @pytest.mark.parametrize("delay", [None, part_of_a_cycle, a_cycle, one_drive_late])
 @pytest.mark.parametrize("when", [2, 5, 30, 300])
-def test_a_drive_that_brakes_slowly_follows_setpoints_only_when_it_stands(delay: Delay | None, when: int) -> None:
-    rig = Rig(braking_slowly(acceleration=0.1), delay)
+def test_a_drive_that_brakes_slowly_follows_setpoints_only_when_it_stands(
+    robots: Robots, delay: Delay | None, when: int
+) -> None:
+    rig = robots(braking_slowly(acceleration=0.1), delay)
     rig.enable()
     begin(rig, when)
     halted_at_rest(rig)
 
 
 @pytest.mark.parametrize("when", range(2, 10))
-def test_a_standstill_from_before_the_start_is_not_taken_for_that_of_the_halt(when: int) -> None:
+def test_a_standstill_from_before_the_start_is_not_taken_for_that_of_the_halt(robots: Robots, when: int) -> None:
     """Statuswords come three cycles late, from a drive that is fast at once and brakes slowly."""
 
     def late_status(message: can.Message) -> float:
         return 3.0 * PERIOD if message.arbitration_id == canopen_frames.TPDO1 + 1 else 0.0
 
-    rig = Rig(braking_slowly(acceleration=50.0), late_status)
+    rig = robots(braking_slowly(acceleration=50.0), late_status)
     rig.enable()
     rig.cycles(5)
     begin(rig, when)
@@ -420,8 +409,7 @@ def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, w
     assert isinstance(rig.command("reset"), Confirmed)
     rig.enable()
     settled(rig)
-    assert isinstance(rig.command("home"), Confirmed)
-    assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
+    is_homed(rig)
 
 
 def test_no_drive_gets_power_in_homing_mode(rig: Rig) -> None:
@@ -434,16 +422,6 @@ def test_no_drive_gets_power_in_homing_mode(rig: Rig) -> None:
     answer = refusal(rig.command("enable"))
     assert "drive A: homing: object 6061:00 (Modes of operation display): wanted 8, found 6" in answer.message
     assert all(drive.state is PowerState.SWITCH_ON_DISABLED for drive in rig.drives)
-
-
-def test_a_missing_switch_is_named() -> None:
-    rig = Rig(incremental(timeout=1.0))
-    rig.enable()
-    rig.drives[1].homing.switch = None
-    answer = refusal(rig.command("home"))
-    assert "drive B: homing: home was not attained within 1 s" in answer.message
-    assert rig.mode is Mode.FAULT
-    rig.bus.shutdown()
 
 
 def test_a_homing_error_is_named(rig: Rig) -> None:
@@ -476,35 +454,25 @@ def test_an_object_that_is_not_answered_about_is_waited_for_until_its_time_is_ov
     assert not homing.under_way
 
 
-def test_a_slider_that_is_pushed_stops_it(rig: Rig) -> None:
-    rig.enable()
-    begin(rig, 100)
-    rig.drives[2].servo.position += 0.0045 * 1e7
-    rig.until(lambda: rig.mode is Mode.FAULT, 3)
-    assert "slider C: following error" in (rig.control.fault or "")
-
-
-def test_homes_outside_the_limits_are_said() -> None:
+def test_homes_outside_the_limits_are_said(robots: Robots) -> None:
     outside = inverse(geometry(CONFIG.geometry), np.array([0.2, 0.0, 0.0])).position.tolist()
-    rig = Rig(changed(incremental(homes=outside), start=[value + 0.002 for value in outside]))
+    rig = robots(changed(incremental(homes=outside), start=[value + 0.002 for value in outside]))
     rig.enable()
     begin(rig)
     rig.until(lambda: rig.mode is Mode.FAULT)
     assert "all drives are homed, but the robot stands outside its limits" in (rig.control.fault or "")
-    rig.bus.shutdown()
 
 
 # ---------------------------------------------------------------------- what is refused
 
 
-def test_absolute_encoders_need_none() -> None:
-    rig = Rig()
+def test_absolute_encoders_need_none(robots: Robots) -> None:
+    rig = robots()
     for mode in (Mode.DISABLED, Mode.HOLDING):
         if mode is Mode.HOLDING:
             rig.enable()
         answer = refusal(rig.command("home"))
         assert (answer.code, answer.message) == ("nothing_to_home", "absolute encoders: there is nothing to home")
-    rig.bus.shutdown()
 
 
 def test_goals_and_homing_in_the_wrong_mode(rig: Rig) -> None:

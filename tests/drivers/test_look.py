@@ -11,9 +11,8 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 from edsfiles import Row, eds
-from rigs import STEP, DriverRig, ideal_servo
+from rigs import STEP, Closing, ideal_servo
 from trirail_drivers.cia402 import inspection, setup
-from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.driver.scaling import scale_of
@@ -21,6 +20,8 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.simulated import SimulatedDrive
 from trirail_drivers.simulated.dictionary import SdoAbort
 from trirail_drivers.simulated.sdo_server import SdoServer
+
+from drivers import test_cia402
 
 FASTEST = 0.5
 HOMING = Homing(method=19, speed_switch=0.02, speed_zero=0.005, acceleration=0.5)
@@ -49,14 +50,15 @@ COMMUNICATION: Final = [
 """Objects of CiA 301."""
 
 
-class Rig(DriverRig[SimulatedDrive, Cia402]):
-    """Three drives, of which A has a dictionary of its own."""
+class Rig(test_cia402.Rig):
+    """Three drives, of which A has a dictionary of its own, written into a folder."""
 
-    def __init__(self, path: Path, **keys: Any) -> None:
-        self._path = path
+    def __init__(self, folder: Path, eds_of_a: str, **keys: Any) -> None:
+        self._path = folder / f"{len(list(folder.iterdir()))}.eds"
+        self._path.write_text(eds_of_a)
         a = Drive(node=1, counts_per_metre=1e6, **keys)
         b, c = (Drive(node=node, counts_per_metre=1e6) for node in (2, 3))
-        super().__init__(Drives("cia402", a, b, c, sdo_timeout=0.01), Cia402)
+        super().__init__(Drives("cia402", a, b, c, sdo_timeout=0.01))
 
     def device(self, drive: Drive, counts: float) -> SimulatedDrive:
         path = self._path if drive.node == 1 else SERVO
@@ -100,10 +102,8 @@ def objects(text: str) -> set[str]:
 
 def check(folder: Path, key: tuple[int, int], types: Iterable[int] = (), **keys: Any) -> None:
     at = next(number for number, row in enumerate(OWN) if row[:2] == key)
-    for number, (kind, instead) in enumerate(others(OWN[at], types)):
-        path = folder / f"{number}.eds"
-        path.write_text(eds([*OWN[:at], *instead, *OWN[at + 1 :]]))
-        rig = Rig(path, **keys)
+    for kind, instead in others(OWN[at], types):
+        rig = Rig(folder, eds([*OWN[:at], *instead, *OWN[at + 1 :]]), **keys)
         before = rig.held()
         looked = rig.look()
         assert rig.held() == before, kind
@@ -135,10 +135,10 @@ def test_a_look_and_the_set_up_come_to_one_verdict_of_the_bus(key: tuple[int, in
         ((0x6064, 0), 0x04, "wo", "6064"),
     ],
 )
-def test_what_is_refused_is_named(key: tuple[int, int], kind: int, access: str, named: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.eds"
-    path.write_text(eds([row if row[:2] != key else (*key, kind, access, None, True) for row in OWN]))
-    rig = Rig(path)
+def test_what_is_refused_is_named(
+    closing: Closing, key: tuple[int, int], kind: int, access: str, named: str, tmp_path: Path
+) -> None:
+    rig = closing(Rig(tmp_path, eds([row if row[:2] != key else (*key, kind, access, None, True) for row in OWN])))
     assert named in rig.look()
     shown = inspection.inspect(rig.bus, rig.config, STEP, rig.clock, FASTEST, apply=False)
     assert [named in each["refused"] for each in shown] == [True, False, False]
@@ -146,11 +146,10 @@ def test_what_is_refused_is_named(key: tuple[int, int], kind: int, access: str, 
     with pytest.raises(DriveError, match=named):
         inspection.inspect(rig.bus, rig.config, STEP, rig.clock, FASTEST, apply=True)
     assert [rig.held(number) for number in range(3)] == before, "all three are written, or none"
-    rig.drives.close()
 
 
 def test_a_drive_is_asked_by_a_look_alone_and_not_by_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    closing: Closing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begin, asked = SdoServer._start_download, []
 
@@ -159,9 +158,7 @@ def test_a_drive_is_asked_by_a_look_alone_and_not_by_the_service(
         begin(server, data)
 
     monkeypatch.setattr(SdoServer, "_start_download", listening)
-    path = tmp_path / "a.eds"
-    path.write_text(eds(OWN))
-    rig = Rig(path)
+    rig = closing(Rig(tmp_path, eds(OWN)))
     assert rig.look() == ""
     assert asked
     assert all(asked)
@@ -169,7 +166,6 @@ def test_a_drive_is_asked_by_a_look_alone_and_not_by_the_service(
     assert rig.set_up() == ""
     assert asked
     assert not any(asked)
-    rig.drives.close()
 
 
 @pytest.mark.parametrize(
@@ -179,20 +175,19 @@ def test_a_drive_is_asked_by_a_look_alone_and_not_by_the_service(
         (0x09B5_0300, "limits.slider.velocity = 0.5 is 0.0005 of it, .*; wanted a finer unit"),
     ],
 )
-def test_a_unit_that_cannot_say_the_sliders_limit_is_refused(unit: int, wanted: str, tmp_path: Path) -> None:
+def test_a_unit_that_cannot_say_the_sliders_limit_is_refused(
+    closing: Closing, unit: int, wanted: str, tmp_path: Path
+) -> None:
     """60A9h = 1e-9 and 1e9 counts a second (CiA 303-2), at 1e6 counts a metre."""
-    path = tmp_path / "a.eds"
-    path.write_text(eds(OWN, {(0x60A9, 0): unit}))
-    rig = Rig(path)
+    rig = closing(Rig(tmp_path, eds(OWN, {(0x60A9, 0): unit})))
     looked = rig.look()
     assert re.match(f"drive A: its unit of velocity .*60A9.*: {wanted}", looked)
     assert rig.set_up() == looked
-    rig.drives.close()
 
 
 @pytest.mark.parametrize("code", [0x0504_0001, 0x0607_0010, None])
 def test_a_drive_that_knows_no_segments_is_set_up_all_the_same(
-    code: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    closing: Closing, code: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It refuses each download that is not expedited, or does not answer it: that says nothing of the object."""
     begin = SdoServer._start_download
@@ -205,8 +200,5 @@ def test_a_drive_that_knows_no_segments_is_set_up_all_the_same(
             raise SdoAbort(code)
 
     monkeypatch.setattr(SdoServer, "_start_download", expedited)
-    path = tmp_path / "a.eds"
-    path.write_text(eds(OWN))
-    rig = Rig(path)
+    rig = closing(Rig(tmp_path, eds(OWN)))
     assert (rig.look(), rig.set_up()) == ("", "")
-    rig.drives.close()

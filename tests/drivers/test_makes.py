@@ -12,9 +12,6 @@ from edsfiles import MAKES, eds, make_eds, rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigs import DeviceRig
-from trirail_drivers import config
-from trirail_drivers.connection.opening import connect, simulated_bus
-from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Mechanics, Servo, SimulatedDrive
 from trirail_drivers.simulated.dictionary import SdoAbort
@@ -112,18 +109,6 @@ def test_the_servo_believes_the_units_of_its_dictionary(
         rig.sync()
     way = VELOCITY**2 / (2.0 * DECELERATION)
     assert rig.get(0x6064) - stopped_at == pytest.approx(way, rel=0.03)
-
-
-def test_a_wrong_unit_is_a_wrong_motion(tmp_path: Path) -> None:
-    """EPOS4 as it is shipped, told counts per second where it has rpm: it runs away from its setpoint."""
-    rig = Rig(make_eds(tmp_path, "maxon_epos4_compact50_5", {(0x6065, 0): 0xFFFFFFFF}))
-    rig.enabled(8)
-    begin = rig.get(0x6064)
-    for tick in range(1, 101):
-        rig.put(0x607A, begin + tick * 10)
-        rig.put(0x60B1, 10_000)  # 0.01 m/s, in counts per second
-        rig.sync()
-    assert rig.get(0x6064) - rig.get(0x607A) > 1000  # 1 mm
 
 
 def test_units_of_position_that_are_set_anew(tmp_path: Path) -> None:
@@ -290,35 +275,3 @@ def test_an_inhibit_time_holds_the_statusword_back(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------------- the configuration
-
-
-def drives(eds_file: Path | None) -> config.Drives:
-    def axis(node: int) -> config.Drive:
-        return config.Drive(node=node, counts_per_metre=1e6, eds=None if eds_file is None else str(eds_file))
-
-    return config.Drives(protocol="cia402", A=axis(1), B=axis(2), C=axis(3))
-
-
-def test_a_configured_eds_holds_for_simulated_drives(tmp_path: Path) -> None:
-    section = config.Can(interface="simulated")
-    with simulated_bus(section, drives(make_eds(tmp_path, "maxon_epos4_compact50_5"))) as bus:
-        for drive in bus.drives:
-            assert isinstance(drive, SimulatedDrive)
-            assert (0x1006, 0) not in drive.objects
-            assert drive.objects[0x605A, 0].value == 6
-
-
-def test_elmos_dictionary_is_set_up_over_the_simulated_bus(tmp_path: Path) -> None:
-    connected = connect(config.Can(interface="simulated"), drives(make_eds(tmp_path, "elmo_gold")))
-    try:
-        connected.configure(PERIOD)
-    finally:
-        connected.close()
-
-
-def test_an_eds_that_is_none_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "x.eds").write_text("no EDS")
-    with pytest.raises(DriveError, match=r"x\.eds is not an EDS as CiA 306 has it"):
-        simulated_bus(config.Can(interface="simulated"), drives(tmp_path / "x.eds"))
-    with pytest.raises(DriveError, match=r"cannot read EDS \S*y\.eds: No such file"):
-        simulated_bus(config.Can(interface="simulated"), drives(tmp_path / "y.eds"))

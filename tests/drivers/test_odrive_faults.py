@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 from drivers.test_faults import (
     IN_MOTION,
-    MODES,
     NOT_HOMING,
     REAL,
-    Begin,
     Case,
     FaultRig,
     assert_goes_on,
     assert_stops_until_reset,
+    begin,
     tried,
 )
 from drivers.test_odrive import odrives
@@ -281,26 +280,10 @@ STOP = [
     # drives
     Case("C silent", 3, SILENT.format("C"), stands=DEAF),
     Case("all silent", 3, SILENT.format("A"), stands=DEAF),
-    Case(
-        "B fault 200 for 5",
-        ASKED,
-        r"drive B: error 0x00000200 DC_BUS_UNDER_VOLTAGE \(supply voltage too low\); look at ",
-        stands=ROLLING,
-    ),
-    Case(
-        "B drop get_error; B fault 200 for 5",
-        BEAT,
-        r"drive B: error 0x00000200 DC_BUS_UNDER_VOLTAGE \(supply voltage too low\); look at ",
-        stands=ROLLING,
-    ),
+    Case("B fault 200 for 5", ASKED, r"drive B: error 0x00000200 DC_BUS_UNDER_VOLTAGE", stands=ROLLING),
+    Case("B drop get_error; B fault 200 for 5", BEAT, r"drive B: error 0x00000200 DC_BUS_UNDER", stands=ROLLING),
     Case("B lets go", BEAT, r"drive B: left closed loop control unasked: idle", stands=ROLLING, lasts=False),
-    Case(
-        "B short watchdog",
-        ASKED,
-        r"drive B: error 0x01000000 WATCHDOG_TIMER_EXPIRED \(no setpoint came in time\); was ",
-        stands=ROLLING,
-        lasts=False,
-    ),
+    Case("B short watchdog", ASKED, r"drive B: error 0x01000000 WATCHDOG_TIMER", stands=ROLLING, lasts=False),
     Case("A stuck", 60, FOLLOWING.format("A"), IN_MOTION, lasts=False),
     Case("A lag 0.1", 100, FOLLOWING.format("A"), IN_MOTION, stands=ROLLING, lasts=False),
     Case("A pushed", 1, FOLLOWING.format("A"), stands=ROLLING, lasts=False),
@@ -323,13 +306,6 @@ def rig() -> Iterator[OdriveRig]:
     made = OdriveRig()
     yield made
     made.bus.shutdown()
-
-
-def begin(rig: OdriveRig, mode: str, line: str) -> Begin:
-    begun = MODES[mode]
-    begun.enter(rig)
-    rig.inject(line)
-    return begun
 
 
 @pytest.mark.parametrize(

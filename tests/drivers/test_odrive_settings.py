@@ -253,12 +253,6 @@ def test_an_answer_that_is_lost_is_asked_for_again(closing: Closing, lost: int) 
             rig.drives.configure(PERIOD)
 
 
-def test_the_maker_s_own_bytes() -> None:
-    """Its example can_param_access.py: struct '<BHB', opcode 0 to read, and the value of the endpoint behind it."""
-    assert cansimple.SDO.pack(cansimple.READ, 214, 0) == bytes.fromhex("00d60000")
-    assert (cansimple.RX_SDO, cansimple.TX_SDO, cansimple.WRITE) == (0x04, 0x05, 0x01)
-
-
 def test_the_tables_are_the_makers() -> None:
     """Of each firmware at hand: version, hardware, and some numbers of its flat_endpoints.json, by hand."""
     found = {(each.fw_version, each.hw_version): each.endpoints for each in KNOWN}
@@ -270,12 +264,6 @@ def test_the_tables_are_the_makers() -> None:
     for each in found.values():
         numbers = [endpoint.id for endpoint in each.values()]
         assert len(set(numbers)) == len(numbers)
-
-
-def test_states_15_and_16_are_known_by_name() -> None:
-    assert cansimple.state_name(15) == "harmonic calibration"
-    assert cansimple.state_name(16) == "harmonic calibration of the commutation encoder"
-    assert {15, 16} <= set(cansimple.PROCEDURES)
 
 
 def test_the_guide_has_every_protection() -> None:

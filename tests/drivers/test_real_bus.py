@@ -17,11 +17,12 @@ import carriers
 import pytest
 from carriers import NAME, ip, on_vcan
 from drivers.real_time import cycle, cycle_until
+from rigs import alike
 from trirail_drivers.bus import wire as wires
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402.drives import Cia402
-from trirail_drivers.config import Can, Drive, Drives, Simulated
+from trirail_drivers.config import Can, Drives, Simulated
 from trirail_drivers.connection import opening
 from trirail_drivers.connection.opening import simulated_bus
 from trirail_drivers.connection.serving import serve
@@ -31,14 +32,8 @@ from waiting import wait_until
 
 SIMULATED = Simulated(missed_syncs=1000)
 VCAN = Can(interface="socketcan", channel=NAME, simulated=SIMULATED)
-DRIVES = Drives(
-    protocol="cia402",
-    A=Drive(node=1, counts_per_metre=1e6),
-    B=Drive(node=2, counts_per_metre=1e6),
-    C=Drive(node=3, counts_per_metre=1e6),
-    heartbeat=2.0,  # a machine that is emulated, or busy, is no drive that is lost
-    sdo_timeout=10.0,
-)
+DRIVES = Drives("cia402", *alike(), heartbeat=2.0, sdo_timeout=10.0)
+"""A machine that is emulated, or busy, is no drive that is lost."""
 PERIOD = 0.02
 SERVED = "served"
 """Drives by trirail_drivers.connection.serving, which have one master."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 import time
@@ -10,28 +11,19 @@ from pathlib import Path
 
 import can
 import pytest
+from rigs import alike, frame
 from trirail_drivers.bus import unixbus
 from trirail_drivers.bus.can_frame import CAN_FRAME, ERROR, EXTENDED, REMOTE
 from trirail_drivers.bus.unixbus import UnixBus
-from trirail_drivers.config import Can, Drive, Drives
+from trirail_drivers.config import Can, Drives
 from trirail_drivers.connection.serving import serve
 from trirail_drivers.errors import DriveError
 from trirail_drivers.odrive import cansimple
 from waiting import WITHIN, wait_until
 
-DRIVES = Drives(
-    protocol="cia402",
-    A=Drive(node=1, counts_per_metre=1e6),
-    B=Drive(node=2, counts_per_metre=1e6),
-    C=Drive(node=3, counts_per_metre=1e6),
-)
-ODRIVES = Drives(
-    protocol="odrive",
-    A=Drive(node=1, counts_per_metre=20.0),
-    B=Drive(node=2, counts_per_metre=20.0),
-    C=Drive(node=3, counts_per_metre=20.0),
-)
 SECTION = Can("simulated")
+DRIVES = Drives("cia402", *alike())
+ODRIVES = Drives("odrive", *alike(20.0))
 DEVICE_TYPE = bytes.fromhex("4000100000000000")
 """A request to read 1000h, and its answer."""
 SERVO = bytes.fromhex("4300100092010200")
@@ -75,8 +67,13 @@ def served(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
     made.over()
 
 
-def frame(can_id: int, data: bytes = b"", **flags: bool) -> can.Message:
-    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **flags})
+@contextlib.contextmanager
+def master(served: Served) -> Iterator[socket.socket]:
+    """Their master's end, as a bare socket."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as line:
+        line.connect(str(served.path))
+        line.settimeout(WITHIN)
+        yield line
 
 
 def until(bus: can.BusABC, can_id: int) -> bytes:
@@ -110,19 +107,24 @@ def test_their_timers_run_without_frames(served: Served) -> None:
         assert time.monotonic() - began > 5 * 0.02 - 0.01
 
 
-def test_what_is_no_frame_for_a_drive_changes_nothing(served: Served) -> None:
-    with UnixBus(str(served.path)) as bus:
-        for node in (1, 2, 3):
-            until(bus, 0x700 + node)
-        request = frame(0x602, DEVICE_TYPE)
-        bus.send(frame(0x602, DEVICE_TYPE, is_extended_id=True))
-        bus.send(frame(0x602, DEVICE_TYPE, is_error_frame=True))
-        bus.send(frame(0x602, is_remote_frame=True))
-        bus.send(frame(0x000, b"\x80\x01\x00"))
-        bus.send(request)
-        answer = bus.recv(WITHIN)
-        assert answer is not None
-        assert (answer.arbitration_id, bytes(answer.data)) == (0x582, SERVO)
+@pytest.mark.parametrize(
+    ("identifier", "data"),
+    [
+        (0x602 | EXTENDED, DEVICE_TYPE),
+        (0x602 | ERROR, DEVICE_TYPE),
+        (0x602 | REMOTE, b""),
+        (0x701 | EXTENDED | REMOTE, b""),
+        (0x701 | ERROR | REMOTE, b""),
+        (0x000, b"\x80\x01\x00"),
+    ],
+)
+def test_what_is_no_frame_for_a_drive_changes_nothing(served: Served, identifier: int, data: bytes) -> None:
+    with master(served) as line:
+        booted = [CAN_FRAME.unpack(line.recv(CAN_FRAME.size))[0] for _ in range(3)]
+        assert booted == [0x701, 0x702, 0x703]
+        line.send(CAN_FRAME.pack(identifier, len(data), data))
+        line.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
+        assert CAN_FRAME.unpack(line.recv(CAN_FRAME.size)) == (0x582, 8, SERVO)
 
 
 def test_a_remote_frame_is_answered(served: Served) -> None:
@@ -173,40 +175,23 @@ def test_drives_have_moved_on_while_they_were_stalled(served: Served) -> None:
 
 def test_a_master_that_does_not_read_loses_frames_and_no_more(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unixbus, "MOST_WAITING", 1)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as master:
-        master.connect(str(served.path))
-        master.settimeout(WITHIN)
+    with master(served) as line:
         for _ in range(500):
-            master.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
+            line.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
         answers = 0
-        master.settimeout(0.5)
-        try:
-            while master.recv(CAN_FRAME.size):
+        line.settimeout(0.5)
+        with contextlib.suppress(TimeoutError):
+            while line.recv(CAN_FRAME.size):
                 answers += 1
-        except TimeoutError:
-            pass
         assert 0 < answers < 500
-        master.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
-        assert CAN_FRAME.unpack(master.recv(CAN_FRAME.size)) == (0x582, 8, SERVO)
+        line.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
+        assert CAN_FRAME.unpack(line.recv(CAN_FRAME.size)) == (0x582, 8, SERVO)
 
 
 @pytest.mark.parametrize("last", [b"", b"short"], ids=["hung up", "no frame"])
 def test_they_end_with_their_master(served: Served, last: bytes) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as master:
-        master.connect(str(served.path))
+    with master(served) as line:
         if last:
-            master.send(last)
+            line.send(last)
             served.over()
     served.over()
-
-
-@pytest.mark.parametrize("flag", [EXTENDED, ERROR, EXTENDED | REMOTE, ERROR | REMOTE])
-def test_flags_of_a_frame_are_no_part_of_its_identifier(served: Served, flag: int) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as master:
-        master.connect(str(served.path))
-        master.settimeout(WITHIN)
-        booted = [CAN_FRAME.unpack(master.recv(CAN_FRAME.size))[0] for _ in range(3)]
-        master.send(CAN_FRAME.pack(0x701 | flag, 0, b""))
-        master.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))
-        assert booted == [0x701, 0x702, 0x703]
-        assert CAN_FRAME.unpack(master.recv(CAN_FRAME.size)) == (0x582, 8, SERVO)

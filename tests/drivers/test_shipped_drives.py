@@ -97,26 +97,6 @@ def test_an_example_starts_moves_and_stops(name: str, alone: bool, tmp_path: Pat
         run.drives.close()
 
 
-@pytest.mark.parametrize("value", [None, 0x0, 0x80, 0xFEFF])
-def test_technosofts_drives_follow_by_bit_8_of_208e_alone(value: int | None, tmp_path: Path) -> None:
-    """Without it their mode 7 waits for points with times, and none of our setpoints moves anything."""
-    config = example("technosoft_ipos", tmp_path)
-    axes = {}
-    for axis in "ABC":
-        drive = getattr(config.drives, axis)
-        (write,) = drive.write
-        other = () if value is None else (msgspec.structs.replace(write, value=value),)
-        axes[axis] = msgspec.structs.replace(drive, write=other)
-    run = Run(msgspec.structs.replace(config, drives=msgspec.structs.replace(config.drives, **axes)))
-    try:
-        run.cycle()
-        run.drives.enable()
-        with pytest.raises(AssertionError, match="setpoints"):
-            run.until(PowerState.OPERATION_ENABLED)
-    finally:
-        run.drives.close()
-
-
 @pytest.mark.parametrize("name", [name for name in DICTIONARIES if name != "odrive_s1"])
 def test_what_an_example_says_of_its_drives_it_needs_to_say(name: str, tmp_path: Path) -> None:
     """Without its units and what it accepts to be lacking, such drives are refused by name; Elmo's need no word."""

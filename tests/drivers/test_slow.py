@@ -7,7 +7,6 @@ import random
 import re
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from drivers.foreign import ENABLED, Habits
@@ -15,8 +14,9 @@ from drivers.slow import Slowness, SlowWires, three_slow
 from drivers.test_foreign import COUNTS, MAKES, PERIOD, Rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs import Closing, alike
 from trirail_drivers.cia402.drives import Cia402
-from trirail_drivers.config import Drive, Drives
+from trirail_drivers.config import Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
 
@@ -37,12 +37,14 @@ class SlowRig(Rig):
         *,
         sdo_timeout: float = 0.5,
         stop_timeout: float = 1.0,
-        **keys: Any,
     ) -> None:
         make = MAKES[name]
-        a, b, c = (Drive(node=node, **{"counts_per_metre": COUNTS, **make.keys, **keys}) for node in (1, 2, 3))
         self.config = Drives(
-            "cia402", a, b, c, quick_stop_deceleration=2.0, sdo_timeout=sdo_timeout, stop_timeout=stop_timeout
+            "cia402",
+            *alike(**{"counts_per_metre": COUNTS, **make.keys}),
+            quick_stop_deceleration=2.0,
+            sdo_timeout=sdo_timeout,
+            stop_timeout=stop_timeout,
         )
         self.wires, self.clock = three_slow(name, make.truth, slow, habits)
         self.drives = Cia402(self.wires, 1_000_000, self.config, self.clock)
@@ -58,12 +60,6 @@ def refusal(rig: SlowRig) -> str:
     finally:
         rig.drives.close()
     return ""
-
-
-def test_a_mode_that_is_shown_later_is_waited_for() -> None:
-    rig = SlowRig("elmo_gold", lambda _: Slowness(effect=lambda: 0.4))
-    assert refusal(rig) == ""
-    assert [node.mode for node in rig.nodes] == [8, 8, 8]
 
 
 def test_a_value_that_never_comes_is_told_with_the_time_that_it_was_given() -> None:
@@ -82,8 +78,10 @@ def test_a_brake_may_take_as_long_as_any_stop(brake: float, said: str) -> None:
     assert re.search(said, refusal(rig))
 
 
-def test_drives_that_boot_later_are_waited_for_and_that_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    rig = SlowRig("elmo_gold", lambda node: Slowness(boots=(0.0, 0.3, 2.6)[node - 1]))
+def test_drives_that_boot_later_are_waited_for_and_that_is_told(
+    closing: Closing, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = closing(SlowRig("elmo_gold", lambda node: Slowness(boots=(0.0, 0.3, 2.6)[node - 1])))
     with caplog.at_level(logging.WARNING, "trirail.drives"):
         rig.ready()
     assert rig.clock.now < 100.0 + 3.0
@@ -94,15 +92,15 @@ def test_drives_that_boot_later_are_waited_for_and_that_is_told(caplog: pytest.L
     rig.drives.close()
 
 
-def test_a_drive_that_never_boots_is_told_with_the_time_that_it_was_given() -> None:
-    rig = SlowRig("elmo_gold", lambda node: Slowness(boots=60.0 * (node == 2)))
+def test_a_drive_that_never_boots_is_told_with_the_time_that_it_was_given(closing: Closing) -> None:
+    rig = closing(SlowRig("elmo_gold", lambda node: Slowness(boots=60.0 * (node == 2))))
     with pytest.raises(DriveTimeout, match=r"^drive B: no answer about object 1000:00 \(Device type\) within 5 s; "):
         rig.drives.configure(PERIOD)
     rig.drives.close()
 
 
-def test_a_drive_that_restarts_while_it_is_set_up_is_told() -> None:
-    rig = SlowRig("elmo_gold", lambda _: Slowness(answer=lambda: 0.01))
+def test_a_drive_that_restarts_while_it_is_set_up_is_told(closing: Closing) -> None:
+    rig = closing(SlowRig("elmo_gold", lambda _: Slowness(answer=lambda: 0.01)))
     rig.wires.slow[2].boots_in(0.5)
     with pytest.raises(DriveError, match=r"^drive C: has restarted while it was set up"):
         rig.drives.configure(PERIOD)
@@ -140,9 +138,9 @@ def test_whatever_delay_is_waited_for_or_told_with_its_time(
         ), said
 
 
-def test_three_drives_take_as_long_as_the_slowest_one() -> None:
+def test_three_drives_take_as_long_as_the_slowest_one(closing: Closing) -> None:
     """200 ms an answer; one after the other it would be three times that."""
-    rig = SlowRig("elmo_gold", lambda _: Slowness(answer=lambda: 0.2))
+    rig = closing(SlowRig("elmo_gold", lambda _: Slowness(answer=lambda: 0.2)))
     rig.drives.configure(PERIOD)
     requests = [sum(message.arbitration_id == 0x600 + node for message in rig.wires.sent) for node in (1, 2, 3)]
     took = rig.clock.now - 100.0
@@ -151,9 +149,9 @@ def test_three_drives_take_as_long_as_the_slowest_one() -> None:
     rig.drives.close()
 
 
-def test_no_thread_is_left_by_the_set_up() -> None:
+def test_no_thread_is_left_by_the_set_up(closing: Closing) -> None:
     before = threading.active_count()
-    rig = SlowRig("elmo_gold", lambda _: Slowness())
+    rig = closing(SlowRig("elmo_gold", lambda _: Slowness()))
     rig.ready()
     assert threading.active_count() <= before  # of other tests some may end meanwhile
     rig.drives.close()
@@ -168,14 +166,14 @@ def test_no_thread_is_left_by_the_set_up() -> None:
     ids=["refused", "not taken up"],
 )
 @pytest.mark.parametrize("was", [0, 3])
-def test_without_6502_the_other_mode_is_tried(habits: Habits, ignores: int, was: int) -> None:
-    rig = SlowRig("technosoft_ipos", lambda _: Slowness(ignores=ignores), habits)
+def test_without_6502_the_other_mode_is_tried(closing: Closing, habits: Habits, ignores: int, was: int) -> None:
+    rig = closing(SlowRig("technosoft_ipos", lambda _: Slowness(ignores=ignores), habits))
     for node in rig.nodes:
         node.mode = was
     rig.ready()
     assert [node.mode for node in rig.nodes] == [7, 7, 7]
     rig.enable()
-    rig.move(0.05, 20)
+    rig.go(0.05, 20)
     rig.drives.close()
 
 
@@ -184,8 +182,8 @@ def held(rig: SlowRig) -> list[float]:
 
 
 @pytest.mark.parametrize("name", ["elmo_gold", "pilz_prbt", "maxon_epos4_compact50_5"])
-def test_a_mode_that_is_shown_only_with_power_is_waited_for_where_the_drive_stands(name: str) -> None:
-    rig = SlowRig(name, lambda _: Slowness(shows=0, mode_takes=0.3))
+def test_a_mode_that_is_shown_only_with_power_is_waited_for_where_the_drive_stands(closing: Closing, name: str) -> None:
+    rig = closing(SlowRig(name, lambda _: Slowness(shows=0, mode_takes=0.3)))
     rig.ready()
     assert any("until it shows mode" in warning for warning in rig.warnings)
     began = held(rig)
@@ -201,8 +199,8 @@ def test_a_mode_that_is_shown_only_with_power_is_waited_for_where_the_drive_stan
         assert PowerState.OPERATION_ENABLED not in feedback.state
     else:
         raise AssertionError("not enabled")
-    rig.feedback, rig.commanded = feedback, feedback.position
-    rig.move(0.1, 50)
+    rig.feedback, rig.target = feedback, feedback.position
+    rig.go(0.1, 50)
     assert held(rig) != pytest.approx(began, abs=5e-3)
     rig.drives.close()
 
@@ -210,8 +208,8 @@ def test_a_mode_that_is_shown_only_with_power_is_waited_for_where_the_drive_stan
 @pytest.mark.parametrize(
     ("shown", "said"), [(0, r"shows no mode \(object 6061\) 0\.5\d* s after"), (1, "shows mode 1")]
 )
-def test_a_mode_that_does_not_come_with_power_stops_all_three(shown: int, said: str) -> None:
-    rig = SlowRig("elmo_gold", lambda _: Slowness(shows=0, mode_takes=1e9))
+def test_a_mode_that_does_not_come_with_power_stops_all_three(closing: Closing, shown: int, said: str) -> None:
+    rig = closing(SlowRig("elmo_gold", lambda _: Slowness(shows=0, mode_takes=1e9)))
     rig.ready()
     rig.drives.enable()
     for cycle in range(400):

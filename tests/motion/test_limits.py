@@ -14,14 +14,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from refusals import refusal
-from trirail.control.feedback import Measured
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds, Violation, gate
 from trirail.motion.runs import MotionState, rest
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted
 from trirail.wire.vocabulary import Mode
-from trirail_drivers.interface import Feedback, PowerState
 
 LIMITS = CONFIG.limits
 PLATFORM = np.array([LIMITS.platform.velocity, LIMITS.platform.acceleration, LIMITS.platform.jerk])
@@ -540,15 +538,3 @@ def test_a_slider_beyond_its_travel_is_not_enabled() -> None:
     assert answer.code == "out_of_workspace"
     assert "the robot stands outside its limits: slider A: position" in answer.message
     assert rig.mode is Mode.DISABLED
-
-
-@pytest.mark.parametrize("drive", range(3))
-def test_a_position_jumps_beyond_twice_what_a_slider_can_do_in_a_cycle(drive: int) -> None:
-    step = SLIDER.velocities[0] * PERIOD
-    for share, jumps in ((0.999, False), (1.001, True)):
-        measured = Measured(ROBOT.packed(), PERIOD, step)
-        here = Feedback((0.0, 0.0, 0.0), (PowerState.SWITCH_ON_DISABLED,) * 3, None)
-        measured.start(here)
-        a, b, c = np.eye(3)[drive] * share * 2.0 * step
-        measured.update(Feedback((a, b, c), here.state, None))
-        assert measured.jumps == tuple(jumps and n == drive for n in range(3))

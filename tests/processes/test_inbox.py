@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from rigs import Clock
 from trirail.processes.inbox import UNREAD, UNREAD_OF_ONE, Inbox, _incoming
 from trirail.processes.incoming import BURST, RATE, Incoming, Pace
 from trirail.wire import zenoh_session
@@ -19,15 +20,6 @@ from trirail.wire.vocabulary import Command
 @pytest.fixture
 def refused() -> list[Incoming]:
     return []
-
-
-class Clock:
-    """Time that passes when told to."""
-
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture

@@ -17,7 +17,9 @@ from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.wire import links
 from trirail.wire.goals import PoseGoal
 from trirail.wire.links import Closed, PacketLink, Port
+from trirail.wire.messages import Event
 from trirail.wire.packets import (
+    Answer,
     CommandRequest,
     Confirmed,
     ControlInput,
@@ -86,6 +88,17 @@ class Shell:
             packets.append(packet)
         return packets
 
+    def said(self, by: PacketLink | None = None) -> list[Answer]:
+        """What the gateway, or another, was told since the last time, records aside."""
+        return [decode_answer(packet[1:]) for packet in self.received(by) if packet[0] == Kind.MESSAGE]
+
+    def events(self) -> list[Event]:
+        return [answer.event for answer in self.said() if isinstance(answer, Happened)]
+
+    def send(self, ticket: int, name: str, goal: PoseGoal) -> None:
+        """The gateway passes a goal of ann's on."""
+        self.gateway.send(message(GoalRequest(ticket, "ann", name, goal, round(self.rig.now * 1e9))))
+
 
 @pytest.fixture
 def shell(rig: Rig, tmp_path: Path) -> Iterator[Shell]:
@@ -133,8 +146,7 @@ def test_a_program_that_is_wrong_stops_the_robot_in_that_cycle(
 def test_the_bus_load_is_measured(shell: Shell) -> None:
     shell.enabled()
     shell.cycles(2100)
-    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
-    measured = [answer.bus_load for answer in said if isinstance(answer, Status)][-1]
+    measured = [answer.bus_load for answer in shell.said() if isinstance(answer, Status)][-1]
     assert measured == pytest.approx(shell.rig.driver.bus_load, rel=0.05)
 
 
@@ -144,8 +156,7 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: b
     """With a gateway that gives signs of life, and records that go to it and to the recorder."""
     shell.enabled()
     if in_motion:
-        now = round(shell.rig.now * 1e9)
-        shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.1, 0.02, 0.1, speed=0.02), now)))
+        shell.send(2, "g-1", PoseGoal(0.1, 0.02, 0.1, speed=0.02))
         beating(shell, 50)
     drives = Followers(shell.loop.control.measured.feedback)
     shell.loop._drives = shell.loop.control._drives = cast(DriveGroup, drives)
@@ -178,7 +189,7 @@ def test_a_gateway_that_comes_anew_is_told_everything(shell: Shell, tmp_path: Pa
     shell.cycles(30)
     shell.gateway = links.connect(tmp_path / "gateway")
     shell.cycles(30)
-    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
+    said = shell.said()
     assert isinstance(said[0], Welcome)
     assert [answer.event.mode for answer in said if isinstance(answer, Happened)] == ["enabling", "holding"]
 
@@ -201,8 +212,7 @@ def beating(shell: Shell, cycles: int) -> None:
 
 def moving(shell: Shell) -> None:
     shell.enabled()
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.08, 0.02, 0.2, speed=0.2), now)))
+    shell.send(2, "g-1", PoseGoal(0.08, 0.02, 0.2, speed=0.2))
     beating(shell, 150)
     assert shell.mode() is Mode.MOVING
 
@@ -215,8 +225,7 @@ def test_a_frozen_gateway_is_a_controlled_stop_that_says_so(shell: Shell) -> Non
     assert shell.mode() is Mode.STOPPING
     shell.cycles(1000)
     assert shell.mode() is Mode.HOLDING
-    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
-    events = [answer.event for answer in said if isinstance(answer, Happened)]
+    events = shell.events()
     assert [event.message for event in events if event.level == "warning"] == [
         "the gateway is frozen, no sign of life for 0.3 s: controlled stop"
     ]
@@ -227,8 +236,7 @@ def test_what_a_frozen_gateway_has_left_is_not_taken_until_it_serves_again(shell
     shell.enabled()
     beating(shell, 50)
     shell.cycles(300)
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    shell.send(2, "g-1", PoseGoal(0.01, 0.0, 0.0))
     shell.cycles(500)
     assert shell.mode() is Mode.HOLDING
     beating(shell, 50)
@@ -239,8 +247,7 @@ def test_what_a_frozen_gateway_has_left_dies_with_it(shell: Shell, tmp_path: Pat
     shell.enabled()
     beating(shell, 50)
     shell.cycles(300)
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    shell.send(2, "g-1", PoseGoal(0.01, 0.0, 0.0))
     shell.gateway.close()
     shell.heartbeats.of("gateway").rest()
     shell.cycles(30)
@@ -257,8 +264,7 @@ def test_what_was_read_of_a_gateway_and_had_to_wait_moves_nothing_once_it_is_los
     shell.took_ns = 800_000
     if goes == "freezes":
         shell.cycles(299)
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    shell.send(2, "g-1", PoseGoal(0.01, 0.0, 0.0))
     if goes == "says what cannot be read":
         shell.gateway.send(bytes((Kind.MESSAGE,)) + b"nonsense")
     shell.cycles(1)
@@ -274,8 +280,7 @@ def test_what_was_read_of_a_gateway_and_had_to_wait_moves_nothing_once_it_is_los
 def test_what_had_to_wait_is_decided_by_a_cycle_later(shell: Shell) -> None:
     shell.enabled()
     shell.took_ns = 800_000
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.01, 0.0, 0.0), now)))
+    shell.send(2, "g-1", PoseGoal(0.01, 0.0, 0.0))
     shell.cycles(1)
     assert shell.planner.receive() is None
     shell.serves = False
@@ -318,7 +323,7 @@ def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) 
     shell.cycles(2)
     shell.loop.ending = True
     shell.cycles(20)  # a batch of records: what was given goes with it
-    said = [decode_answer(packet[1:]) for packet in shell.received(shell.recorder) if packet[0] == Kind.MESSAGE]
+    said = shell.said(shell.recorder)
     given = [answer for answer in said if isinstance(answer, ControlInput)]
     assert [type(what.given) for what in given] == [CommandRequest, DrivesFault, Disturbance, Disturbance]
     assert [what.seq for what in given] == [1, 2, 3, 4]
@@ -334,19 +339,16 @@ def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     shell.recorder.send(message(Remark("warning", "the disk is full")))
     shell.recorder.send(b"\x02nonsense")
     shell.cycles(60)
-    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
-    told = [(answer.event.level, answer.event.message) for answer in said if isinstance(answer, Happened)][2:]
-    assert told[0] == ("warning", "the disk is full")
-    assert told[1][1].startswith("the recorder said something unreadable")
-    assert len(told) == 2
+    full, unreadable = shell.events()[2:]
+    assert (full.level, full.message) == ("warning", "the disk is full")
+    assert unreadable.message.startswith("the recorder said something unreadable")
     assert shell.loop.control.state.mode is Mode.HOLDING
 
 
 def test_that_nothing_is_recorded_stands_in_the_status_while_it_is_so(shell: Shell) -> None:
     def standing() -> list[str]:
         shell.cycles(60)
-        said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
-        return [answer.unrecorded for answer in said if isinstance(answer, Status)]
+        return [answer.unrecorded for answer in shell.said() if isinstance(answer, Status)]
 
     shell.enabled()
     shell.recorder.send(message(Remark("info", "recording to x.rrd")))
@@ -374,7 +376,7 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
     shell.loop.control.modes.trip("x" * 200_000 + "\n\x1b[2J", "internal")
     shell.cycles(60)
     for link in (shell.gateway, shell.recorder):
-        said = [decode_answer(packet[1:]) for packet in shell.received(link) if packet[0] == Kind.MESSAGE]
+        said = shell.said(link)
         (told,) = [answer.event for answer in said if isinstance(answer, Happened) and answer.event.kind == "fault"]
         assert told.message.startswith("xxx")
         faults = [answer.fault for answer in said if isinstance(answer, Status) and answer.fault]
@@ -382,16 +384,14 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
         assert faults
 
 
-def answered(packets: list[bytes]) -> list[int]:
+def answered(shell: Shell) -> list[int]:
     """Tickets of the commands that are confirmed, in order."""
-    said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
-    return [answer.ticket for answer in said if isinstance(answer, Confirmed)]
+    return [answer.ticket for answer in shell.said() if isinstance(answer, Confirmed)]
 
 
 def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shell: Shell) -> None:
     shell.enabled()
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.08, 0.02, 0.2), now)))
+    shell.send(2, "g-1", PoseGoal(0.08, 0.02, 0.2))
     shell.cycles(100)
     assert shell.mode() is Mode.MOVING
     for ticket in range(100, 200):
@@ -400,7 +400,7 @@ def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shel
     shell.cycles(100 // REQUESTS_A_CYCLE + 1)
     assert shell.mode() is Mode.STOPPING
     shell.cycles(400)
-    assert answered(shell.received())[1:] == list(range(100, 201))
+    assert answered(shell)[1:] == list(range(100, 201))
 
 
 def test_an_answer_waits_for_a_gateway_that_is_slow(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -412,7 +412,7 @@ def test_an_answer_waits_for_a_gateway_that_is_slow(shell: Shell, monkeypatch: p
             shell.gateway.send(message(CommandRequest(ticket, "ann", Command.STOP)))
         shell.cycles(50)
     shell.cycles(10)
-    assert answered(shell.received()) == list(range(100, 130))
+    assert answered(shell) == list(range(100, 130))
 
 
 def test_nobody_is_told_what_a_gateway_that_is_gone_was_asked(shell: Shell, tmp_path: Path) -> None:
@@ -422,7 +422,7 @@ def test_nobody_is_told_what_a_gateway_that_is_gone_was_asked(shell: Shell, tmp_
     shell.cycles(30)
     shell.gateway = links.connect(tmp_path / "gateway")
     shell.cycles(30)
-    assert answered(shell.received()) == []
+    assert answered(shell) == []
 
 
 # ---------------------------------------------------------------------- the planner
@@ -432,14 +432,12 @@ def sent_in_motion(shell: Shell) -> None:
     """A robot on its way to g-1, whose planner serves no more, that has just been sent g-2."""
     moving(shell)
     shell.serves = False
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(3, "ann", "g-2", PoseGoal(0.0, 0.05, 0.0), now)))
+    shell.send(3, "g-2", PoseGoal(0.0, 0.05, 0.0))
     shell.cycles(1)
 
 
 def refusals(shell: Shell) -> list[tuple[int, str]]:
-    said = [decode_answer(packet[1:]) for packet in shell.received() if packet[0] == Kind.MESSAGE]
-    return [(answer.ticket, answer.code) for answer in said if isinstance(answer, Refused)]
+    return [(answer.ticket, answer.code) for answer in shell.said() if isinstance(answer, Refused)]
 
 
 def test_a_planner_that_dies_is_noticed_in_the_next_cycle(shell: Shell) -> None:
@@ -455,14 +453,12 @@ def test_a_planner_that_is_not_there_costs_the_goal_and_the_next_one_is_taken(sh
     shell.serves = False
     shell.planner.close()
     beating(shell, 50)
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.05, 0.0, 0.0), now)))
+    shell.send(2, "g-1", PoseGoal(0.05, 0.0, 0.0))
     shell.cycles(2)
     assert refusals(shell) == [(2, "planner_lost")]
     shell.planner, shell.serves = links.connect(tmp_path / "planner", MAX_PLANNING), True
     beating(shell, 50)
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(3, "ann", "g-2", PoseGoal(0.05, 0.0, 0.0), now)))
+    shell.send(3, "g-2", PoseGoal(0.05, 0.0, 0.0))
     shell.cycles(3)
     assert shell.mode() is Mode.MOVING
 
@@ -488,7 +484,7 @@ def test_a_planner_that_floods_the_loop_is_not_read(shell: Shell) -> None:
         pass
     shell.gateway.send(message(CommandRequest(9, "ann", Command.STOP)))
     shell.cycles(600)
-    assert answered(shell.received())[-1] == 9
+    assert answered(shell)[-1] == 9
     assert shell.mode() is Mode.HOLDING
 
 
@@ -510,10 +506,9 @@ def test_an_answer_to_what_was_asked_before_is_not_the_last(shell: Shell) -> Non
 
 def test_the_recorder_has_every_answer_with_the_cycle_in_which_it_was_taken(shell: Shell) -> None:
     shell.enabled()
-    now = round(shell.rig.now * 1e9)
-    shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.05, 0.0, 0.0), now)))
+    shell.send(2, "g-1", PoseGoal(0.05, 0.0, 0.0))
     shell.cycles(3)
-    said = [decode_answer(packet[1:]) for packet in shell.received(shell.recorder) if packet[0] == Kind.MESSAGE]
+    said = shell.said(shell.recorder)
     goal, planned = [answer for answer in said if isinstance(answer, ControlInput)][-2:]
     assert isinstance(goal.given, GoalRequest)
     assert isinstance(planned.given, Planned)
@@ -527,8 +522,7 @@ def test_a_gateway_that_says_what_cannot_be_read_is_let_go(shell: Shell, words: 
     shell.gateway.send(bytes((Kind.MESSAGE,)) + words)
     shell.cycles(25)  # a batch of records: what was given goes with it
     assert not shell.ports.gateway.connected
-    said = [decode_answer(packet[1:]) for packet in shell.received(shell.recorder) if packet[0] == Kind.MESSAGE]
-    given = [answer.given for answer in said if isinstance(answer, ControlInput)]
+    given = [answer.given for answer in shell.said(shell.recorder) if isinstance(answer, ControlInput)]
     assert [what.event for what in given if isinstance(what, Disturbance)] == ["GATEWAY_LOST"]
     assert shell.loop.control.fault is None
     assert shell.loop.control.state.mode is Mode.HOLDING

@@ -5,18 +5,11 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs import Clock
 from trirail.processes.loop_death import LoopDeath
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, Farewell, GoalRequest, Happened, Status
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def request(goal_id: str) -> GoalRequest:
@@ -71,15 +64,7 @@ def test_a_loop_that_never_turned_says_by_itself_why() -> None:
 IDS = st.sampled_from("abcd")
 
 
-@given(
-    st.lists(
-        st.one_of(
-            IDS.map(lambda name: ("asked", name)),
-            IDS.map(lambda name: ("under way", name)),
-            IDS.map(lambda name: ("ended", name)),
-        )
-    )
-)
+@given(st.lists(st.tuples(st.sampled_from(["asked", "under way", "ended"]), IDS)))
 def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
     words = LoopDeath(0.001)
     words.heard()

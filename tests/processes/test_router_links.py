@@ -101,7 +101,7 @@ def test_without_routers_nothing_is_looked_at() -> None:
 
 
 def test_the_gateway_has_the_loop_tell_of_it_and_warns(rig: Rig) -> None:
-    gateway, link = rig
+    gateway = rig.gateway
     assert gateway.warnings() == ()
     gateway._routers._routers, net = Net().links._routers, gateway._routers
     net._why_not, net._routers[0].ask_at = lambda _: "connection refused", 0.0
@@ -109,5 +109,5 @@ def test_the_gateway_has_the_loop_tell_of_it_and_warns(rig: Rig) -> None:
     net._asking.submit(lambda: None).result()
     net._due = 0.0
     net.poll()
-    assert link.sent == [Remark("warning", DOWN)]
+    assert rig.sent == [Remark("warning", DOWN)]
     assert gateway.warnings() == (DOWN,)

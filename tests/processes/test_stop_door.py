@@ -24,7 +24,7 @@ from trirail.processes.stop_door import Answer
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import CommandReply
-from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest, stop_address
+from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopAddress, StopRequest, stop_address
 from trirail.wire.vocabulary import Command
 from waiting import WITHIN
 
@@ -89,10 +89,15 @@ def call(
     return came[0]
 
 
-def connected(locator: str) -> socket.socket:
-    """Connect to the door and say nothing."""
+def door_of(locator: str) -> StopAddress:
     address = stop_address(locator)
     assert address is not None
+    return address
+
+
+def connected(locator: str) -> socket.socket:
+    """Connect to the door and say nothing."""
+    address = door_of(locator)
     if not isinstance(address.where, str):
         return socket.create_connection(address.where, WITHIN)
     connection = socket.socket(socket.AF_UNIX)
@@ -240,8 +245,6 @@ def test_nobody_asks_in_anothers_name_or_with_a_certificate_that_is_no_good(secu
     refused = call(locator, user="ann", shown=user(tmp_path, "max"))
     assert isinstance(refused, RefusedError)
     assert refused.code is RefusalCode.NOT_ALLOWED
-    address = stop_address(locator)
-    assert address is not None
     unseen = [
         Credentials(user(tmp_path, name), name, Credentials.read(user(tmp_path, "ann")).expires, ())
         for name in ("foreign", "late")
@@ -259,8 +262,7 @@ def test_a_robot_whose_descriptors_are_used_up_hears_it_all_the_same(plain: Open
     locator, asked = plain
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     client = socket.socket(socket.AF_UNIX if locator.startswith("unix") else socket.AF_INET)
-    address = stop_address(locator)
-    assert address is not None
+    address = door_of(locator)
     taken: list[socket.socket] = []
     try:
         most = max(map(int, os.listdir("/proc/self/fd")))  # of whatever else runs in this process
@@ -295,8 +297,7 @@ def test_what_is_released_of_a_reserve_is_kept_again(tmp_path: Path) -> None:
 def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_on() -> None:
     port = service_port()
     config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=(f"tcp/127.0.0.1:{port}",)))
-    address = stop_address(config.zenoh.listen[0])
-    assert address is not None
+    address = door_of(config.zenoh.listen[0])
     assert not isinstance(address.where, str)
     guard = Guard(config)
     with socket.create_server(address.where):
@@ -310,8 +311,7 @@ def test_an_address_that_is_taken_is_told_with_the_remedy_and_the_service_goes_o
 def test_a_port_that_the_configuration_needs_for_more_is_not_taken() -> None:
     port = service_port()
     listen = (f"tcp/127.0.0.1:{port}",)
-    address = stop_address(listen[0])
-    assert address is not None
+    address = door_of(listen[0])
     telemetry = msgspec.structs.replace(CONFIG.telemetry, live_port=int(address.where[1]))
     guard = Guard(msgspec.structs.replace(CONFIG, zenoh=Zenoh(listen=listen), telemetry=telemetry))
     door = guard.stop_door(lambda *_: None)
@@ -321,6 +321,4 @@ def test_a_port_that_the_configuration_needs_for_more_is_not_taken() -> None:
 
 @pytest.mark.parametrize(("port", "door"), [(1, 1001), (7447, 8447), (64535, 65535), (64536, 63536), (65535, 64535)])
 def test_where_the_door_is(port: int, door: int) -> None:
-    address = stop_address(f"tls/robot.example:{port}")
-    assert address is not None
-    assert address == (("robot.example", door), True)
+    assert door_of(f"tls/robot.example:{port}") == (("robot.example", door), True)

@@ -68,20 +68,6 @@ SERVING = (
 )
 
 
-@pytest.fixture(autouse=True)
-def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the supervisor says. Its children do what is written in files of their name and number."""
-    monkeypatch.setattr(forked_processes, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
-    monkeypatch.setattr(supervisor, "END_WITHIN", 0.5)
-    return []
-
-
-@pytest.fixture
-def patient(told: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody is killed who only takes a busy machine's time to end."""
-    monkeypatch.setattr(supervisor, "END_WITHIN", WITHIN)
-
-
 class Told(list[str]):
     """What is told; with what begins so, the time in which a child is to be up becomes another."""
 
@@ -95,64 +81,79 @@ class Told(list[str]):
             self._patches.setattr(supervisor, "START_WITHIN", self._start_within)
 
 
-def run(told: list[str], folder: Path, config: Config = CONFIG, /, **children: str) -> int:
-    """What is told has begun for the children: told-1 with the first of it, and up as soon as that is said."""
-    for name, does in ({"drives_1": RECORDING, "planner_1": RECORDING} | children).items():
-        (folder / name.replace("_", "-")).write_text(does)
+class Running:
+    """Runs a supervisor over children that do what they are told, and keeps what it says."""
 
-    def tell(words: str) -> None:
-        told.append(words)
-        (folder / f"told-{len(told)}.begun").touch()
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.told: list[str] = []
 
-    def up(_: object) -> None:
-        tell("up")
-        (folder / "up.begun").touch()
+    def ends(self, code: int, config: Config = CONFIG, /, **children: str) -> None:
+        """Run it until it ends with an exit code.
 
-    return supervisor.Supervisor(config, None, lambda words, _: tell(words)).run(up)
+        What is told has begun for the children: told-1 with the first of it, and up as soon as that is said.
+        """
+        for name, does in ({"drives_1": RECORDING, "planner_1": RECORDING, "recorder_1": RECORDING} | children).items():
+            (self.folder / name.replace("_", "-")).write_text(does)
+
+        def tell(words: str) -> None:
+            self.told.append(words)
+            (self.folder / f"told-{len(self.told)}.begun").touch()
+
+        def up(_: object) -> None:
+            tell("up")
+            (self.folder / "up.begun").touch()
+
+        assert supervisor.Supervisor(config, None, lambda words, _: tell(words)).run(up) == code
 
 
-def test_a_hung_gateway_is_killed_and_started_again(told: list[str], tmp_path: Path) -> None:
-    code = run(
-        told,
-        tmp_path,
+@pytest.fixture(autouse=True)
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Running:
+    """Its children do what is written in files of their name and number."""
+    monkeypatch.setattr(forked_processes, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
+    monkeypatch.setattr(supervisor, "END_WITHIN", 0.5)
+    return Running(tmp_path)
+
+
+@pytest.fixture
+def patient(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody is killed who only takes a busy machine's time to end."""
+    monkeypatch.setattr(supervisor, "END_WITHIN", WITHIN)
+
+
+def test_a_hung_gateway_is_killed_and_started_again(run: Running) -> None:
+    run.ends(
+        1,
         loop_1="ready(); beat_until(lambda: begun('gateway-2')); heartbeats.of('loop').rest()",
         gateway_1=HANGING,
         gateway_2="ready()",
-        recorder_1=RECORDING,
     )
-    assert code == 1
-    assert told[:2] == [
+    assert run.told[:2] == [
         "up",
         "the gateway has died (no sign of life for 0.7 s, so it was killed): the loop stops the robot and holds; "
         "starting it again",
     ]
 
 
-def test_a_gateway_that_hangs_in_its_start_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = Told("up", 6.0, monkeypatch)
-    code = run(
-        told,
-        tmp_path,
+def test_a_gateway_that_hangs_in_its_start_is_killed(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.told = Told("up", 6.0, monkeypatch)
+    run.ends(
+        1,
         loop_1="ready(); beat_until(lambda: begun('gateway-3')); heartbeats.of('loop').rest()",
         gateway_1="ready(); beat_until(lambda: begun('up'))",
         gateway_2="freeze()",
         gateway_3="ready()",
-        recorder_1=RECORDING,
     )
-    assert code == 1
-    assert "no sign of life for 6 s, so it was killed" in told[2]
+    assert "no sign of life for 6 s, so it was killed" in run.told[2]
 
 
-def test_a_frozen_loop_ends_the_service(told: list[str], tmp_path: Path) -> None:
-    code = run(
-        told,
-        tmp_path,
+def test_a_frozen_loop_ends_the_service(run: Running) -> None:
+    run.ends(
+        1,
         loop_1=HANGING,
         gateway_1=TURNING,
-        recorder_1=RECORDING,
     )
-    assert code == 1
-    assert told[1] == (
+    assert run.told[1] == (
         "the loop is dead (no sign of life for 0.7 s, so it was killed): the drives stop by their own watchdogs; ending"
     )
 
@@ -165,7 +166,7 @@ def test_a_frozen_loop_ends_the_service(told: list[str], tmp_path: Path) -> None
     ],
 )
 def test_what_hangs_beside_the_loop_is_killed_and_started_again(
-    name: str, silent: float, consequence: str, told: list[str], tmp_path: Path
+    name: str, silent: float, consequence: str, run: Running
 ) -> None:
     children = {
         "loop_1": f"ready(); beat_until(lambda: begun('{name}-2')); heartbeats.of('loop').rest()",
@@ -174,8 +175,8 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
         f"{name}_1": HANGING,
         f"{name}_2": "ready()",
     }
-    assert run(told, tmp_path, **children) == 1
-    assert told[:2] == [
+    run.ends(1, **children)
+    assert run.told[:2] == [
         "up",
         f"the {name} has died (no sign of life for {silent} s, so it was killed): {consequence}; starting it again",
     ]
@@ -183,85 +184,79 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
 
 @pytest.mark.core
 @pytest.mark.usefixtures("patient")
-def test_those_that_end_because_the_loop_ends_are_not_started_again(told: list[str], tmp_path: Path) -> None:
-    code = run(
-        told,
-        tmp_path,
+def test_those_that_end_because_the_loop_ends_are_not_started_again(run: Running) -> None:
+    run.ends(
+        1,
         loop_1="ready(); beat_until(lambda: begun('up') and begun('serving') and begun('recording')); "
         "heartbeats.of(name).rest(); time.sleep(0.5)",
         gateway_1=SERVING,
         recorder_1="ready(); beat = heartbeats.of('loop')\nwhile not beat.count: pass\n"
         "(folder / 'recording.begun').touch()\nwhile beat.count: pass",
     )
-    assert code == 1
-    assert told == [
+    assert run.told == [
         "up",
         "the loop is dead (another process sent it SIGTERM): it has stopped the robot and disabled the drives; ending",
     ]
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_loop_that_has_not_begun_has_stopped_nothing(told: list[str], tmp_path: Path) -> None:
-    code = run(told, tmp_path, loop_1="os.kill(os.getpid(), 15)", gateway_1="freeze()", recorder_1="freeze()")
-    assert code == 1
-    assert told == ["the loop is dead (killed by SIGTERM): it had not begun; ending"]
+def test_a_loop_that_has_not_begun_has_stopped_nothing(run: Running) -> None:
+    run.ends(1, loop_1="os.kill(os.getpid(), 15)", gateway_1="freeze()", recorder_1="freeze()")
+    assert run.told == ["the loop is dead (killed by SIGTERM): it had not begun; ending"]
 
 
-def test_a_first_start_is_waited_for_as_long_as_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = Told("the first start", 3.0, monkeypatch)
+def test_a_first_start_is_waited_for_as_long_as_it_compiles(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.told = Told("the first start", 3.0, monkeypatch)
     compiling = f"""
 for number in range({FUNCTIONS}):
     child.compiling(f"f{{number}}")
     time.sleep(4.0 / {FUNCTIONS})
 """
     end = "ready(); beat_until(lambda: begun('up')); heartbeats.of('loop').rest()"
-    assert run(told, tmp_path, loop_1=compiling + end, gateway_1=SERVING, recorder_1=RECORDING) == 1
-    assert told[0] == f"the first start compiles the mathematics, {FUNCTIONS} functions; once, half a minute or more"
-    assert told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
-    assert told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]
+    run.ends(1, loop_1=compiling + end, gateway_1=SERVING)
+    assert run.told[0].startswith(f"the first start compiles the mathematics, {FUNCTIONS} functions; once")
+    assert run.told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
+    assert run.told[4:6] == [f"compiling: {FUNCTIONS} of {FUNCTIONS} functions", "up"]
 
 
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGHUP"])
 def test_the_terminals_interrupt_and_end_reach_no_child_not_even_one_that_is_still_importing(
-    sent: str, told: list[str], tmp_path: Path
+    sent: str, run: Running
 ) -> None:
     """Ctrl-C, and its own end, go to all of the terminal's processes: the supervisor alone acts on it."""
     interrupted = f"os.kill(os.getpid(), signal.{sent}); ready(); "
     turning = "beat_until(lambda: begun('up')); heartbeats.of('loop').rest()"
-    run(told, tmp_path, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()", recorder_1=RECORDING)
-    assert told[0] == "up"
+    run.ends(1, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()")
+    assert run.told[0] == "up"
 
 
 @pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("sent", ["SIGTERM", "SIGINT", "SIGHUP"])
-def test_a_start_that_is_interrupted_has_not_failed(sent: str, told: list[str], tmp_path: Path) -> None:
+def test_a_start_that_is_interrupted_has_not_failed(sent: str, run: Running) -> None:
     """SIGTERM ends the children before they have said what it is to do."""
     interrupting = f"os.kill({os.getpid()}, signal.{sent}); freeze()"
-    assert run(told, tmp_path, loop_1=interrupting, gateway_1="freeze()", recorder_1="freeze()") == 0
-    assert told == [f"{sent}: the start is interrupted, nothing has moved"]
+    run.ends(0, loop_1=interrupting, gateway_1="freeze()", recorder_1="freeze()")
+    assert run.told == [f"{sent}: the start is interrupted, nothing has moved"]
 
 
-def test_who_does_not_end_is_a_failure_also_of_a_start_that_is_interrupted(told: list[str], tmp_path: Path) -> None:
+def test_who_does_not_end_is_a_failure_also_of_a_start_that_is_interrupted(run: Running) -> None:
     deaf = "signal.signal(signal.SIGTERM, signal.SIG_IGN); (folder / 'deaf.begun').touch(); freeze()"
     interrupting = f"beat_until(lambda: begun('deaf')); os.kill({os.getpid()}, signal.SIGTERM); freeze()"
-    assert run(told, tmp_path, loop_1=interrupting, gateway_1=deaf, recorder_1="freeze()") == 1
-    assert told[1] == "the gateway does not end: killing it"
+    run.ends(1, loop_1=interrupting, gateway_1=deaf, recorder_1="freeze()")
+    assert run.told[1] == "the gateway does not end: killing it"
 
 
 def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
-    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nobody could bring the gateway back, and the robot would wait for it."""
     monkeypatch.setattr(supervisor, "FORKS_WITHIN", 0.5)
-    code = run(
-        told,
-        tmp_path,
+    run.ends(
+        1,
         loop_1="ready(); beat_until(lambda: begun('gateway-2'))",
         gateway_1="ready(); beat_until(lambda: begun('up')); os.kill(os.getppid(), signal.SIGSTOP); os._exit(1)",
-        recorder_1=RECORDING,
     )
-    assert code == 1
-    assert told[:3] == [
+    assert run.told[:3] == [
         "up",
         "the gateway has died (its parent does not say how): the loop stops the robot and holds; starting it again",
         "the process that forks the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
@@ -269,80 +264,66 @@ def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
     ]
 
 
-def test_simulated_drives_that_die_are_told_and_come_back_with_the_next_service_alone(
-    told: list[str], tmp_path: Path
-) -> None:
+def test_simulated_drives_that_die_are_told_and_come_back_with_the_next_service_alone(run: Running) -> None:
     """The loop has them in fault; those that would take their place would stand elsewhere, and not be set up."""
-    code = run(
-        told,
-        tmp_path,
+    run.ends(
+        1,
         loop_1="ready(); beat_until(lambda: begun('told-2')); heartbeats.of('loop').rest()",
         gateway_1=SERVING,
-        recorder_1=RECORDING,
         drives_1="ready()\nwhile not (begun('up') or never()): time.sleep(0.01)\nos.kill(os.getpid(), signal.SIGKILL)",
     )
-    assert code == 1
-    assert told[:2] == [
+    assert run.told[:2] == [
         "up",
         "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
         "service's next start",
     ]
-    assert len(told) == 3, told
-    assert not (tmp_path / "drives-2.begun").exists()
+    assert len(run.told) == 3, run.told
+    assert not (run.folder / "drives-2.begun").exists()
 
 
 @pytest.mark.usefixtures("patient")
-def test_drives_that_end_since_the_loop_lets_go_of_them_are_not_told(told: list[str], tmp_path: Path) -> None:
+def test_drives_that_end_since_the_loop_lets_go_of_them_are_not_told(run: Running) -> None:
     """A loop that cannot set them up has closed its bus before it has ended."""
-    code = run(
-        told,
-        tmp_path,
+    run.ends(
+        1,
         loop_1="beat_until(lambda: begun('planner-1')); time.sleep(0.5); os._exit(1)",
         gateway_1=TURNING,
-        recorder_1=RECORDING,
         drives_1="ready(); time.sleep(0.1)",
     )
-    assert code == 1
-    assert told == ["the loop is dead (exit code 1): it had not begun; ending"]
+    assert run.told == ["the loop is dead (exit code 1): it had not begun; ending"]
 
 
-def test_an_end_while_a_recorder_is_started_again_is_in_order(
-    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_end_while_a_recorder_is_started_again_is_in_order(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor, "END_WITHIN", 5.0)  # it is given so long
     stopping = "def end(*_): heartbeats.of('loop').rest(); os._exit(0)\nsignal.signal(signal.SIGTERM, end)\n"
-    code = run(
-        told,
-        tmp_path,
+    run.ends(
+        0,
         loop_1=f"{stopping}ready(); beat_until(lambda: begun('recorder-2')); os.kill({os.getpid()}, signal.SIGTERM); "
         "beat_until(never)",
         gateway_1=SERVING,
         recorder_1="ready()\nwhile not (begun('up') or never()): time.sleep(0.01)\nos._exit(1)",
         recorder_2="freeze()",
     )
-    assert told[2:] == ["SIGTERM: stopping the robot and disabling the drives"]
-    assert code == 0
+    assert run.told[2:] == ["SIGTERM: stopping the robot and disabling the drives"]
 
 
 @pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("does", ["os._exit(3)", "time.sleep(0.2); os._exit(3)"])
-def test_drives_that_cannot_start_are_the_end(does: str, told: list[str], tmp_path: Path) -> None:
-    assert run(told, tmp_path, loop_1="freeze()", gateway_1="freeze()", recorder_1="freeze()", drives_1=does) == 1
-    assert told == ["the drives could not start (exit code 3)"]
+def test_drives_that_cannot_start_are_the_end(does: str, run: Running) -> None:
+    run.ends(1, loop_1="freeze()", gateway_1="freeze()", recorder_1="freeze()", drives_1=does)
+    assert run.told == ["the drives could not start (exit code 3)"]
 
 
-def test_a_real_bus_has_no_process_of_drives(told: list[str], tmp_path: Path) -> None:
+def test_a_real_bus_has_no_process_of_drives(run: Running) -> None:
     on_a_bus = structs.replace(CONFIG, can=structs.replace(CONFIG.can, interface="socketcan", channel="can0"))
     turning = "ready(); beat_until(lambda: begun('up')); heartbeats.of('loop').rest()"
-    run(told, tmp_path, on_a_bus, loop_1=turning, gateway_1=SERVING, recorder_1=RECORDING)
-    assert told[0] == "up"
-    assert not (tmp_path / "drives-1.begun").exists()
+    run.ends(1, on_a_bus, loop_1=turning, gateway_1=SERVING)
+    assert run.told[0] == "up"
+    assert not (run.folder / "drives-1.begun").exists()
 
 
-def test_a_runtime_folder_of_somebody_else_is_refused_in_words(
-    told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runtime_folder_of_somebody_else_is_refused_in_words(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     """As `su` leaves it to another user."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "gone"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(run.folder / "gone"))
     with pytest.raises(ServiceError, match=r"sockets in .*gone, the XDG_RUNTIME_DIR: .*; unset that, or set"):
-        run(told, tmp_path)
+        run.ends(1)
