@@ -61,7 +61,10 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
         robot.enable()
         robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN)
     marks = ("--program", f"{sys.executable} {script} {locator} {part}", "--connect", locator)
+    kept.write_text("taught", encoding="utf-8")
     told = trirail("align", "calibrate", kept, *marks).stdout
+    assert kept.with_name("camera.json.old").read_text(encoding="utf-8") == "taught"
+    assert "camera.json.old" in told
     assert "look 7 of 7" in told
     assert "3.9" in told  # µm a pixel
     part.write_text(json.dumps({"left": [-0.0597, 0.0103], "right": [0.0603, 0.0106]}), encoding="utf-8")

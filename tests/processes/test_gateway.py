@@ -141,7 +141,7 @@ def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: p
     passed = rig.goals()
     assert [name for name, _ in passed] == ["a", "b", "c", "d", "e"]
     assert [withdrawn for _, withdrawn in passed[:4]] == [None] * 4
-    assert passed[4][1] == "too many goals before it: it has waited longer than 8 s"
+    assert passed[4][1] == "it has waited longer than 8 s, for goals before it or a busy machine: send it again"
 
 
 def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:

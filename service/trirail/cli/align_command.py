@@ -46,7 +46,7 @@ def calibrate(
     Parameters
     ----------
     file
-        Where to keep it.
+        Where to keep it; what is there already is kept as FILE.old.
     by
         How far to move along x and y, each both ways [m], or with a unit: 0.5mm.
     angle
@@ -74,11 +74,21 @@ def calibrate(
         wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
         found = drive(robot, look, _printed(wishes, service, len(moves) + 1), source.speed, source.wait)
         targets = dict(drive(robot, look, mean_look(source.looks), source.speed, source.wait).marks)
+    old = calibration_file.keep_old(file)
     calibration_file.write(file, service.robot, found, targets)
     if service.json:
-        terminal.json({"file": str(file), "targets": targets, "calibration": msgspec.to_builtins(found)})
+        terminal.json(
+            {
+                "file": str(file),
+                "old": str(old) if old else None,
+                "targets": targets,
+                "calibration": msgspec.to_builtins(found),
+            }
+        )
     else:
         alignment_lines.show_calibration(found, file)
+        if old is not None:
+            terminal.say(f"what was there is in {old}")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -39,6 +40,20 @@ def write(path: Path, robot: str, calibration: CameraCalibration, targets: Marks
         files.replace(path, msgspec.json.format(msgspec.json.encode(content)) + b"\n")
     except OSError as error:
         raise FileError(f"cannot write {path}: {error.strerror}") from error
+
+
+def keep_old(path: Path) -> Path | None:
+    """Keep the file that is there beside it, as NAME.old, for targets that were taught; return that. Raises FileError.
+
+    None where there is none.
+    """
+    if not path.exists():
+        return None
+    old = path.with_name(f"{path.name}.old")
+    try:
+        return Path(shutil.copy2(path, old))
+    except OSError as error:
+        raise FileError(f"cannot keep {path} as {old}: {error.strerror}") from error
 
 
 def read(path: Path) -> CalibrationFile:

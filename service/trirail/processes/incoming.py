@@ -195,7 +195,8 @@ class Backlog:
         """Return the goal of a user whose turn it is; one that has waited too long is withdrawn. KeyError for none."""
         incoming, request = self._goals.first(user)
         if request.withdrawn is None and time.monotonic_ns() - request.received_ns > GOAL_PATIENCE * 1e9:
-            reason = f"too many goals before it: it has waited longer than {GOAL_PATIENCE:g} s"
+            waited = f"it has waited longer than {GOAL_PATIENCE:g} s"
+            reason = f"{waited}, for goals before it or a busy machine: send it again"
             request = structs.replace(request, withdrawn=reason)
         return WaitingGoal(incoming, request)
 
