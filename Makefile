@@ -21,8 +21,9 @@ test: check  ## before each commit, five minutes: lint, format, types, import co
 
 test-all: test-side-by-side test-alone  ## everything that decides: the same with every test and every example
 
+EFFORT ?= 1
 test-side-by-side: check  # one more than there are processors: many of these tests wait
-	$(VENV)/bin/pytest --numprocesses $$(($$(nproc) + 1)) --dist worksteal -m "not alone"
+	$(VENV)/bin/pytest --numprocesses $$(($$(nproc) + 1)) --dist worksteal --effort $(EFFORT) -m "not alone"
 
 test-alone: $(READY)
 	$(VENV)/bin/pytest -m alone

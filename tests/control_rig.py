@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
 from trirail.control.control import Control, Given
 from trirail.control.local_planner import LocalPlanner
-from trirail.motion.paths import FOR_EVER, Path, constant
+from trirail.motion.paths import LAST_PIECE_S, Path, constant_law
 from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import Notice
-from trirail.wire.packets import Answer, CommandRequest, GoalRequest, Request
+from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest, Request
 from trirail.wire.vocabulary import Command, CommandContent, Mode
 from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
 
@@ -37,6 +37,12 @@ def carried(name: str, rate: float | None = None) -> CommandContent:
     return content(*(1.0 if rate is None else 100.0 * rate for field in fields(content) if field.required))
 
 
+def expected_duration(answer: Answer) -> float:
+    """Return the expected duration of an accepted goal, infinite where it has none [s]."""
+    assert isinstance(answer, Accepted), answer
+    return math.inf if answer.reply.duration is None else answer.reply.duration
+
+
 class PerfectDrives:
     """Drives that are at once where they were told to be two SYNCs ago, and power up and down within a cycle."""
 
@@ -50,7 +56,7 @@ class PerfectDrives:
         self._due = position, position
         self._position = position
 
-    def configure(self, period: float, fastest: float | None = None) -> None:
+    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """Do nothing: there is nothing to set up."""
 
     def sync(self) -> None:
@@ -169,8 +175,8 @@ class ControlRig:
         pieces = np.zeros((1, 3, 6))
         pieces[0, :, :3] = np.transpose(state)
         pieces[0, :, 2] /= 2.0
-        run.path = Path(np.array([0.0, FOR_EVER]), pieces)
-        run.change_law(constant(1.0), 1.0)
+        run.path = Path(np.array([0.0, LAST_PIECE_S]), pieces)
+        run.change_law(constant_law(1.0), 1.0)
         run.time = -self.config.period
         run.furthest[:] = -math.inf
 

@@ -73,7 +73,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         return
     explore, effort = metafunc.config.getoption("explore"), metafunc.config.getoption("effort")
     number = max(1, round(len(marker.args) * effort))
-    seeds = list(marker.args[:number])
+    seeds = list(marker.args[-number:])  # those that exploring has found stand last
     if explore is not None:
         chance = random.Random(f"{explore} {metafunc.definition.nodeid}")
         seeds = [chance.randrange(2**32) for _ in range(number)]

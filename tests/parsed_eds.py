@@ -13,9 +13,9 @@ from typing import Any
 
 import canopen
 import pytest
-from trirail_drivers.simulated import edsfile
+from trirail_drivers.simulated import dictionary
 
-_import_od = canopen.import_od
+_import_od, _compact_arrays = canopen.import_od, dictionary.compact_arrays
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -49,4 +49,4 @@ def compact_arrays(file: Path) -> dict[int, int]:
 
 @functools.cache
 def _arrays(file: Path, _content: bytes) -> dict[int, int]:
-    return edsfile.compact_arrays(file)
+    return _compact_arrays(file)

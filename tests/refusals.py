@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
+import msgspec
 import pytest
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.packets import Answer, Refused
+from trirail.wire.messages import Notice
+from trirail.wire.packets import Announcement, Answer, Refused
 
 
 @contextlib.contextmanager
@@ -22,3 +24,9 @@ def refusal(answer: Answer) -> Refused:
     """Return an answer that is one."""
     assert isinstance(answer, Refused), answer
     return answer
+
+
+def uncoded(announced: Iterable[object]) -> list[Notice]:
+    """Return notices, announced or not, without their event codes, which tests/wire/test_event_codes.py covers."""
+    notices = [each.notice if isinstance(each, Announcement) else each for each in announced]
+    return [msgspec.structs.replace(each, event_code=None, params={}) for each in notices if isinstance(each, Notice)]

@@ -13,7 +13,7 @@ ENDING = """
 import socket
 from trirail.config import SIM, load as loaded
 from trirail.processes.heartbeats import Heartbeats
-from trirail.processes.child_process import Order
+from trirail.processes.order import Order
 
 runtime, record, control, beats, *sockets = sys.argv[1:]
 with socket.socket(fileno=int(control)) as connected:

@@ -25,6 +25,9 @@ AT_HOME = {
 KNOWN = {
     # A name becomes a pose where the named poses are; maps are older than the second mechanism.
     ("processes/poses.py", "isinstance(goal, NamedGoal)"),
+    # A trajectory alone has parts: the client cuts it, and the gateway puts it together.
+    ("client/outgoing.py", "isinstance(goal, TrajectoryGoal)"),
+    ("processes/gateway.py", "isinstance(sent, TrajectoryGoal)"),
     ("config/as_built.py", "robot.kind == '3-PRP'"),
 }
 

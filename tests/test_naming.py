@@ -18,7 +18,7 @@ from trirail.cli import live
 from trirail.config import Config, geometry, load, parse
 from trirail.config.loading import SIM
 from trirail.config.tables import GeometryTable
-from trirail.diagnosis.dial_gauge import JUDGEMENTS
+from trirail.diagnosis.dial_gauge import CONFIG_CHECKS
 from trirail.errors import ConfigError, KinematicsError
 from trirail.kinematics.calibration import corrected
 from trirail.kinematics.robot import inverse
@@ -78,20 +78,20 @@ def test_nothing_that_people_read_of_a_stage_has_the_letter_of_a_slider(stage: s
     said = [str(each) for each in violations(robot.geometry, limits, (0.02, 0.02, 0.02))]
     bounds = Bounds(limits, config.period, labels=robot.geometry.labels)
     for number, label in enumerate(labels):
-        found = bounds.setpoint([np.eye(3)[number]])
+        found = bounds.setpoint_violation([np.eye(3)[number]])
         assert found is not None
-        assert found.what == NAMES[number]
+        assert found.axis == NAMES[number]
         assert found.subject == f"slider {label}"
         said.append(str(found))
     with pytest.raises(KinematicsError) as wrong:
         inverse(robot.geometry, (0.0, 0.0, np.nan))
     said.append(str(wrong.value))
-    said += [check.found + check.remedy for judgement in JUDGEMENTS for check in judgement.of(config)]
+    said += [check.found + check.remedy for each in CONFIG_CHECKS for check in each.run(config)]
     said.append(readout.markdown(np.zeros(1, DTYPE)[0], Standing(), labels))
     assert not [words for words in said if LETTER.search(words)]
     assert f"| {' | '.join(labels)} |" in said[-1]
     shown = describe(told, robot, "me", None)
-    assert (shown["sliders"], shown["decimals"]) == (labels, 4)
+    assert (shown["sliders"], shown["resolution"]["unit"]) == (labels, "µm")
     drawn = curves.plots(robot)[curves.POSITION].moving
     assert tuple(line.name for line in drawn) == labels
     assert provenance.labels(provenance.texts(config)) == labels

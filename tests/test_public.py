@@ -39,7 +39,7 @@ def top_level(*packages: ModuleType) -> Iterator[ast.stmt]:
         ("from trirail import Geometry, Leg, inverse, forward, jacobians", {"numba", "numpy"}),
         ("from trirail import read", {"numpy", "rerun"}),
         ("from trirail.cli import app", {"rich", "cyclopts"}),
-        ("from trirail.telemetry.session_index import SessionIndex", set()),
+        ("from trirail.telemetry.sessions import find", set()),
         ("from trirail.config import SIM, load; load(SIM)", {"numpy", "can", "canopen"}),
         ("from trirail.processes import supervisor", {"numpy"}),
         ("from trirail.processes import gateway", {"numpy", "zenoh"}),
@@ -53,9 +53,9 @@ def test_each_name_loads_what_it_needs_and_no_more(statement: str, loaded: set[s
 
 
 def test_every_public_name_is_there_and_is_the_one_at_its_home() -> None:
-    assert set(trirail.__all__) == {*trirail._HOME, "__version__"}
+    assert set(trirail.__all__) == {*trirail._MODULE_OF, "__version__"}
     assert set(trirail.__all__) <= set(dir(trirail))
-    for name, home in trirail._HOME.items():
+    for name, home in trirail._MODULE_OF.items():
         assert getattr(trirail, name) is getattr(importlib.import_module(home), name)
 
 

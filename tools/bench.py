@@ -1,6 +1,6 @@
-"""Measurements: `python tools/bench.py loop`, `latency`, …, each with --json for programs; `all` is `make bench`.
+"""Benchmarks: `python tools/bench.py loop`, `latency`, …, each with --json for programs; `all` is `make bench`.
 
-Speed is a ratio within one run, for the machines that this runs on are not alike.
+Speed is given as a ratio within one run, because machines differ.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from cyclopts import App
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
 
-# Each command imports what it measures: `frames` runs in an emulated machine too, where an import takes its time.
+# Each command imports its benchmark itself: `frames` also runs in an emulated machine, where imports are slow.
 
 
 def report(found: dict[str, Any], json: bool) -> None:
-    """Print what was measured, as one JSON object or in lines; a list of numbers is at the `quantiles`."""
+    """Print the results, as one JSON object or in lines; a list of numbers gives the values at `quantiles`."""
     print(json_format.dumps(found) if json else "\n".join(lines(found)))
 
 
 def lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
-    """Yield it line by line."""
+    """Yield the results line by line."""
     for name, value in found.items():
         parts = value if isinstance(value, list) and any(isinstance(part, dict) for part in value) else [value]
         for part in parts:
@@ -39,9 +39,7 @@ def lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
 
 
 @app.command
-def loop(
-    *, seconds: float = 60.0, rates: tuple[int, ...] = (1000, 2000, 4000), runs: int = 5, json: bool = False
-) -> None:
+def loop(*, seconds: float = 60.0, rates: tuple[int, ...] = (1000, 2000), runs: int = 5, json: bool = False) -> None:
     """Run the whole service, goals without pause; time its loop beside cyclictest and the bare loop, at each rate."""
     import bench_loop
 

@@ -1,8 +1,8 @@
-"""Alignment of seeded parts on stages of both kinds: corrections, what is left, and the seconds of one correction.
+"""Alignment of seeded parts on stages of both kinds: corrections, residuals, and the duration of one correction.
 
-The stage is computed, without its time: who commands a pose inverts the model that he has, sliders go to whole counts,
-and the table is where the loops of the stage as built close. So the residuals are of kinematics, calibration and
-cameras alone; drives' own errors are not in them. The seconds are a running service's, on simulated drives with lag.
+The stage is computed, without timing: a commanded pose is inverted with the commander's model, sliders move to whole
+counts, and the table is where the loops of the stage as built close. The residuals thus contain only kinematics,
+calibration and cameras, not errors of drives. Durations come from a running service on simulated drives with lag.
 """
 
 from __future__ import annotations
@@ -16,10 +16,18 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from trirail.alignment.camera_calibration import placed
-from trirail.alignment.images import CameraView, Pair, pixels
-from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Task, Wish, align, calibration_by_moves
-from trirail.alignment.rigid import Floats, rigid_error, turned
+from trirail.alignment.camera_calibration import to_base_frame
+from trirail.alignment.images import CameraView, Pair, project_points
+from trirail.alignment.procedure import (
+    LOOK,
+    AlignmentRequest,
+    AlignmentTask,
+    Observation,
+    StageMotion,
+    align,
+    calibrate_by_moves,
+)
+from trirail.alignment.rigid_motion import Floats, fit_rigid_motion, rotation_matrix
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.client.stage_as_built import built_otherwise
@@ -30,17 +38,17 @@ from trirail_drivers.interface import Triple
 
 T = TypeVar("T")
 Model = Callable[[Floats], Floats]
-"""Sliders [m] of a pose."""
+"""Function from a pose to slider positions [m]."""
 SEED = 28
 SCALE = 1.0 / 3.75e-6
 NOISE = 0.1
 COUNT = 1e-7
 OFF, TURNED = 1e-3, math.radians(0.5)
 PLACES, ANGLES = 50e-6, 0.1e-3
-"""By how much legs as built differ from their configuration at most, in each coordinate [m] and angle [rad]."""
+"""Maximum deviations of legs as built from their configuration, in each coordinate [m] and angle [rad]."""
 TOLERANCE, ARC = 1e-6, math.radians(5.0 / 3600.0)
 LOOKS = 4
-"""Pictures at each place, in a mean: of the calibration, of the targets and of a part, unless a case says one."""
+"""Pictures averaged at each place: for calibration, targets and parts, unless a case uses one."""
 PART: dict[str, Pair] = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
 FILES = {"3-PRP": "uvw.toml", "3-PPR": "uvw-ppr.toml"}
 AIMS = {
@@ -50,40 +58,42 @@ AIMS = {
 
 
 class ComputedStage:
-    """A stage that is built one way and commanded by a model of it, and two cameras above it."""
+    """A stage as built, commanded through a model of it, and two cameras above it."""
 
     def __init__(self, built: Geometry, model: Model, rng: np.random.Generator) -> None:
         self._built, self._model, self._rng = built, model, rng
         self.views = {name: _view(rng, place) for name, place in PART.items()}
         self.part: Mapping[str, Pair] = PART
         self.pose: Triple = (0.0, 0.0, 0.0)
-        """Where whoever commands it has it."""
+        """Pose according to the model."""
 
     @property
     def true(self) -> Triple:
-        """Where it is."""
+        """True pose."""
         sliders = np.round(self._model(np.array(self.pose)) / COUNT) * COUNT
         x, y, phi = forward(self._built, sliders).tolist()
         return x, y, phi
 
     def seen(self, noise: float) -> dict[str, Pair]:
-        """Return the pixels of the part's marks."""
+        """Return the pixel coordinates of the part's marks, with `noise` [pixels]."""
         pose = self.true
-        exact = {name: pixels(self.views[name], placed(q, pose)[None])[0] for name, q in self.part.items()}
+        exact = {
+            name: project_points(self.views[name], to_base_frame(q, pose)[None])[0] for name, q in self.part.items()
+        }
         noisy = {name: (at + noise * self._rng.standard_normal(2)).tolist() for name, at in exact.items()}
         return {name: (u, v) for name, (u, v) in noisy.items()}
 
     def go(self, motion: StageMotion) -> None:
-        """Go to a pose, or by so much about a point, in the model's belief."""
+        """Move to a pose, or relative about a point, according to the model."""
         if motion.tool is None:
             self.pose = motion.by
             return
         phi = self.pose[2] + motion.by[2]
-        x, y = (placed(motion.tool, self.pose) + motion.by[:2] - turned(phi) @ motion.tool).tolist()
+        x, y = (to_base_frame(motion.tool, self.pose) + motion.by[:2] - rotation_matrix(phi) @ motion.tool).tolist()
         self.pose = (x, y, phi)
 
-    def drive(self, wishes: Generator[Wish, Sighting, T], after: Callable[[], None] = lambda: None) -> T:
-        """Do what a conversation wishes; `after` is called after each motion."""
+    def drive(self, wishes: Generator[AlignmentRequest, Observation, T], after: Callable[[], None] = lambda: None) -> T:
+        """Fulfil the requests of a procedure and return its result; `after` is called after each motion."""
         marks: Mapping[str, Pair] = {}
         try:
             wish = next(wishes)
@@ -93,13 +103,13 @@ class ComputedStage:
                 elif isinstance(wish, StageMotion):
                     self.go(wish)
                     after()
-                wish = wishes.send(Sighting(marks, self.pose, 0.0))
+                wish = wishes.send(Observation(marks, self.pose, 0.0))
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
 
 
 def measure(parts: int, goals: int) -> dict[str, Any]:
-    """Return for each kind and case what became of so many parts, and the seconds of corrections of a service."""
+    """Return the results of `parts` parts for each kind and case, and the duration of a service's corrections."""
     found: dict[str, Any] = {"aims": [f"{name}: {aim}, {share:.0%}" for name, (aim, share) in AIMS.items()]}
     found |= computed(parts)
     found["seconds of a correction, a service"] = seconds(goals)
@@ -107,7 +117,7 @@ def measure(parts: int, goals: int) -> dict[str, Any]:
 
 
 def computed(parts: int) -> dict[str, Any]:
-    """Return for each kind and case what became of so many parts."""
+    """Return the results of `parts` parts for each kind and case."""
     found: dict[str, Any] = {}
     for kind, file in FILES.items():
         ideal = geometry(load(SIM.with_name(file)).geometry)
@@ -132,14 +142,15 @@ def _case(
     for seed in range(parts):
         rng = np.random.default_rng((SEED, seed))
         stage = ComputedStage(built(rng), model, rng)
-        calibration = stage.drive(calibration_by_moves(looks=LOOKS))
+        calibration = stage.drive(calibrate_by_moves(looks=LOOKS))
         views = [stage.seen(NOISE) for _ in range(LOOKS)]
         targets = {name: tuple(np.mean([view[name] for view in views], axis=0).tolist()) for name in PART}
-        aim = np.array([placed(q, stage.true) for q in PART.values()])
+        aim = np.array([to_base_frame(q, stage.true) for q in PART.values()])
         error = (*rng.uniform(-OFF, OFF, 2), rng.uniform(-TURNED, TURNED))
-        stage.part = {name: tuple(placed(q, error).tolist()) for name, q in PART.items()}
+        stage.part = {name: tuple(to_base_frame(q, error).tolist()) for name, q in PART.items()}
         after: list[tuple[float, float]] = []
-        result = stage.drive(align(Task(calibration, targets, looks=looks)), lambda: after.append(_left(stage, aim)))  # noqa: B023
+        task = AlignmentTask(calibration, targets, looks=looks)
+        result = stage.drive(align(task), lambda: after.append(_left(stage, aim)))  # noqa: B023
         made.append(len(result.corrections))
         one.append(after[0][0])
         left.append(after[-1][0])
@@ -160,13 +171,13 @@ def _case(
 
 
 def _left(stage: ComputedStage, aim: Floats) -> tuple[float, float]:
-    """Return how far the farthest mark truly is from its place [m], and by what angle the part is turned [rad]."""
-    at = np.array([placed(q, stage.true) for q in stage.part.values()])
-    return float(np.linalg.norm(at - aim, axis=1).max()), abs(rigid_error(at, aim).turn)
+    """Return the true distance of the farthest mark from its place [m], and the angular error of the part [rad]."""
+    at = np.array([to_base_frame(q, stage.true) for q in stage.part.values()])
+    return float(np.linalg.norm(at - aim, axis=1).max()), abs(fit_rigid_motion(at, aim).turn)
 
 
 def small_angles(robot: Geometry) -> Model:
-    """Return what most programs of such stages compute: each slider by x - y' phi or y + x' phi."""
+    """Return the small-angle model of most programs for such stages: each slider by x - y' phi or y + x' phi."""
     middle = inverse(robot, np.zeros(3)).position
     rows = []
     for leg in robot.each:
@@ -178,13 +189,18 @@ def small_angles(robot: Geometry) -> Model:
 
 def _view(rng: np.random.Generator, place: Pair) -> CameraView:
     mirror = np.diag([1.0, rng.choice([-1.0, 1.0])])
-    matrix = SCALE * turned(rng.uniform(-math.pi, math.pi)) @ mirror @ (np.eye(2) + rng.uniform(-0.01, 0.01, (2, 2)))
+    matrix = (
+        SCALE
+        * rotation_matrix(rng.uniform(-math.pi, math.pi))
+        @ mirror
+        @ (np.eye(2) + rng.uniform(-0.01, 0.01, (2, 2)))
+    )
     (a, b), (c, d) = matrix.tolist()
     return CameraView(place, (1000.0, 800.0), ((a, b), (c, d)))
 
 
 def seconds(goals: int) -> dict[str, Any]:
-    """Return the seconds of corrections by 0.5 mm on a running service, without the camera's own."""
+    """Return the durations of corrections by 0.5 mm on a running service, without camera time [s]."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as name:
         folder = Path(name)
         locator = f"unixsock-stream/{folder}/zenoh"
@@ -207,7 +223,7 @@ def _seconds(robot: Robot, goals: int) -> dict[str, Any]:
 
     def look() -> dict[str, Pair]:
         pose = robot.state().pose
-        seen = {name: pixels(views[name], placed(q, pose)[None])[0].tolist() for name, q in part.items()}
+        seen = {name: project_points(views[name], to_base_frame(q, pose)[None])[0].tolist() for name, q in part.items()}
         return {name: (u, v) for name, (u, v) in seen.items()}
 
     targets, calibration = look(), robot.calibrate_camera(look)

@@ -1,7 +1,7 @@
-"""What the machine itself can do while something is measured: cyclictest or, without that, a loop that only sleeps.
+"""Lateness of the machine itself during a benchmark, by cyclictest or, without it, by a loop that only sleeps.
 
-Both sleep to absolute deadlines with SCHED_FIFO on the loop's processor, one priority above it, and at its period. Each
-time that they wake later than a period, ticks went by in which no program could have run.
+Both sleep to absolute deadlines with SCHED_FIFO on the loop's processor, one priority above it, with its period. A
+wake-up later than a period means ticks in which no program could have run.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from trirail.processes.clock import Ticker
 
 LONGEST = 100_000
-"""Latenesses that are told apart [µs]."""
+"""Largest lateness that the histogram distinguishes [µs]."""
 
 
 class Beside:
-    """A measurement of the machine's own lateness, which ends by itself after so many seconds."""
+    """A measurement of the machine's own lateness, which ends by itself after `seconds`."""
 
     def __init__(self, seconds: float, period_us: int, priority: int, result: Path) -> None:
         self.period_us = period_us
@@ -41,19 +41,19 @@ class Beside:
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
 
     def lateness(self) -> NDArray[np.float64]:
-        """Wait for its end; how late it woke, each time [µs]."""
+        """Wait for its end; return the lateness of each wake-up [µs]."""
         self._process.wait(60)
         found = json.loads(self._result.read_text(encoding="utf-8"))
         counts = found["thread"]["0"]["histogram"] if "thread" in found else found
         return np.repeat([float(value) for value in counts], list(counts.values()))
 
     def ticks_lost(self, lateness: NDArray[np.float64]) -> int:
-        """Ticks that went by in sleeps that were longer than a period."""
+        """Return the number of ticks lost in sleeps longer than a period."""
         return int(np.sum(lateness // self.period_us))
 
 
 def main() -> None:
-    """Sleep from deadline to deadline; leave a histogram."""
+    """Sleep from deadline to deadline; write a histogram of the lateness."""
     seconds, period_us, priority, processor = (float(value) for value in sys.argv[1:5])
     signal.signal(signal.SIGTERM, _end)
     try:

@@ -1,8 +1,8 @@
-"""Simulated drives on a bus between processes on which others may listen: what the loop sends is measured with them.
+"""Simulated drives on a bus between processes with third-party listeners, to measure the frames that the loop sends.
 
-python tools/bench_drives.py CONFIG PATH        real-time where the rights allow it, away from the loop's processor
+python tools/bench_drives.py CONFIG PATH        real-time if permitted, away from the loop's processor
 
-tools/virtual_drives.py is the one for people: it takes faults, and tells what the drives do.
+tools/virtual_drives.py is the version for users: it accepts faults and reports the drives' states.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.connection.opening import simulated_bus
 
 PRIORITY = 70
-"""SCHED_FIFO, below the loop's 80."""
+"""Priority for SCHED_FIFO, below the loop's 80."""
 POLL = 0.01
-"""How often the drives' own timers are looked at where no frame comes [s]."""
+"""Polling interval of the drives' own timers without frames [s]."""
 
 
 def main() -> None:
-    """Serve until SIGTERM."""
+    """Run the drives until SIGTERM."""
     config = load(Path(sys.argv[1]))
     signal.signal(signal.SIGTERM, _end)
     with contextlib.suppress(OSError):

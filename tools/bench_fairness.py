@@ -1,9 +1,9 @@
-"""What one user's flood costs another: how long goals and stops take to be answered, quiet and flooded by turns.
+"""Effect of one user's flood on another: response times of goals and stops, alternately without and with the flood.
 
-The flood is eve's, from processes of her own that give way to all else on this machine: as if she were on another. She
-sends goals that are planned and refused, commands, questions and junk, with so many messages without an answer at a
-time as she gets away with. Ann sends a goal from standstill, stops the robot, and stops it again: the first answer is
-that the goal is accepted, the last one, of a robot that stands, that the stop is carried out.
+The flood comes from user eve, from processes with the lowest priority, as if on another machine. They send goals that
+are planned and refused, commands, queries and junk, with as many unanswered messages at a time as the service permits.
+User ann sends a goal from standstill, stops the robot, and stops it again. Measured are the acceptance of the goal and
+the execution of the second stop, with the robot at rest.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ from trirail.wire import zenoh_session
 
 FLOODERS = 2
 SESSIONS = 8
-"""Of each of them."""
+"""Number of sessions per flooding process."""
 PENDING = 100
-"""Messages of each of them that may be without an answer."""
+"""Maximum number of unanswered messages per flooding process."""
 ROUNDS = 10
-"""How often quiet and flood take turns, so that what else the machine does is in both."""
+"""Number of alternations of quiet and flood, so that other load of the machine affects both."""
 SETTLE = 0.5
-"""From the beginning or end of a flood until it is measured [s]."""
+"""Time from the beginning or end of a flood to the measurement [s]."""
+BEGIN = 60.0
+"""Time limit for the first message after the start of the flood [s]."""
 
 MESSAGES: tuple[tuple[str, bytes], ...] = (
     ("goal/eve", b'{"kind": "pose", "x": 0.14, "y": 0.14, "phi": 0.5}'),
@@ -41,11 +43,11 @@ MESSAGES: tuple[tuple[str, bytes], ...] = (
     ("cmd/eve/dance", b""),
     ("info", b""),
 )
-"""None of them moves the robot: what it does meanwhile would be measured too."""
+"""Messages of the flood. None moves the robot, because its motion would affect the measurement."""
 
 
 def flood(locator: str, on: Event, sent: Any) -> None:
-    """Flood while `on` is set, until this process is ended; count in `sent`."""
+    """Flood while `on` is set, until this process is killed; count messages in `sent`."""
     os.nice(19)
     choice, pending = random.Random(os.getpid()), threading.Semaphore(PENDING)
     sessions = [zenoh_session.open_client(locator) for _ in range(SESSIONS)]
@@ -63,7 +65,7 @@ def flood(locator: str, on: Event, sent: Any) -> None:
 
 @contextlib.contextmanager
 def flooders(locator: str) -> Iterator[tuple[Event, Any]]:
-    """The processes that flood, at first silent; give what sets them on, and the count of what they have sent."""
+    """Run the flooding processes, initially silent; yield the event that starts them and the count of messages."""
     context = multiprocessing.get_context("spawn")
     on, sent = context.Event(), context.Value("Q", 0)
     processes = [context.Process(target=flood, args=(locator, on, sent), daemon=True) for _ in range(FLOODERS)]
@@ -78,7 +80,7 @@ def flooders(locator: str) -> Iterator[tuple[Event, Any]]:
 
 
 def measure(made: Rig, goals: int, rounds: int = ROUNDS) -> dict[str, Any]:
-    """Measure so many goals and stops, half of them flooded; return milliseconds at QUANTILES."""
+    """Measure `goals` goals and stops, half of them flooded; return milliseconds at QUANTILES."""
     choice = random.Random(7)
     took: dict[str, list[float]] = {
         f"{what}_{when}_ms": [] for what in ("goal", "stop") for when in ("quiet", "flooded")
@@ -89,7 +91,7 @@ def measure(made: Rig, goals: int, rounds: int = ROUNDS) -> dict[str, Any]:
         for number in range(2 * rounds):
             when = "flooded" if number % 2 else "quiet"
             if number % 2:
-                on.set()
+                _set_on(on, sent)
             began = time.monotonic()
             time.sleep(SETTLE)
             for _ in range(max(1, goals // (2 * rounds))):
@@ -107,8 +109,18 @@ def measure(made: Rig, goals: int, rounds: int = ROUNDS) -> dict[str, Any]:
     return {"quantiles": QUANTILES, "messages_per_second": messages, **spread, **ratios}
 
 
+def _set_on(on: Event, sent: Any) -> None:
+    """Start the flood and wait for its first message, since low-priority processes start late on a busy machine."""
+    before, deadline = sent.value, time.monotonic() + BEGIN
+    on.set()
+    while sent.value == before:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"no message of the flood was sent within {BEGIN:g} s: is the machine busy?")
+        time.sleep(0.01)
+
+
 def _each(robot: Robot, choice: random.Random) -> tuple[float, float]:
-    """Send a goal from standstill and stop it; return how long its acceptance took, and a stop at standstill [s]."""
+    """Send a goal from standstill and stop it; return the times for its acceptance and a stop at standstill [s]."""
     time.sleep(choice.uniform(0.0, 0.01))  # at any phase of the cycle, and of the flood
     accepted = _timed(lambda: robot.move_to(x=choice.uniform(-0.05, 0.05), y=choice.uniform(-0.05, 0.05), phi=0.0))
     robot.stop()

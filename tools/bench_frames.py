@@ -1,7 +1,7 @@
-"""What one cycle's frames cost: by python-can's SocketCAN, and on its socket as the drivers do it, in one run.
+"""Cost of one cycle's frames, by python-can's SocketCAN and directly on its socket like the drivers, in one run.
 
-A cycle is SYNC and three setpoints sent, a bus found empty, three positions received, and a bus found empty again. The
-bus is the kernel's virtual one where that can be made, else python-can's SocketCAN code over a pair of unix sockets.
+A cycle sends SYNC and three setpoints, finds the bus empty, receives three positions, and finds the bus empty again.
+The bus is a virtual one of the kernel if possible, else python-can's SocketCAN code over a pair of unix sockets.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from trirail_drivers.cia402 import canopen_frames as layout
 from trirail_drivers.interface import NAMES
 
 AIM = 10.0
-"""What one cycle's frames may cost [µs]."""
+"""Maximum time for one cycle's frames [µs]."""
 NODES = range(1, 1 + len(NAMES))
 
 
@@ -39,11 +39,11 @@ class Loopback(SocketcanBus):
         can.BusABC.__init__(self, channel=self.channel)
 
     def _apply_filters(self, filters: can.typechecking.CanFilters | None) -> None:
-        """Do nothing: identifiers are filtered by the kernel's CAN sockets alone."""
+        """Do nothing: only the kernel's CAN sockets filter identifiers."""
 
 
 class Listener:
-    """Reads positions as a drive's axis does."""
+    """Decoder of positions, like that of a drive's axis."""
 
     def __init__(self) -> None:
         self.heard = 0
@@ -55,9 +55,9 @@ class Listener:
 
 
 def measure(cycles: int) -> dict[str, Any]:
-    """Return microseconds of one cycle's frames, each way, and their ratio."""
+    """Return the time for one cycle's frames by either method [µs], and their ratio."""
     with _bus() as (kind, bus, far):
-        # What both have to do with a frame is the same, so it is left to the cycle: here are the frames alone.
+        # Only frames are compared here: the processing of their contents, in the cycle, is the same for both.
         ways: dict[str, FrameIO] = {"python_can": PythonCanFrames(bus), "socket": SocketFrames(bus.socket)}
         times: dict[str, list[float]] = {name: [] for name in ways}
         sync, setpoints = Frame(layout.SYNC), [Frame(layout.RPDO2 + node, bytes(8)) for node in NODES]
@@ -122,7 +122,7 @@ def _bus() -> Iterator[tuple[str, SocketcanBus, socket.socket]]:
 
 
 def _vcan() -> tuple[str, Callable[[], object]]:
-    """Make a virtual bus; return its name, and what takes it down."""
+    """Create a virtual bus; return its name and a function that removes it."""
     socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     name = f"vcan{os.getpid() % 100_000}"
 

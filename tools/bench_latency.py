@@ -1,8 +1,8 @@
-"""From a goal's put to the first setpoint that it changes, as a third party on the bus sees it.
+"""Time from a goal's put to the first setpoint that it changes, as seen by a third party on the bus.
 
-At rest, and in motion: there the robot cruises on a straight line, where each slider's velocity feed-forward stays what
-it is, until the goal that turns it back changes it. Setpoints have the kernel's time of arrival at the third party, to
-which the drives' process passes them on; a goal's time is that before the client's call.
+At rest and in motion. In motion the robot cruises on a straight line, with constant velocity feed-forward of each
+slider until the goal that turns it back changes that. Setpoints have the kernel's time of arrival at the third party,
+to which the drives' process forwards them; the time of a goal is taken before the client's call.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from trirail_drivers.interface import NAMES
 
 SETPOINTS = {layout.RPDO2 + node for node in range(1, 1 + len(NAMES))}
 STEADY = 20
-"""Feed-forward that changes by less is that of a cruise: rounding, at 1e7 counts per metre [counts/s]."""
+"""Maximum change of the feed-forward in a cruise, by rounding at 1e7 counts per metre [counts/s]."""
 WITHIN = 0.1
-"""A goal that has changed nothing by then is left out, and counted [s]."""
+"""Time limit for a change; goals without one are left out, and counted [s]."""
 END = 0.08
-"""Where goals lead, and turn back [m]."""
+"""Coordinate x of the goals, at which motions reverse [m]."""
 
 
 class Setpoint(NamedTuple):
-    """A setpoint as it passed the bus."""
+    """A setpoint on the bus."""
 
     t: float
-    """Seconds since 1970."""
+    """Time since 1970 [s]."""
     identifier: int
     velocity: int
     """Feed-forward [counts/s]."""
 
 
 class Listener:
-    """A third party on the bus: keeps every setpoint with the time of its arrival."""
+    """A third party on the bus, which keeps every setpoint with its time of arrival."""
 
     def __init__(self, path: str) -> None:
         self._bus = UnixBus(path)
@@ -63,7 +63,7 @@ class Listener:
             self._frames.receive(0.1)
 
     def setpoints(self) -> list[Setpoint]:
-        """Those that have arrived since the last time."""
+        """Return the setpoints that have arrived since the last call."""
         return [
             Setpoint(t, identifier, layout.SETPOINT.unpack(data)[1])
             for t, identifier, data in self._taken()
@@ -71,7 +71,7 @@ class Listener:
         ]
 
     def arrivals(self, identifier: int) -> list[float]:
-        """When frames of an identifier have arrived since the last time [s]."""
+        """Return the arrival times of frames with an identifier since the last call [s]."""
         return [t for t, one, _ in self._taken() if one == identifier]
 
     def _taken(self) -> Iterator[tuple[float, int, bytes]]:
@@ -89,7 +89,7 @@ class Listener:
 
 @contextlib.contextmanager
 def listener(path: str) -> Iterator[Listener]:
-    """A third party on a bus."""
+    """Run a third party on a bus."""
     made = Listener(path)
     try:
         yield made
@@ -98,11 +98,11 @@ def listener(path: str) -> Iterator[Listener]:
 
 
 Measured = Callable[[Robot, Listener, random.Random], float | None]
-"""What measures one goal: seconds, None where it changed nothing."""
+"""Function that measures one goal [s]; None if it changed nothing."""
 
 
 def measure(made: Rig, goals: int) -> dict[str, Any]:
-    """Send so many goals at rest, and as many in motion; return milliseconds at QUANTILES."""
+    """Send `goals` goals at rest, and as many in motion; return milliseconds at QUANTILES."""
     chance = random.Random(3)
     with listener(made.bus) as heard:
         at_rest = _each(goals, made.robot, heard, chance, _at_rest)
@@ -117,7 +117,7 @@ def measure(made: Rig, goals: int) -> dict[str, Any]:
 
 
 def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, measured: Measured) -> list[float | None]:
-    """Measure so many goals; one in which the machine has stalled the drives into a fault counts as without effect."""
+    """Measure `goals` goals; one during which a stall of the machine faults the drives counts as without effect."""
     found: list[float | None] = []
     ready = False
     for _ in range(goals):
@@ -136,9 +136,9 @@ def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, meas
 
 
 def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
-    """A small goal from standstill, and its end."""
+    """Measure a small goal from standstill, and wait for its end."""
     heard.setpoints()
-    time.sleep(chance.uniform(0.02, 0.04))  # at any phase of the cycle, and setpoints of before are there
+    time.sleep(chance.uniform(0.02, 0.04))  # at any phase of the cycle, and after some earlier setpoints
     put = time.time()
     goal = robot.move_to(x=-END + chance.uniform(0.0, 0.004), y=chance.uniform(-0.004, 0.004), phi=0.0)
     time.sleep(WITHIN)
@@ -148,7 +148,7 @@ def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | No
 
 
 def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
-    """A goal across, and in its cruise another that leads back."""
+    """Measure a goal that reverses the cruise of a previous one."""
     state = robot.state()
     side = 1.0 if state.commanded.pose[0] < 0.0 else -1.0
     robot.move_to(x=side * END, y=0.0, phi=0.0)
@@ -165,7 +165,7 @@ def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | 
 
 
 def first_change(setpoints: list[Setpoint], put: float) -> float | None:
-    """Seconds from the put to the first setpoint with another feed-forward than before; None if there is none."""
+    """Return the time from the put to the first setpoint with a different feed-forward [s]; None if there is none."""
     steady = {one.identifier: one.velocity for one in setpoints if one.t <= put}
     for one in setpoints:
         if one.t <= put or one.identifier not in steady:

@@ -1,12 +1,11 @@
-"""The loop under its real neighbours: what a cycle costs, how late it comes, and which ticks it misses.
+"""Real-time performance of the loop in a complete service: cost of a cycle, lateness and missed ticks.
 
-The service runs as a user runs it, with gateway, recorder and a client that watches every cycle, while goals come
-without pause. cyclictest runs in the same minute on the same processor, one priority above the loop, in as many runs as
-lateness is compared in. The simulated drives are a process of the service, real-time on the other processor, so that a
-cycle is the loop's own; where a virtual machine stalls one of the two, the other waits for it. Faults are counted and
-reset. Before the service and after it the bare loop runs, a cycle's frames and nothing else, as trirail doctor measures
-it, and cyclictest beside it: what it takes is the machine's share. Of a rate that the service cannot keep that is
-said.
+The service runs as for a user, with gateway, recorder and a client that watches every cycle, under continuous goals.
+cyclictest runs in the same minute on the same processor, one priority above the loop, in as many runs as lateness is
+compared in. The simulated drives are a process of the service, real-time on the other processor, so that a cycle
+contains only the loop; if a virtual machine stalls one of the two, the other waits. Faults are counted and reset.
+Before and after the service, the bare loop runs with only a cycle's frames, as in trirail doctor, beside cyclictest:
+its time is the machine's share. A rate that the service cannot keep is reported as such.
 """
 
 from __future__ import annotations
@@ -31,15 +30,15 @@ from trirail.wire.records import PARTS, Part, unpack
 from trirail.wire.vocabulary import Mode
 
 MOST_FAULTS = 0.2
-"""With more faults a second a rate is not kept."""
+"""Maximum number of faults per second at a rate that counts as kept [1/s]."""
 BARE = 1.0 / 6.0
-"""The bare loop runs for such a share of the service's time before it, and again after it."""
+"""Duration of the bare loop before the service, and again after it, as a share of the service's."""
 SETTLE = 2.0
-"""Goals before the measurement: what happens once has happened [s]."""
+"""Duration of goals before the measurement, to exclude one-time effects [s]."""
 
 
 def measure(seconds: float, rates: tuple[int, ...], runs: int) -> dict[str, Any]:
-    """Measure each rate [Hz] for so many seconds, in as many runs; microseconds at QUANTILES, and counts."""
+    """Measure each rate [Hz] for `seconds` in total over `runs`; return microseconds at QUANTILES, and counts."""
     return {"quantiles": QUANTILES, "rates": [_of_a_rate(rate, seconds, runs) for rate in rates]}
 
 
@@ -57,7 +56,7 @@ def _of_a_rate(rate: int, seconds: float, runs: int) -> dict[str, Any]:
 
 
 def of_both(service: dict[str, Any], bare: dict[str, Any]) -> dict[str, Any]:
-    """What was found of a service's loop and of the bare one, and their ratios where the service kept the rate."""
+    """Return the results of a service's loop and of the bare one, and their ratios if the service kept the rate."""
     found = {**service, "bare": bare}
     if "not_kept" not in service:
         pairs = {what: zip(service[what], bare[what], strict=True) for what in ("cycle", "lateness")}
@@ -70,7 +69,7 @@ class _NotKeptError(Exception):
 
 
 def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, Any]:
-    """The service's loop. Raises what kept it from the rate."""
+    """Measure the service's loop. Raises TrirailError or _NotKeptError if it cannot keep the rate."""
     priority, period_us = load(SIM).loop.priority, 1_000_000 // rate
     found: list[dict[str, Any]] = []
     batches: list[NDArray[np.void]] = []
@@ -108,7 +107,7 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
 
 
 def _bare(rate: int, seconds: float, result: Path) -> tuple[bare_loop.Cycles, int]:
-    """The bare loop, in a process of its own; and the ticks that the machine lost meanwhile."""
+    """Measure the bare loop in a process of its own; return its cycles and the ticks that the machine lost."""
     loop = load(SIM).loop
     with ProcessPoolExecutor(1, get_context("spawn"), bare_loop.prepare) as alone:
         alone.submit(os.getpid).result()  # it has compiled
@@ -118,7 +117,7 @@ def _bare(rate: int, seconds: float, result: Path) -> tuple[bare_loop.Cycles, in
 
 
 def together(parts: list[tuple[bare_loop.Cycles, int]]) -> dict[str, Any]:
-    """What all runs of the bare loop took, and the ticks that the machine lost in each."""
+    """Return the results of all runs of the bare loop, and the ticks that the machine lost in total."""
     return {
         "cycles": sum(len(cycles.work) for cycles, _ in parts),
         "answers": sum(cycles.answers for cycles, _ in parts),
@@ -130,11 +129,11 @@ def together(parts: list[tuple[bare_loop.Cycles, int]]) -> dict[str, Any]:
 
 
 class Faults:
-    """Faults are counted and reset, and the measurement goes on: a machine that stalls faults any drives outside."""
+    """Counter of faults, which resets them so that the measurement continues: any stall faults external drives."""
 
     def __init__(self, robot: Robot) -> None:
         self.told: list[str] = []
-        """What was said of each."""
+        """Messages of the faults."""
         self._robot = robot
 
     def mend(self) -> None:
@@ -148,7 +147,7 @@ class Faults:
 
 
 def _collect(made: Rig, seconds: float, faults: Faults) -> tuple[NDArray[np.void], int]:
-    """Keep the robot in motion; every cycle's record, and how many goals were accepted."""
+    """Keep the robot in motion; return the record of every cycle, and the number of accepted goals."""
     batches: list[bytes] = []
     with made.robot.records(batches.append):
         accepted = without_pause(made.robot, seconds, faults.mend)
@@ -158,7 +157,7 @@ def _collect(made: Rig, seconds: float, faults: Faults) -> tuple[NDArray[np.void
 
 
 def _lateness(rows: NDArray[np.void], period_us: int) -> NDArray[np.float64]:
-    """How late each cycle of a run was, (n,) [µs]: after missed ticks by those too."""
+    """Return the lateness of each cycle of a run, including preceding missed ticks, (n,) [µs]."""
     found: NDArray[np.float64] = rows["lateness_ns"] / 1000.0 + _missed(rows) * period_us
     return found
 
@@ -168,7 +167,7 @@ def _missed(rows: NDArray[np.void]) -> NDArray[np.int64]:
 
 
 def _run(rows: NDArray[np.void], beside: NDArray[np.float64], of: Beside, period_us: int) -> dict[str, Any]:
-    """One run's lateness beside the machine's own."""
+    """Return the lateness of one run and that of the machine itself."""
     lateness = quantiles(_lateness(rows, period_us))
     own = quantiles(beside)
     return {

@@ -1,7 +1,7 @@
-"""The intervals of SYNC at a receiver: trirail's loop, python-canopen's own periodic SYNC, and LinuxCNC's servo thread.
+"""Intervals of SYNC at a receiver: trirail's loop, python-canopen's own periodic SYNC, and LinuxCNC's servo thread.
 
-trirail and python-canopen send over the same bus between processes, with the same drives on it; the receiver is a
-third party there, and takes the kernel's time of arrival. python-canopen runs as it comes, and with the loop's rights.
+trirail and python-canopen send over the same bus between processes, with the same drives; the receiver is a third
+party there, and uses the kernel's time of arrival. python-canopen runs unchanged, and with the loop's privileges.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PRIORITY = 80
 
 
 def measure(seconds: float) -> dict[str, Any]:
-    """Listen to each for so many seconds; return deviations of SYNC's interval from its period, microseconds."""
+    """Listen to each for `seconds`; return the deviations of SYNC's interval from its period [µs]."""
     return {
         "rate_hz": RATE,
         "quantiles": QUANTILES,
@@ -59,21 +59,21 @@ def _canopen(seconds: float, real_time: bool) -> list[float]:
 
 
 def _deviations(arrivals: list[float]) -> list[float]:
-    """How far the intervals are from the period, without sign [µs]."""
+    """Return the absolute deviations of the intervals from the period at QUANTILES [µs]."""
     if len(arrivals) < RATE // 10:
         raise SystemExit(f"only {len(arrivals)} SYNCs arrived")
     return quantiles(np.abs(np.diff(arrivals) - 1.0 / RATE) * 1e6)
 
 
 def _linuxcnc() -> str:
-    """What there is to say of LinuxCNC's servo thread on this machine."""
+    """Return whether LinuxCNC's servo thread can be compared on this machine, in words."""
     if shutil.which("halrun") is None:
         return "not installed (Debian's package is linuxcnc-uspace): no servo thread to compare with"
     return "installed: run its latency-histogram beside this, it measures its servo thread itself"
 
 
 def _send_sync(path: str, seconds: float, real_time: bool) -> None:
-    """python-canopen's periodic SYNC on the bus, for so long."""
+    """Send python-canopen's periodic SYNC on the bus for `seconds`."""
     import canopen
 
     if real_time:

@@ -1,4 +1,4 @@
-"""A service to be measured, on its own simulated drives or on a bus where others listen, and goals without pause."""
+"""Service under test, on its own simulated drives or on a bus with listeners, and continuous goals."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from trirail.client.client import Robot
 from trirail.errors import TrirailError
 
 GOALS_HZ = 20.0
-"""Goals a second that are "without pause": none has ended when the next takes over."""
+"""Rate of goals "without pause": each goal replaces the previous one before its end [1/s]."""
 SPAN = (0.05, 0.05, 0.4)
-"""They lie so far from the middle [m, m, rad]."""
+"""Maximum distance of goals from the centre [m, m, rad]."""
 BITRATE = 8_000_000
-"""Of a bus without a wire: the load of no real one keeps a rate from being measured [bit/s]."""
+"""Bitrate of the virtual bus, high enough for its load not to limit the measured rates [bit/s]."""
 
 
 QUANTILES = (50.0, 99.0, 99.9, 100.0)
@@ -36,11 +36,11 @@ class Rig(NamedTuple):
     robot: Robot
     locator: str
     bus: str
-    """Path of the bus between processes; "" where it is the service's own."""
+    """Path of the bus between processes; "" if the bus is the service's own."""
 
 
 def quantiles(values: list[float] | NDArray[np.float64]) -> list[float]:
-    """The values at QUANTILES."""
+    """Return the values at QUANTILES."""
     if not len(values):
         raise SystemExit("there is nothing to measure")
     return [float(value) for value in np.percentile(values, QUANTILES)]
@@ -48,7 +48,7 @@ def quantiles(values: list[float] | NDArray[np.float64]) -> list[float]:
 
 @contextlib.contextmanager
 def rig(rate_hz: int, own: bool = False) -> Iterator[Rig]:
-    """A service on simulated drives at a rate, enabled; they are its `own`, or on a bus where others can listen."""
+    """Run an enabled service at a rate, on its `own` simulated drives or on some on a bus with listeners."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         config, locator = configured(folder, rate_hz, own)
@@ -59,12 +59,12 @@ def rig(rate_hz: int, own: bool = False) -> Iterator[Rig]:
         robot = stack.enter_context(Robot("demo", locator, user="bench"))
         robot.enable()
         yield Rig(robot, locator, bus)
-        with contextlib.suppress(TrirailError):  # it may be in fault, which is told elsewhere
+        with contextlib.suppress(TrirailError):  # it may be in fault, which is reported elsewhere
             robot.disable()
 
 
 def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
-    """Write the configuration; return the file, and the locator of the service."""
+    """Write the configuration; return its file and the locator of the service."""
     config, locator = own_service.private(folder)
     text = config.read_text(encoding="utf-8")
     changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE)}
@@ -80,7 +80,7 @@ def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
 
 @contextlib.contextmanager
 def drives(config: Path, bus: str) -> Iterator[None]:
-    """The drives of a configuration in a process of their own."""
+    """Run the drives of a configuration in a process of their own."""
     command = [sys.executable, str(Path(__file__).with_name("bench_drives.py")), str(config), bus]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -92,7 +92,7 @@ def drives(config: Path, bus: str) -> Iterator[None]:
 
 
 def without_pause(robot: Robot, seconds: float, refused: Callable[[], None] = lambda: None) -> int:
-    """Send goal after goal, GOALS_HZ a second, for so long; return how many were taken. `refused` is told of others."""
+    """Send GOALS_HZ goals per second for `seconds`; return how many were accepted. Call `refused` for others."""
     choice, accepted = random.Random(1), 0
     due = began = time.monotonic()
     while time.monotonic() < began + seconds:

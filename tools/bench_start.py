@@ -1,4 +1,4 @@
-"""What a start costs: seconds and processor seconds until the service is up, then each process's memory."""
+"""Cost of a start: time and processor time until the service is up, then the memory of each process."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from trirail.telemetry.sinks import free_port
 
 TICK = os.sysconf("SC_CLK_TCK")
 REST = 3.0
-"""Seconds after which nothing of the start goes on."""
+"""Time after which the start has finished completely [s]."""
 WATCHED = 5.0
-"""Seconds over which a service at rest is watched."""
+"""Duration of the observation of a service at rest [s]."""
 
 
 def measure() -> dict[str, Any]:
-    """Start a service on simulated drives twice, and look at the second, which compiles nothing."""
+    """Start a service on simulated drives twice, and measure the second start, which compiles nothing."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
         for place in (Path(folder, "first"), Path(folder, "second")):
             place.mkdir()
@@ -47,12 +47,12 @@ def _start(folder: Path) -> dict[str, Any]:
 
 
 def _processor(pid: int) -> float:
-    """Return the processor time of a process and of its children that are over [s]."""
+    """Return the processor time of a process and of its finished children [s]."""
     spent = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[11:15]
     return sum(map(int, spent)) / TICK
 
 
 def _memory(pid: int) -> float:
-    """Return the memory of a process, with its share of what it has in common with others (PSS) [1e6 bytes]."""
+    """Return the memory of a process, with its share of memory common to several (PSS) [1e6 bytes]."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1024e-6

@@ -1,6 +1,6 @@
-"""Checks a log of CAN frames against CiA 301, CiA 402 and the robot's limits: what really was on the bus.
+"""Check of a log of the actual CAN frames against CiA 301, CiA 402 and the robot's limits.
 
-It knows the standards' tables by itself and shares no code with the driver, but for the layout of its PDOs.
+It has its own tables of the standards and shares no code with the driver except the layout of its PDOs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HELD = {
     "power": "controlwords and states in CiA 402's order, each state asked for, no power without a setpoint",
     "capture": "the service's own log has the same frames in the same order",
 }
-"""What is true where `problems` and `differences` find none."""
+"""Properties that hold if `problems` and `differences` find nothing."""
 
 STATES = {
     0x00: "not ready to switch on",
@@ -35,7 +35,7 @@ STATES = {
     0x0F: "fault reaction active",
     0x08: "fault",
 }
-"""Statusword 6041h: bits 0 to 3, 5 and 6, of which bit 5 says nothing in states with bit 3 or 6, or in the first."""
+"""Statusword 6041h: bits 0 to 3, 5 and 6; bit 5 has no meaning in the first state and in those with bit 3 or 6."""
 
 ASKED_BY = {
     ("not ready to switch on", "switch on disabled"): None,
@@ -53,17 +53,17 @@ ASKED_BY = {
     ("fault reaction active", "fault"): None,
     ("fault", "switch on disabled"): {0x80},
 }
-"""CiA 402's transitions, and the controlwords that ask for them; None for those that a drive makes by itself."""
+"""Transitions of CiA 402, and the controlwords that command them; None for those that a drive makes by itself."""
 
 FOLLOWS = {0x07: {0x06, 0x0F}, 0x0F: {0x07}}
-"""The controlwords that may go before one that leads towards power."""
+"""Controlwords that may precede one that leads towards power."""
 
 
 class Frame(NamedTuple):
     """A data frame with an 11-bit identifier."""
 
     t: float
-    """Seconds since 1970."""
+    """Time since 1970 [s]."""
     identifier: int
     data: bytes
 
@@ -73,9 +73,9 @@ class Setpoint(NamedTuple):
 
     t: float
     position: float
-    """Of the slider [m]."""
+    """Position of the slider [m]."""
     velocity: float
-    """The feed-forward [m/s]."""
+    """Velocity feed-forward [m/s]."""
 
 
 def read(path: Path) -> list[Frame]:
@@ -86,7 +86,7 @@ def read(path: Path) -> list[Frame]:
 
 
 def problems(log: Sequence[Frame], config: Config, missed: int, until: float) -> list[str]:
-    """Return what is wrong in the frames before the time `until`, a line each; `missed` ticks the service told of."""
+    """Return the errors in the frames before the time `until`, one line each; the service reported `missed` ticks."""
     log = [frame for frame in log if frame.t < until]
     found = sync_problems(log, config.period, missed, until)
     for name, drive in zip(NAMES, config.drives.each, strict=True):
@@ -96,7 +96,7 @@ def problems(log: Sequence[Frame], config: Config, missed: int, until: float) ->
 
 
 def sync_problems(log: Sequence[Frame], period: float, missed: int, until: float) -> list[str]:
-    """Return what is wrong with the SYNCs before the time `until`, for a cycle of `period` seconds."""
+    """Return the errors of the SYNCs before the time `until`, for a cycle of `period` seconds."""
     syncs = [frame.t for frame in log if frame.identifier == layout.SYNC and frame.t < until]
     if len(syncs) < 3:
         return [f"SYNC: {len(syncs)} in the log: nothing ran"]
@@ -104,19 +104,19 @@ def sync_problems(log: Sequence[Frame], period: float, missed: int, until: float
 
 
 def differences(own: Sequence[Frame], log: Sequence[Frame], until: float) -> list[str]:
-    """Return where the frames in the service's own log, before `until`, are no run of those on the bus."""
+    """Return the identifiers whose frames in the service's log, before `until`, are no contiguous run on the bus."""
     here, there = _by_identifier([frame for frame in own if frame.t < until]), _by_identifier(log)
     found = []
     for identifier, said in here.items():
         heard = there.get(identifier, [])
-        # Its log begins and ends at other times.
+        # The two logs begin and end at different times.
         if not any(heard[start : start + len(said)] == said for start in range(len(heard) - len(said) + 1)):
             found.append(f"identifier {identifier:03X}: {len(said)} frames in the service's log, but others on the bus")
     return found
 
 
 def statistics(log: Sequence[Frame], config: Config, until: float) -> dict[str, float]:
-    """Return numbers for people: how many frames, and the intervals of SYNC [ms]."""
+    """Return statistics: numbers of frames, and intervals of SYNC [ms]."""
     log = [frame for frame in log if frame.t < until]
     syncs = [frame.t for frame in log if frame.identifier == layout.SYNC]
     intervals = sorted(after - before for before, after in itertools.pairwise(syncs))
@@ -138,10 +138,10 @@ def _by_identifier(log: Sequence[Frame]) -> dict[int, list[bytes]]:
 
 
 def _sync_problems(syncs: Sequence[float], period: float, missed: int) -> Iterator[str]:
-    """Ticks come on a grid that begins with the first one: late ones are skipped, never made up for."""
+    """Yield deviations of the ticks from the grid that the first one starts: late ticks are skipped, not caught up."""
     began = syncs[0]
     for number, t in enumerate(syncs):
-        # Not before its place on the grid, less what the first one was late itself.
+        # No tick is earlier than its place on the grid minus the lateness of the first one.
         if t - began < (number - 1) * period:
             early = number * period - (t - began)
             yield f"SYNC {number} comes {early:.4f} s too early: ticks were caught up in a burst"
@@ -164,7 +164,7 @@ def _setpoints(log: Sequence[Frame], drive: Drive) -> list[Setpoint]:
 
 
 def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> Iterator[str]:
-    """Within the limits, and continuous: each step is a velocity, each change of it an acceleration in the limits."""
+    """Yield violations of limits and continuity: each step is a velocity, each change of it an acceleration."""
     limits, period, leg = config.limits.slider, config.period, config.drives.each.index(drive)
     velocity, acceleration = limits.velocities[leg], limits.accelerations[leg]
     count = 1.0 / drive.counts_per_metre
@@ -182,7 +182,7 @@ def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> It
         step = after.position - before.position
         if abs(step) > velocity * period + 2 * count:
             yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}: {abs(step) / period:.3f} m/s"
-        # Velocity changes within the step by a·T at most, so that the step is its mean over the period.
+        # Velocity changes by at most a·T within the step, so that the step equals its mean times the period.
         mean = 0.5 * (before.velocity + after.velocity) * period
         if abs(step - mean) > 0.25 * acceleration * period**2 + 3 * count:
             yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}, but its feed-forward says {mean * 1e3:.4f} mm"
@@ -199,9 +199,9 @@ def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> It
 
 
 def _power_problems(log: Sequence[Frame], node: int) -> Iterator[str]:
-    """The order of controlwords, and the states that follow from them."""
+    """Yield errors in the order of controlwords and in the resulting states."""
     word, state = 0x00, ""
-    words = {0x00}  # sent since the drive last told of a change
+    words = {0x00}  # sent since the drive last reported a change
     setpoint = started = False
     for frame in log:
         if frame.identifier == layout.NMT and frame.data[0] == layout.NMT_START and frame.data[1] in {0, node}:

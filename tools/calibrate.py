@@ -1,11 +1,11 @@
-"""Identifies the geometry of a robot as built from measured poses, and writes its [geometry] section.
+"""Identification of a robot's geometry as built from measured poses, written as its [geometry] section.
 
 python tools/calibrate.py poses.csv --config robot.toml --output geometry.toml
 python tools/calibrate.py poses.csv --config robot.toml --map --output as_built.toml
 
-With --map it leaves the geometry as it is, and writes the map of what the robot still does beside it, for [correction].
-The file has the columns x, y, phi, A, B, C: where an outside instrument saw the platform, and what the sliders
-read there, in metres and radians. kinematics.calibration has the mathematics. The report goes to standard error.
+With --map it keeps the geometry and writes the map of the robot's remaining deviations from it, for [correction].
+The file has the columns x, y, phi, A, B, C: poses of the platform measured by an external instrument, and the slider
+readings there, in metres and radians. kinematics.calibration has the mathematics. The report goes to standard error.
 Needs trirail[analysis].
 """
 
@@ -39,9 +39,9 @@ counted from: both stay as in the starting geometry."""
 
 
 def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]:
-    """Return poses (N, 3) and sliders (N, 3) in m and rad, and the lines on which they stand.
+    """Return poses (N, 3) and sliders (N, 3) in m and rad, and their line numbers.
 
-    Raises FileError, or CalibrationError with the line of what is wrong.
+    Raises FileError, or CalibrationError with the line of the error.
     """
     rows: list[list[float]] = []
     lines: list[int] = []
@@ -62,7 +62,7 @@ def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]
 
 
 def _numbers(names: Sequence[str], fields: Sequence[str], line: int, bare: str) -> list[float]:
-    """Return the fields of a row in SI, in the order of COLUMNS; an angle without a unit is in `bare`."""
+    """Return the fields of a row in SI units, in the order of COLUMNS; an angle without a unit is in `bare`."""
     if len(fields) != len(names):
         raise CalibrationError(f"line {line}: {len(fields)} fields; wanted are {len(names)}")
     given = dict(zip(names, fields, strict=True))
@@ -87,7 +87,7 @@ def section(geometry: Geometry) -> str:
 
 
 def describe(found: Calibration, lines: Sequence[int]) -> str:
-    """Return the report for people."""
+    """Return the report as text."""
     said = [f"{len(lines)} poses; the residuals are {found.misfit:.2f} times the stated noise", ""]
     said.append(f"{'residual':<36}{'rms':>10}{'greatest':>12}")
     for (name, unit, scale), column in zip(COORDINATES, np.abs(found.residuals.T), strict=True):
@@ -135,7 +135,7 @@ def calibrate(options: argparse.Namespace) -> None:
 
 
 def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders: Array) -> str:
-    """Fit the map, report, and return its file. Raises CalibrationError, also where the service would refuse it."""
+    """Fit the map, report, and return its file. Raises CalibrationError, also if the service would refuse it."""
     limits = config.load(options.config).limits
     try:
         found = correction_fit.fit(robot, poses, sliders, config.room(limits), options.cells)
@@ -146,7 +146,7 @@ def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders
             high=found.correction.high,
             nodes=found.correction.nodes.tolist(),
         )
-        text = as_built.written(made)
+        text = as_built.format_map(made)
         config.check_as_built(as_built.parse(text), robot, limits)
     except (CalibrationError, ConfigError) as error:
         raise CalibrationError(f"{options.poses}: {error}") from error
@@ -155,12 +155,12 @@ def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders
 
 
 def describe_map(found: correction_fit.Fit) -> str:
-    """Return the report on a map for people."""
+    """Return the report on a map as text."""
     cells = math.prod(found.correction.cells)
     said = [f"{len(found.before)} poses; {found.empty} of {cells} cells have none, and what is there comes from beside"]
     said += ["", f"{'pose error: rms, greatest':<28}{'measured':>18}{'left':>18}{'left if not measured':>24}"]
     for k, (name, unit, scale) in enumerate(COORDINATES):
-        columns = [np.abs(each[:, k]) * scale for each in (found.before, found.residuals, found.foretold)]
+        columns = [np.abs(each[:, k]) * scale for each in (found.before, found.residuals, found.predicted)]
         told = [f"{math.sqrt(np.mean(each**2)):.2f}, {each.max():.2f}" for each in columns]
         said.append(f"{f'{name} [{unit}]':<28}{told[0]:>18}{told[1]:>18}{told[2]:>24}")
     return "\n".join(said)
@@ -178,12 +178,12 @@ def write(text: str, output: Path | None) -> None:
 
 
 def length(text: str) -> float:
-    """Return a length of the command line [m]. Raises ValueError."""
+    """Parse a length from the command line [m]. Raises ValueError."""
     return quantity(text, LENGTH)
 
 
 def angle(text: str) -> float:
-    """Return an angle of the command line [rad]. Raises ValueError."""
+    """Parse an angle from the command line [rad]. Raises ValueError."""
     return quantity(text, ANGLE)
 
 

@@ -40,11 +40,11 @@ HARM: dict[str, tuple[signal.Signals, float | None]] = {
 }
 GOAL = "chaos"
 STANDS_AFTER = 3.0
-"""A robot that nobody can stop any more must stand by then [s]."""
+"""Time limit for standstill of a robot that no process can stop any more [s]."""
 
 
 class Case(NamedTuple):
-    """One thing that happens."""
+    """Single disturbance of a process in a mode."""
 
     mode: str
     victim: str
@@ -52,25 +52,25 @@ class Case(NamedTuple):
 
     @property
     def ends_the_service(self) -> bool:
-        """Whether the service ends by it."""
+        """Whether it ends the service."""
         if self.victim == "fork-server":
             return self.harm == "KILL"
         return self.victim == "loop" or (self.victim == "supervisor" and self.harm in ("KILL", "TERM"))
 
     @property
     def stops_the_robot(self) -> bool:
-        """Whether the robot is to stand soon afterwards."""
+        """Whether the robot must be at rest soon afterwards."""
         return self.ends_the_service or self.victim == "gateway"
 
     @property
     def exit_codes(self) -> tuple[int, ...]:
-        """What the service may exit with in the end."""
+        """Permitted exit codes of the service."""
         if self.victim == "supervisor":
             return (0,) if self.harm not in {"KILL", "STOP"} else (-signal.SIGKILL,)
         if self.victim == "loop" or (self.victim, self.harm) == ("fork-server", "KILL"):
             return (1,)
-        # A recorder that is frozen as the service ends is killed: what it had is lost, which is a failure. A frozen
-        # fork server does not say how the others have ended, which may have been one.
+        # A recorder that is frozen as the service ends is killed and loses its data, which is a failure. A frozen
+        # fork server does not report how the others have ended, which may have been a failure.
         return (0, 1) if self.victim in ("recorder", "fork-server") and self.harm == "STOP" else (0,)
 
     def __str__(self) -> str:
@@ -81,14 +81,14 @@ CASES = [Case(*case) for case in itertools.product(MODES, PROCESSES, HARM)]
 
 
 def bring_to(mode: str, rig: Rig, robot: Robot, ask: Callable[[str], object]) -> None:
-    """Bring a robot that is disabled to a mode; the goal that is sent for it is GOAL.
+    """Bring a disabled robot to a mode, by the goal GOAL if it needs one.
 
-    `ask` sends a command and does not wait until it has been carried out.
+    `ask` sends a command and does not wait for its execution.
     """
     if mode == "disabled":
         return
     if mode == "enabling":
-        rig.fault("A drop rpdo1")  # and so drive A does not hear that it is to power up
+        rig.fault("A drop rpdo1")  # keeps drive A from receiving the command to power up
         ask("enable")
         states(robot, lambda state: state.mode == "enabling")
         return
@@ -106,7 +106,7 @@ def bring_to(mode: str, rig: Rig, robot: Robot, ask: Callable[[str], object]) ->
 
 
 def run(rig: Rig, case: Case) -> None:
-    """Let a case happen to a service that is up and disabled, and check what becomes of it. Raises Failed."""
+    """Apply a case to a service that is up and disabled, and check the outcome. Raises Failed."""
     heard: list[str] = []
     victim = rig.process(case.victim)
     faults = rig.major_faults()
@@ -117,7 +117,7 @@ def run(rig: Rig, case: Case) -> None:
         stands_by = time.monotonic() + STANDS_AFTER
     if seconds is not None:
         time.sleep(seconds)
-        with contextlib.suppress(ProcessLookupError):  # it may have been killed for being frozen
+        with contextlib.suppress(ProcessLookupError):  # the service may have killed the frozen process
             os.kill(victim, signal.SIGCONT)
     rig.fault("clear")
     if case.ends_the_service:
@@ -144,7 +144,7 @@ def run(rig: Rig, case: Case) -> None:
 
 
 def _go_on(rig: Rig, case: Case) -> list[str]:
-    """Check that the service goes on and can be told to stop; return what has been heard of the goal's end."""
+    """Check that the service continues and obeys a stop; return the reported end of the goal."""
     if case.stops_the_robot:
         time.sleep(STANDS_AFTER)
         rig.check_rest()
@@ -167,7 +167,7 @@ def _wait_end(rig: Rig) -> None:
 
 
 def _check_goal(rig: Rig, case: Case, heard: list[str]) -> None:
-    """Check that the recording can be read and that the goal has ended once in it."""
+    """Check that the recording is readable and contains exactly one end of the goal."""
     recorded: dict[int, str] = {}
     sent = False
     for recording in rig.recordings():
@@ -179,13 +179,13 @@ def _check_goal(rig: Rig, case: Case, heard: list[str]) -> None:
         return
     if len(heard) > 1 or len(recorded) > 1:
         raise Failed(f"the goal has ended more than once: {heard} {recorded}")
-    # What happens while there is no recorder is in no recording.
+    # Without a recorder, events are in no recording.
     if not recorded and (case.victim != "recorder" or not heard):
         raise Failed("how the goal has ended is in no recording")
 
 
 def attempt(rig: Rig, case: Case) -> str:
-    """Return "ok" or what failed; leave a service that is up and disabled."""
+    """Return "ok" or the failure; leave a service that is up and disabled."""
     found = "ok"
     try:
         run(rig, case)
@@ -208,7 +208,7 @@ def attempt(rig: Rig, case: Case) -> str:
 
 
 def main() -> int:
-    """Run the cases that are asked for; print a table, or with --json one object."""
+    """Run the selected cases; print a table, or with --json one object."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--sample", type=int, help="so many cases, by chance")
     arguments.add_argument("--seed", type=int, default=0, help="of the chance")

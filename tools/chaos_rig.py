@@ -1,4 +1,4 @@
-"""What tools/chaos.py does its harm to: drives in a process of their own, a service beside them, and who listens."""
+"""Test rig of tools/chaos.py: drives in a process of their own, a service, and a listener on the bus."""
 
 from __future__ import annotations
 
@@ -21,18 +21,20 @@ from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError, TrirailError
 from trirail.processes.operating_system import child
-from trirail.telemetry.reading import Recording, read
+from trirail.telemetry.reading import read
+from trirail.telemetry.recording import Recording
 from trirail.telemetry.sinks import HOST, free_port
 from trirail.wire.state import State
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import canopen_frames
+from trirail_drivers.errors import BusError
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 20.0
-"""How long anything may take that has to come [s]."""
+"""Time limit for any expected event [s]."""
 PROCESSES = ("supervisor", "fork-server", "gateway", "loop", "planner", "recorder")
 NODES = (1, 2, 3)
-# Three processes share what may be a slow machine: a rate and watchdogs that leave them time.
+# Rate and watchdogs leave enough time for three processes on a machine that may be slow.
 CHANGES = {
     "rate_hz": "100",
     "missed_syncs": "30",
@@ -43,11 +45,11 @@ CHANGES = {
 
 
 class Failed(Exception):
-    """Something is not as it has to be."""
+    """A requirement is violated."""
 
 
 def wait_for(condition: Callable[[], bool], what: str, within: float = PATIENCE) -> None:
-    """Wait until something holds. Raises Failed."""
+    """Wait until a condition holds. Raises Failed."""
     deadline = time.monotonic() + within
     while not condition():
         if time.monotonic() > deadline:
@@ -55,8 +57,17 @@ def wait_for(condition: Callable[[], bool], what: str, within: float = PATIENCE)
         time.sleep(0.01)
 
 
+def _connect(path: Path, buses: list[UnixBus]) -> bool:
+    """Connect to a bus once it has a listener: its path exists earlier."""
+    try:
+        buses.append(UnixBus(str(path)))
+    except BusError:
+        return False
+    return True
+
+
 class Rig:
-    """Drives on a bus between processes, and one service after the other on it."""
+    """Drives on a bus between processes, with successive services on it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -73,8 +84,9 @@ class Rig:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
         )
-        wait_for(self.bus_path.exists, "virtual drives")
-        self._bus = UnixBus(str(self.bus_path))
+        buses: list[UnixBus] = []
+        wait_for(lambda: _connect(self.bus_path, buses), "virtual drives")
+        (self._bus,) = buses
         self._lock = threading.Lock()
         self._heard: list[can.Message] = []
         self._closing = False
@@ -97,7 +109,7 @@ class Rig:
         return text
 
     def close(self) -> None:
-        """End the drives."""
+        """Stop the drives."""
         self._closing = True
         self._drives.terminate()
         self._drives.wait(PATIENCE)
@@ -116,15 +128,15 @@ class Rig:
 
     @property
     def locator(self) -> str:
-        """Where the service is."""
+        """Locator of the service."""
         return f"tcp/{HOST}:{self.ports[0]}"
 
     def robot(self) -> Robot:
-        """A client."""
+        """Return a client."""
         return Robot("demo", self.locator, user="chaos")
 
     def served(self) -> Robot:
-        """A client of a service that answers, by and by."""
+        """Return a client once the service answers."""
         deadline = time.monotonic() + PATIENCE
         while True:
             robot: Robot | None = None
@@ -140,32 +152,32 @@ class Rig:
                 return robot
 
     def process(self, name: str) -> int:
-        """Process id of one of PROCESSES."""
+        """Return the process id of one of PROCESSES."""
         return self.service.pid if name == "supervisor" else child(self.service.pid, name)
 
     def major_faults(self) -> int:
-        """Pages that the loop has had to wait for a disk for."""
+        """Return the number of pages for which the loop had to wait for a disk."""
         return int(Path(f"/proc/{self.process('loop')}/stat").read_text().rpartition(")")[2].split()[9])
 
     def fault(self, line: str) -> None:
-        """Tell the drives of a fault: trirail_drivers.simulated.faultlines."""
+        """Inject a fault into the drives, in the language of trirail_drivers.simulated.faultlines."""
         if self._drives.stdin is not None:
             self._drives.stdin.write(line.encode() + b"\n")
             self._drives.stdin.flush()
 
     def remains(self) -> list[int]:
-        """Process ids of the service's processes that are still there."""
+        """Return the ids of the service's remaining processes."""
         found = []
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
-                # Forked processes have neither arguments nor, for sure, an environment of their own.
+                # Forked processes have no arguments, and not necessarily an environment, of their own.
                 speaks_to = (entry / "fd" / "1").readlink()
                 if speaks_to.is_relative_to(self.folder) and b"virtual_drives" not in (entry / "cmdline").read_bytes():
                     found.append(int(entry.name))
         return found
 
     def clean_up(self) -> None:
-        """Leave nothing of a service to the next one."""
+        """Remove everything that a service could leave to the next one."""
         for process in self.remains():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
@@ -176,28 +188,28 @@ class Rig:
         self._log.close()
 
     def recordings(self) -> list[Recording]:
-        """All that the service has recorded; Failed where a file cannot be read."""
+        """Return all recordings of the service. Raises Failed if a file cannot be read."""
         found = []
         for file in sorted((self.folder / "recordings").glob("*.rrd")):
             if file.name.startswith("fault-"):
                 continue
             try:
                 found.append(read(file))
-            except EmptyRecordingError:  # a recorder that took a dead one's place, just before the service ended
+            except EmptyRecordingError:  # a recorder that replaced a dead one just before the service ended
                 continue
             except ServiceError as error:
                 raise Failed(str(error)) from error
         return found
 
     def warnings(self) -> str:
-        """What the service has warned of, for people who look for the cause of a failure."""
+        """Return the service's warnings, to find the cause of a failure."""
         with contextlib.suppress(Failed):
             lines = [line for recording in self.recordings() for line in recording.events]
             return " | ".join(f"{line.t:.2f} s {line.text}" for line in lines if line.level != "INFO")
         return ""
 
     def ports_are_free(self) -> bool:
-        """Whether both ports can be listened on."""
+        """Return whether both ports are free."""
         for port in self.ports:
             with socket.socket() as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -220,7 +232,7 @@ class Rig:
                     self._heard.append(message)
 
     def ask(self, node: int, index: int) -> int:
-        """Ask a drive for an object, by SDO."""
+        """Read an object of a drive by SDO."""
         with self._lock:
             begin = len(self._heard)
         request = struct.pack("<BHB4x", 0x40, index, 0)
@@ -242,7 +254,7 @@ class Rig:
         return answers()[0]
 
     def check_rest(self) -> None:
-        """Failed where a drive moves."""
+        """Raise Failed if a drive moves."""
         before = [self.ask(node, 0x6064) for node in NODES]
         time.sleep(0.2)
         moved = [self.ask(node, 0x6064) - position for node, position in zip(NODES, before, strict=True)]
@@ -250,13 +262,13 @@ class Rig:
             raise Failed(f"the drives move: {moved} counts in 0.2 s")
 
     def check_unpowered(self) -> None:
-        """Failed where a drive follows setpoints still."""
+        """Raise Failed if a drive still follows setpoints."""
         words = [self.ask(node, 0x6041) & 0x6F for node in NODES]
         if 0x27 in words:
             raise Failed(f"drives are enabled still: statuswords {words}")
 
     def check_setpoints(self) -> None:
-        """Failed where the setpoints step, in position or in velocity."""
+        """Raise Failed if the setpoints step, in position or in velocity."""
         for node in NODES:
             for setpoints in self._followed(node):
                 step, bend = (np.abs(np.diff(setpoints, order)).max(initial=0.0) for order in (1, 2))
@@ -266,7 +278,7 @@ class Rig:
                     raise Failed(f"drive {node}: the velocity of setpoints steps by {bend / self.period:.3f} m/s")
 
     def _followed(self, node: int) -> list[np.ndarray[tuple[int], np.dtype[np.float64]]]:
-        """The setpoints of a drive while it was told to follow them [m]: else they are what is measured."""
+        """Return the setpoints of a drive while commanded to follow them [m]; otherwise they are measured positions."""
         runs: list[list[float]] = []
         told = 0
         with self._lock:
@@ -287,12 +299,12 @@ class Rig:
 def _python(*arguments: str) -> list[str]:
     from trirail.processes.operating_system import python
 
-    # A tool finds its neighbours by its own folder, which -P would leave out; the current one is not on its path.
+    # A tool imports others from its own folder, which -P would exclude; the current folder is not on its path.
     return [python()[0], *arguments]
 
 
 def states(robot: Robot, condition: Callable[[State], bool]) -> State:
-    """Return the first state for which something holds. Raises Failed."""
+    """Return the first state that satisfies a condition. Raises Failed."""
     deadline = time.monotonic() + PATIENCE
     for state in robot.states(timeout=PATIENCE):
         if condition(state):

@@ -1,4 +1,4 @@
-"""What the source says of a type's fields: the string below each, which Python itself throws away."""
+"""Docstrings of a type's fields: the string below each in the source, which Python itself discards."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from msgspec import Struct
 
 
 def fields(kind: type) -> dict[str, str]:
-    """Return the docstring of each field of a Struct that has one, its own or inherited, on one line."""
+    """Return the docstring, own or inherited, of each documented field of a Struct or NamedTuple, on one line."""
+    end = Struct if issubclass(kind, Struct) else tuple
     return {
         field: text
-        for each in reversed(kind.__mro__[: kind.__mro__.index(Struct)])
+        for each in reversed(kind.__mro__[: kind.__mro__.index(end)])
         for field, text in _of_module(each.__module__).get(each.__name__, {}).items()
     }
 

@@ -1,4 +1,4 @@
-"""The loop equation of a leg of either mechanism, solved in 60-digit arithmetic: nothing of the service is in it."""
+"""Loop equation of a leg of either mechanism, solved in 60-digit arithmetic without code of the service."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Point = tuple[Decimal, Decimal]
 
 
 def cos_sin(angle: float | Decimal) -> Point:
-    """Return cosine and sine by their series."""
+    """Return cosine and sine from their series."""
     with localcontext() as context:
         context.prec = DIGITS + 10
         x, term = Decimal(angle), Decimal(1)
@@ -30,7 +30,7 @@ def travels(
     turns: bool,
     pose: Sequence[float | Decimal],
 ) -> tuple[Decimal, Decimal]:
-    """Return where slider and cross slide are with the platform at a pose [m].
+    """Return the positions of slider and cross slide for a pose of the platform [m].
 
     anchor + (home + slider) u(rail) + passive u(cross) = G + R(phi) held, with the cross slide's direction turned by
     phi if it `turns`: Cramer's rule.

@@ -29,28 +29,28 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 NICE = 10
-"""What the machine has beside to do comes first."""
+"""Nice value, which gives other work of the machine precedence."""
 TIMEOUT = 600
-"""So long may a test take that tries its usual number of examples, and makes what it finds small [s]."""
+"""Time limit of a test that tries its usual number of examples and shrinks its findings [s]."""
 SAID_EVERY = 30.0
-"""Progress [s]."""
+"""Interval of progress messages [s]."""
 GRACE = 20.0
-"""So long may a test take to put away what it has begun [s]."""
+"""Time limit for a test to clean up [s]."""
 
 
 class Summary(NamedTuple):
-    """What was tried and found so far."""
+    """Examples tried and findings up to now."""
 
     tests: int
-    """That there are."""
+    """Number of tests."""
     examples: Counter[str]
-    """By test."""
+    """Number of examples by test."""
     findings: dict[str, dict[str, str]]
-    """By test: the first error, and the line that keeps it."""
+    """First error, and the line that preserves it, by test."""
 
     @classmethod
     def of(cls, lines: Sequence[dict[str, Any]]) -> Summary:
-        """Sum up what rounds have told."""
+        """Summarise the output of rounds."""
         examples: Counter[str] = Counter()
         findings: dict[str, dict[str, str]] = {}
         for line in lines:
@@ -66,7 +66,7 @@ class Summary(NamedTuple):
         return f"{self.examples.total():,} examples of {tried} of {self.tests} tests, {len(self.findings)} findings"
 
     def lines(self) -> Iterator[str]:
-        """Yield it line by line, for people."""
+        """Yield the summary as text, line by line."""
         for test, count in sorted(self.examples.items()):
             yield f"{count:10,}  {test}"
         for test, found in self.findings.items():
@@ -75,7 +75,7 @@ class Summary(NamedTuple):
 
 
 class Core:
-    """Rounds of the generated tests, one after another, each in a process of its own."""
+    """Successive rounds of the generated tests, each in a process of its own."""
 
     def __init__(self, folder: Path, number: int, seed: int, only: str) -> None:
         self.found = folder / f"{number}.jsonl"
@@ -89,13 +89,13 @@ class Core:
         command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-k", self._only, f"--found={self.found}"]
         command += [f"--explore={self._chance.randrange(2**32)}", f"--effort={self._effort}"]
         command += [f"--timeout={TIMEOUT * self._effort}"]
-        with self._log.open("wb") as log:  # Ctrl-C is for this program alone, which ends them in good order
+        with self._log.open("wb") as log:  # only this program handles Ctrl-C, and ends the rounds in order
             self._process = subprocess.Popen(
                 ["nice", "-n", str(NICE), *command], cwd=ROOT, stdout=log, stderr=log, start_new_session=True
             )
 
     def go_on(self) -> str | None:
-        """Begin the next round if one is over; return why there can be none."""
+        """Start the next round if the last one is over; return the reason if none can start."""
         code = self._process.poll()
         if code is None:
             return None
@@ -106,12 +106,12 @@ class Core:
         return None
 
     def interrupt(self) -> None:
-        """Have the test under way put away what it has begun."""
+        """Ask the running test to clean up."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGINT)
 
     def end(self) -> None:
-        """Wait for that, not for ever."""
+        """Wait for the end, up to a time limit."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE)
         with contextlib.suppress(ProcessLookupError):
@@ -119,7 +119,7 @@ class Core:
         self._process.wait()
 
     def lines(self) -> list[dict[str, Any]]:
-        """Return what its rounds have told so far; a line that is being written is not yet one."""
+        """Return the output of its rounds, without a line that is incomplete."""
         if not self.found.exists():
             return []
         whole = self.found.read_text(encoding="utf-8").rpartition("\n")[0]
@@ -127,7 +127,7 @@ class Core:
 
 
 def explore(cores: Sequence[Core], seconds: float) -> str | None:
-    """Let them go on for so long, and say so; return why they could not, "" where they were interrupted."""
+    """Run for the given time and report progress; return the reason for an early end, "" for an interrupt."""
     begun = said = time.monotonic()
     trouble = None
     try:
@@ -148,12 +148,12 @@ def explore(cores: Sequence[Core], seconds: float) -> str | None:
 
 
 def summary(cores: Sequence[Core]) -> Summary:
-    """Return what all of them have told so far."""
+    """Return the combined output of all explorers."""
     return Summary.of([line for core in cores for line in core.lines()])
 
 
 def main() -> int:
-    """Explore for as long as is asked; print what was tried and found, or with --json one object."""
+    """Explore for the requested time; print the summary, or with --json one object."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("minutes", type=float)
     arguments.add_argument("--only", default="", help="tests whose name or file contains this, as pytest -k has it")
@@ -162,7 +162,7 @@ def main() -> int:
     options = arguments.parse_args()
     signal.signal(
         signal.SIGINT, signal.default_int_handler
-    )  # a shell has it ignored in the background, and pytest then
+    )  # a shell ignores it for background jobs, and pytest inherits that
     seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
     with tempfile.TemporaryDirectory(prefix="trirail-explore-") as folder:
         cores = [Core(Path(folder), number, seed, options.only) for number in range(os.cpu_count() or 1)]

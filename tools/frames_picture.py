@@ -33,7 +33,7 @@ def draw(file: Path) -> None:
     """Draw the robot at its centre and moved, in millimetres, with all that is counted."""
     limits = load(SIM).limits.slider
     robot = Geometry.symmetric(0.3)
-    parts = RobotParts.of(robot, limits)
+    parts = RobotParts.from_geometry(robot, limits)
     figure = Figure(figsize=(12.0, 5.9), dpi=150, layout="constrained")
     centre, moved = figure.subplots(1, 2, sharex=True, sharey=True)
     x, y, phi = MOVED
@@ -54,11 +54,11 @@ def _robot(panel: Axes, robot: Geometry, parts: RobotParts, pose: tuple[float, f
     """Draw rails, platform and sliders, each with where it is."""
     for rail in parts.rails:
         panel.plot(*(1e3 * rail.T), color=RAIL, linewidth=7.0, solid_capstyle="round", zorder=1)
-    for line in part_positions.placed(parts.outline, pose):
+    for line in part_positions.transform_lines(parts.outline, pose):
         panel.add_patch(Polygon(1e3 * line, facecolor=PLATFORM, alpha=0.13, zorder=3))
         panel.plot(*(1e3 * line.T), color=PLATFORM, linewidth=2.0, solid_joinstyle="round", zorder=4)
     positions = inverse(robot, pose).position
-    at = part_positions.sliders(robot, positions[None])[0]
+    at = part_positions.slider_points(robot, positions[None])[0]
     panel.plot(*(1e3 * at.T), "o", color="white", markeredgecolor=SLIDER, markersize=10, markeredgewidth=2.4, zorder=6)
     for name, slider, outward, position in zip("ABC", at, _outward(parts), positions, strict=True):
         value = f"{position * 1e3:+.0f} mm".replace("-", "−") if abs(position) > 1e-9 else "0"

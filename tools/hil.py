@@ -1,11 +1,11 @@
-"""Hardware in the loop, without the hardware: the service on real SocketCAN, in an emulated machine.
+"""Hardware-in-the-loop test without hardware: the service on real SocketCAN, in an emulated machine.
 
-python tools/hil.py               boots Debian's kernel in QEMU with two CAN cards on one bus; minutes
-make hil                          the same, and installs what it needs where that is possible
+python tools/hil.py               boots Debian's kernel in QEMU with two CAN cards on one bus; takes minutes
+make hil                          the same, and installs missing packages if possible
 
-Inside, tools/hil_guest.py runs the service on can0, virtual drives on can1 and a client; then a second service on
-vcan0 at another rate, with a drive that is homed and one that others made; then pytest the tests that are marked vcan.
-The frames on both buses are checked here, by tools/bus_log.py and by Wireshark's dissector.
+In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1 and a client; then a second one on
+vcan0 at another rate, with a drive that is homed and a third-party one; then pytest runs the tests marked vcan.
+tools/bus_log.py and Wireshark's dissector check the frames on both buses, outside the machine.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ CHANGES = {
     "rate_hz = 1000": "rate_hz = 20",
     "heartbeat = 0.1": "heartbeat = 1.0",
     "enable_timeout = 5.0": "enable_timeout = 30.0",
-    # Feedback is one SYNC old and a setpoint one ahead: at 0.1 m/s and 20 Hz that alone is 10 mm.
+    # Feedback is one SYNC old and a setpoint one ahead, which alone is 10 mm at 0.1 m/s and 20 Hz.
     "following_error = 0.002 ": "following_error = 0.03 ",
     "following_error = 0.0025": "following_error = 0.04",
     "live_port = 9876": "live_port = 0",
     "[watchdogs]\n": "[watchdogs]\ngateway_timeout = 3.0\n",
 }
-"""What the machine's configuration has that differs from configs/socketcan.toml."""
+"""Differences of the machine's configuration from configs/socketcan.toml."""
 LOGS = ("service", "drives", "second-service", "second-drives", "foreign")
-"""What is shown of a run that failed."""
+"""Logs shown after a failed run."""
 NOT_SHOWN = (
     "lateness, jitter and 1 kHz: the processor is emulated, ten to twenty times slower and without a clock of its own",
     "bit errors, arbitration, a bus that is full, error-passive and bus-off: the emulated cards delay nothing, and "
@@ -49,15 +49,15 @@ NOT_SHOWN = (
     "cable, terminators, bitrates that differ, transceivers, and the drivers of USB adapters: there is no wire",
     "what maker's firmware does beyond its dictionary, motors, brakes, power: every drive is a program",
 )
-"""What an emulated machine cannot show, whatever holds in it."""
+"""Properties that an emulated machine cannot test."""
 
 
 class Stalled(Failed):
-    """A card lost frames, for the host stood still while more came than the 64 bytes it has room for."""
+    """A card lost frames, because more arrived during a stall of the host than its 64 bytes of memory hold."""
 
 
 def main() -> int:
-    """Run it; exit code 0 only if everything held."""
+    """Run the test; return exit code 0 only if all checks passed."""
     parser = argparse.ArgumentParser(description="The service on real SocketCAN, in a machine that QEMU emulates.")
     parser.add_argument("--install", action="store_true", help="install missing Debian packages first (as root)")
     parser.add_argument("--timeout", type=float, default=1500.0, help="of the whole run [s]; default 1500")
@@ -105,7 +105,7 @@ def main() -> int:
 
 
 class Progress:
-    """Prints lines with the time since the start."""
+    """Printer of lines with the time since the start."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -121,7 +121,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 
 def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict[str, Any]) -> None:
-    """Boot, run both robots and the tests, check the frames. Raises Failed; Stalled where to try again makes sense."""
+    """Boot, run both robots and the tests, check the frames. Raises Failed, or Stalled if a retry makes sense."""
     config = configure(folder)
     say("compiling the kinematics for the emulated processor, beside what follows")
     with compiling(folder):
@@ -142,7 +142,7 @@ def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict
 
 
 def judge(folder: Path, config: Config, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:
-    """Look at what the machine left. Raises Failed."""
+    """Check the results of the machine. Raises Failed."""
     if result["failure"]:
         raise Failed(f"{result['failure']}{_logs(folder, *LOGS)}")
     code = (folder / "vcan.code").read_text().strip() if (folder / "vcan.code").exists() else "none"
@@ -159,13 +159,13 @@ def judge(folder: Path, config: Config, result: dict[str, Any], say: Progress, r
 
 
 def configure(folder: Path) -> Config:
-    """Write the machine's configurations: configs/socketcan.toml with CHANGES, and the second robot's from that."""
+    """Write the machine's configurations: configs/socketcan.toml with CHANGES, and from it that of the second robot."""
     text = (ROOT / "configs/socketcan.toml").read_text()
     memory = "/dev/shm"
     changes = CHANGES | {
         'listen = ["tcp/127.0.0.1:7447"]': f'listen = ["unixsock-stream/{memory}/zenoh"]',
         'directory = "recordings"': f'directory = "{memory}/recordings"',
-        # A stalled host stalls the drives with the loop: that is no loss of SYNC.
+        # A stall of the host affects the drives like the loop, so it must not count as a loss of SYNC.
         "[drives]\n": "[can.simulated]\nmissed_syncs = 40\n\n[drives]\nsdo_timeout = 10.0\n",
     }
     for before, after in changes.items():
@@ -187,7 +187,7 @@ def _result(folder: Path) -> dict[str, Any]:
 
 
 def _price(folder: Path) -> dict[str, Any]:
-    """What tools/bench.py has measured of a cycle's frames in the machine."""
+    """Return the results of tools/bench.py for a cycle's frames in the machine."""
     try:
         return json.loads((folder / "price.json").read_text())  # type: ignore[no-any-return]
     except (FileNotFoundError, json.JSONDecodeError):
@@ -195,7 +195,7 @@ def _price(folder: Path) -> dict[str, Any]:
 
 
 def check_frames(folder: Path, config: Config, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:
-    """Check the frames that candump saw on can1, and those that the service says it sent and heard."""
+    """Check the frames that candump saw on can1, and those that the service reports as sent and received."""
     frames = bus_log.read(folder / "bus.log")
     own = bus_log.read(folder / "service-frames.log")
     until, missed = result["cut"], result["loops"][f"{config.loop.rate_hz} Hz"]["overruns"]
@@ -215,7 +215,7 @@ def check_frames(folder: Path, config: Config, result: dict[str, Any], say: Prog
 
 
 def _check_second(folder: Path, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:
-    """Check the second robot's frames: its SYNC, and all of them as Wireshark sees them."""
+    """Check the second robot's frames: its SYNC, and all of them as decoded by Wireshark."""
     config, until = load(folder / "second.toml"), result["second_cut"]
     path, missed = folder / "second-bus.log", result["loops"][f"{config.loop.rate_hz} Hz"]["overruns"]
     dissected = hil_dissector.dissect(path)
@@ -228,7 +228,7 @@ def _check_second(folder: Path, result: dict[str, Any], say: Progress, report: d
 
 
 def _logs(folder: Path, *names: str) -> str:
-    """The ends of some logs, for people."""
+    """Return the ends of some logs as text."""
     found = ((name, folder / f"{name}.log") for name in names)
     return "".join(
         f"\n--- {name}.log\n{last(path.read_text(errors='replace'))}" for name, path in found if path.exists()

@@ -1,6 +1,6 @@
-"""A log of CAN frames as others read it: by the CANopen dissector of Wireshark, which knows CiA 301 and not trirail.
+"""Check of a log of CAN frames by Wireshark's CANopen dissector, which knows CiA 301 but not trirail.
 
-`tshark` decodes the log; its fields are judged here (names: `tshark -G fields`), and nothing that trirail packed.
+`tshark` decodes the log; the checks use only its fields (names: `tshark -G fields`), no data packed by trirail.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ SDO_ANSWER, SDO_REQUEST, EMERGENCY, ERROR_CONTROL = 0xB, 0xC, 0x1, 0xE
 """Function codes, bits 7 to 10 of an identifier (CiA 301, 7.3.3)."""
 BOOT_UP, OPERATIONAL = 0x0, 0x5
 START, ALL_NODES = 0x01, 0
-"""Of an NMT command (CiA 301, 7.2.8.3.1)."""
+"""Values of an NMT command (CiA 301, 7.2.8.3.1)."""
 
 
 class Dissected(NamedTuple):
-    """A frame in the dissector's words; None where the frame has no such field."""
+    """Frame as decoded by the dissector; None for fields that it does not have."""
 
     t: float
-    """Seconds since 1970."""
+    """Time since 1970 [s]."""
     function: int | None
     node: int | None
     malformed: bool
@@ -47,16 +47,16 @@ class Dissected(NamedTuple):
     """Index and sub-index of an SDO."""
     abort: int | None
     emergency: int | None
-    """The error code of an EMCY, unless it says "no error"."""
+    """Error code of an EMCY, unless it is "no error"."""
     state: int | None
-    """The NMT state in a heartbeat or boot-up."""
+    """NMT state in a heartbeat or boot-up."""
     command: int | None
     commanded: int | None
-    """An NMT command, and the node that it is for."""
+    """NMT command, and the node that it addresses."""
 
 
 def dissect(log: Path) -> list[Dissected]:
-    """Let tshark read a log in candump's format. Raises Failed where it cannot."""
+    """Decode a log in candump's format by tshark. Raises Failed if that is not possible."""
     command = ["tshark", "-r", str(log), "-d", "can.subdissector,canopen", "-T", "fields", "-E", "occurrence=f"]
     for field in FIELDS:
         command += ["-e", field]
@@ -67,17 +67,17 @@ def dissect(log: Path) -> list[Dissected]:
 
 
 def problems(frames: Sequence[Dissected], until: float) -> list[str]:
-    """Return what is wrong, a line each.
+    """Return the errors, one line each.
 
-    All frames are to be readable. Before the time `until`, when nobody disturbs them, nodes are to be asked one thing
-    at a time, and to stay operational and without errors; later a deaf node is told to stop without waiting for it.
+    All frames must be readable. Before the time `until`, without disturbances, each node must receive one request at a
+    time, and stay operational and free of errors; later, a deaf node receives a stop without a wait for its answer.
     """
     calm = [frame for frame in frames if frame.t < until]
     return [*_unreadable(frames), *_unanswered(calm), *_fallen(calm)]
 
 
 def statistics(frames: Sequence[Dissected]) -> dict[str, int]:
-    """Return numbers for people: how many frames of what kind, as the dissector sees it."""
+    """Return statistics: numbers of frames by kind, as the dissector decodes them."""
     kinds = Counter("other" if frame.function is None else _KINDS.get(frame.function, "other") for frame in frames)
     return dict(sorted(kinds.items()))
 
@@ -93,7 +93,7 @@ def _unreadable(frames: Sequence[Dissected]) -> Iterator[str]:
 
 
 def _unanswered(frames: Sequence[Dissected]) -> Iterator[str]:
-    """Each first segment of an SDO is answered for the same object, or with an abort for it."""
+    """Yield first segments of SDOs without an answer or abort for the same object."""
     asked: dict[int, Dissected] = {}
     for frame in frames:
         if frame.entry is None or frame.node is None:
@@ -106,7 +106,7 @@ def _unanswered(frames: Sequence[Dissected]) -> Iterator[str]:
 
 
 def _fallen(frames: Sequence[Dissected]) -> Iterator[str]:
-    """A node that has become operational stays so until it is told otherwise, and sends no EMCY."""
+    """Yield nodes that leave operational without a command, or send an EMCY."""
     operational: set[int] = set()
     for frame in frames:
         if frame.command not in (None, START):

@@ -1,9 +1,9 @@
-"""A drive that others made, on a bus and in real time: python-canopen's LocalNode over the dictionary of a real drive.
+"""Third-party drive on a bus in real time: python-canopen's LocalNode with the dictionary of a real drive.
 
 python tools/hil_foreign.py CONFIG --interface socketcan --channel vcan0    is drive C of that configuration
 
-What it is made of stands in tests/drivers/foreign.py, and is none of this project's: canopen serves SDO, python-can
-carries the frames, and its servo believes only its own units. tools/hil.py has it in its machine.
+tests/drivers/foreign.py assembles it from parts outside this project: canopen serves SDO, python-can carries the
+frames, and its servo uses only its own units. tools/hil.py runs it in its machine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hil_second import COUNTS, MAKE, REVOLUTIONS
 from virtual_drives import bus_to_be_on
 
 STEP = 0.005
-"""How often it looks at its own timers, if no frame comes [s]."""
+"""Polling interval of its own timers without frames [s]."""
 NAMES = {
     DISABLED: "switch on disabled",
     READY: "ready to switch on",
@@ -39,8 +39,35 @@ NAMES = {
 }
 
 
+class LastingBus(can.BusABC):
+    """A bus that may be down: then nothing arrives, frames are lost, and only the drive's watchdogs act."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self.channel_info = bus.channel_info
+        super().__init__(channel=self.channel_info)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame."""
+        with suppress(can.CanOperationError):
+            self._bus.send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next frame."""
+        try:
+            return self._bus.recv(timeout)
+        except can.CanOperationError:
+            time.sleep(STEP)
+            return None
+
+    def shutdown(self) -> None:
+        """Close the underlying bus."""
+        super().shutdown()
+        self._bus.shutdown()
+
+
 def serve(bus: can.BusABC, node: int, say: Callable[[str], None], going: Callable[[], bool]) -> None:
-    """Be a drive on a bus for as long as `going`; say each change of its state, with where its slider is."""
+    """Run a drive on a bus while `going`; print each change of its state with the position of its slider."""
     rpm = 60.0 * REVOLUTIONS
     drive = ForeignDrive(MAKE, node, bus, time.monotonic, Truth(COUNTS, rpm, rpm))
     said = None
@@ -61,7 +88,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, _interrupt)
     config = load(options.config)
     with suppress(KeyboardInterrupt), bus_to_be_on(options.interface, options.channel, config) as bus:
-        serve(bus, config.drives.C.node, lambda line: print(line, flush=True), lambda: True)
+        serve(LastingBus(bus), config.drives.C.node, lambda line: print(line, flush=True), lambda: True)
     return 0
 
 

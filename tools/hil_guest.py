@@ -1,6 +1,6 @@
-"""What tools/hil.py runs inside the machine: a service on can0, its drives on can1, a client; then a second robot.
+"""Program of tools/hil.py inside the machine: a service on can0, its drives on can1, a client; then a second robot.
 
-python tools/hil_guest.py FOLDER    as root; FOLDER has robot.toml and second.toml, and takes logs and result.json
+python tools/hil_guest.py FOLDER    as root; FOLDER has robot.toml and second.toml, and receives logs and result.json
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from typing import Any
 from hil_programs import Machine
 
 LOGS = {"bus.log": "bus.log", "second-bus.log": "second-bus.log", "recordings/*.log": "service-frames.log"}
-"""What is brought out of memory: what the host has it by."""
+"""Files copied out of memory, and their names on the host."""
 
 CARDS = ("can0", "can1")
 
 
 def main() -> int:
-    """Run both robots; leave logs and result.json."""
+    """Run both robots; write logs and result.json."""
     folder, began = Path(sys.argv[1]), time.monotonic()
-    # The folder is on the host and slow to write: what is written in motion goes to memory first.
+    # The folder is on the host and slow to write: files written in motion go to memory first.
     memory = Path(os.environ["TMPDIR"])
     result: dict[str, Any] = {"checks": {}, "failure": None, "loops": {}}
 
@@ -37,7 +37,7 @@ def main() -> int:
     try:
         with Machine(folder, memory) as machine:
             _run(machine, folder, held, result)
-    except Exception as error:  # noqa: BLE001 - whatever it is, the host is to tell it
+    except Exception as error:  # noqa: BLE001 - the host reports any error
         result["failure"] = f"{type(error).__name__}: {error}"
     finally:
         result["lost"] = {card: _lost(card) for card in CARDS}
@@ -50,7 +50,7 @@ def main() -> int:
 
 def _run(machine: Machine, folder: Path, held: Callable[[str, str], None], result: dict[str, Any]) -> None:
     prepared = _compiled()
-    # What takes this slow machine long begins at once, beside this program's own imports.
+    # Programs that start slowly on this machine start first, in parallel with this program's own imports.
     drives = machine.begin_drives("robot.toml", "can1")
     doctor = machine.doctor()
     machine.candump("can1", "bus.log")
@@ -64,23 +64,23 @@ def _run(machine: Machine, folder: Path, held: Callable[[str, str], None], resul
     held("doctor", doctor())
     machine.await_service(service)
     hil_scenario.disturbed(machine, load(folder / "robot.toml"), held, result)
-    # The first service writes its black boxes; the second one starts beside it.
+    # The second service starts while the first one writes its black boxes.
     service.send_signal(signal.SIGTERM)
-    second = hil_second.begin(machine)
+    second, drives = hil_second.begin(machine)
     machine.await_end(service, "the service")
     held("end", "exit code 0 after SIGTERM")
-    hil_second.run(machine, second, load(folder / "second.toml"), held, result)
+    hil_second.run(machine, second, drives, load(folder / "second.toml"), held, result)
     here = sorted(_compiled() - prepared)
     held("compiled code", f"{len(prepared)} functions from outside, {len(here)} compiled here: {', '.join(here)}")
 
 
 def _lost(card: str) -> int:
-    """How often a card had no room for a frame that came: linux/if_link.h, rx_over_errors."""
+    """Return the number of frames for which a card had no room (linux/if_link.h, rx_over_errors)."""
     return int(Path(f"/sys/class/net/{card}/statistics/rx_over_errors").read_text())
 
 
 def _compiled() -> set[str]:
-    """The names of what numba keeps."""
+    """Return the names of the functions in numba's cache."""
     return {path.name for path in Path(os.environ["NUMBA_CACHE_DIR"]).glob("*/*.nbc")}
 
 

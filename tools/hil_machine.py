@@ -1,4 +1,4 @@
-"""The emulated machine: Debian's kernel in QEMU with two CAN cards on one bus, and Python with its packages in it."""
+"""Emulated machine: Debian's kernel in QEMU with two CAN cards on one bus, and Python with its packages."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from hil_needs import BIN, MODULES, SEARCH, Failed, busybox, last
 
 ROOT = Path(__file__).parents[1]
 PRECEDENCE = "-10"
-"""Nice value of the machine's session, where this may be set."""
+"""Nice value of the machine's session, if permitted."""
 PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
-"""Compiled code for any x86-64: the emulated processor has not what this one has, and compiles for minutes."""
+"""Settings of numba for any x86-64: the emulated processor lacks features of the host's and compiles for minutes."""
 
 TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py")
-"""What has tests marked vcan."""
+"""Files with tests marked vcan."""
 
 COMPILED = "compiled"
-"""The file that says how compiling went: the machine waits for it."""
+"""File with the outcome of compiling, for which the machine waits."""
 CACHE = Path(sys.prefix) / "hil-numba"
-"""What was compiled, for the next run too: numba takes what fits its source's time and size, and compiles the rest."""
+"""Compiled code, also for the next run: numba reuses code whose source has the same time and size."""
 COMPILE = """
 import sys
 from pathlib import Path
@@ -44,8 +44,8 @@ finally:
 
 @contextlib.contextmanager
 def compiling(folder: Path) -> Iterator[None]:
-    """Compile the kinematics here, beside what is done meanwhile, for the machine to load. Raises Failed at the end."""
-    (folder / COMPILED).unlink(missing_ok=True)  # of a run before, in a folder that was kept
+    """Compile the kinematics on the host in parallel, for the machine to load. Raises Failed at the end."""
+    (folder / COMPILED).unlink(missing_ok=True)  # from a previous run, in a folder that was kept
     with (folder / "compile.log").open("wb") as log:
         process = subprocess.Popen(
             (sys.executable, "-P", "-c", COMPILE, folder / COMPILED),
@@ -59,17 +59,17 @@ def compiling(folder: Path) -> Iterator[None]:
         yield
     finally:
         outcome = process.poll()
-        process.kill()  # where the machine has come to an end without waiting for it
+        process.kill()  # if the machine has ended without waiting for it
         process.wait()
     if outcome:
         raise Failed(f"cannot compile the kinematics:\n{last((folder / 'compile.log').read_text())}")
 
 
 def pack(folder: Path) -> tuple[Path, ...]:
-    """Write what Python itself and its packages consist of into an image; return the folders that are in it.
+    """Write the files of Python and its packages into an image; return the folders in it.
 
-    Our own modules stay on the host: numba takes compiled code for old where a file's time differs, and an image
-    keeps whole seconds.
+    Our own modules stay on the host: numba discards compiled code if a file's time differs, and an image stores
+    whole seconds.
     """
     library, packages = (Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib"))
     done = subprocess.run(
@@ -90,13 +90,22 @@ def pack(folder: Path) -> tuple[Path, ...]:
 
 
 UNUSED = ("test", "rerun_cli", "scipy", "scipy.libs", "matplotlib", "mypy", "*__mypyc.*", "fontTools", "sympy", "ruff")
-"""Large folders and files of Python's that nothing in the machine imports."""
+"""Large folders and files of Python that nothing in the machine imports."""
+
+
+def can_interface(name: str) -> str:
+    """Return the shell commands by which the shipped unit brings a CAN interface up."""
+    lines = (ROOT / "configs" / "trirail-can@.service").read_text(encoding="utf-8").replace("%i", name).splitlines()
+    setting = next(line.removeprefix("Environment=") for line in lines if line.startswith("Environment="))
+    commands = [line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart=")]
+    # A command behind "-" may fail.
+    return "\n".join([setting, *(f"{line[1:]} || true" if line.startswith("-") else line for line in commands)])
 
 
 def script(folder: Path, packed: tuple[Path, ...]) -> str:
-    """What the machine runs, as root."""
-    # The tree that virtme-ng mounts asks the host for every file at every import, which takes a minute for the
-    # service; an image, whose blocks stay in memory, takes a third of that.
+    """Return the script that the machine runs as root."""
+    # The tree that virtme-ng mounts queries the host for every file at every import, which takes a minute for the
+    # service. An image, whose blocks stay in memory, takes a third of that.
     binds = "\n".join(f"mount --bind /run/python{path} {path}" for path in packed)
     return f"""set -e
 echo 'the machine is up'
@@ -108,10 +117,8 @@ cd {ROOT}
 export PATH={BIN}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 export PYTHONDONTWRITEBYTECODE=1 TMPDIR=/dev/shm NUMBA_CACHE_DIR=/dev/shm/numba
 export {" ".join(f"{name}='{value}'" for name, value in PORTABLE.items())}
-for interface in can0 can1; do
-    ip link set $interface txqueuelen 100
-    ip link set $interface up type can bitrate 1000000
-done
+{can_interface("can0")}
+{can_interface("can1")}
 # Both cards interrupt one processor: where each has its own and that of can1 stands still, as the host lets it, frames
 # go on from can0 until the 64 bytes that can1 has room for are full (of 3,600 frames beside a busy host 300 times).
 for interrupt in $(awk '/can[01]$/ {{print $1 + 0}}' /proc/interrupts); do
@@ -134,18 +141,18 @@ echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
 
 @contextlib.contextmanager
 def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[queue.Queue[str | None]]:
-    """Boot the machine; give the lines that it prints, None at its end. It is gone when the context is left."""
+    """Boot the machine; yield the queue of lines that it prints, None at its end. Leaving the context kills it."""
     (folder / "machine.sh").write_text(script(folder, packed))
     devices = (
         f"-drive file={folder}/python.img,format=raw,if=virtio,readonly=on",
-        "-cpu Nehalem",  # what Python's packages need and no more: emulating AVX halves the speed
+        "-cpu Nehalem",  # the minimum for Python's packages: emulating AVX halves the speed
         "-object can-bus,id=bus -device kvaser_pci,canbus=bus -device kvaser_pci,canbus=bus",
     )
     command = [
         *(str(BIN / "vng"), "--run", str(kernel), "--user", "root", "--cpus", "2", "--memory", "2G"),
-        # Emulated on purpose: the same everywhere, also where KVM is not to be had or hangs.
+        # Emulated on purpose: the same everywhere, even if KVM is not available or hangs.
         *("--disable-kvm", "--disable-microvm", "--force-9p", "--force-initramfs"),
-        *("--busybox", str(busybox())),  # else it takes the first of that name, which may need libraries
+        *("--busybox", str(busybox())),  # otherwise it uses the first of that name, which may need libraries
         *("--append", "mitigations=off", "--rwdir", str(folder), f"--qemu-opts={' '.join(devices)}"),
         *("--", f"bash {folder}/machine.sh"),
     ]
@@ -154,11 +161,11 @@ def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[qu
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        start_new_session=True,  # so that all of it can be ended: virtme-ng, its shell, QEMU
+        start_new_session=True,  # to kill all of it together: virtme-ng, its shell, QEMU
         env=os.environ | {"PATH": f"{BIN}:{SEARCH}"},
     )
-    # The machine keeps real time: as root it goes before what else runs here. Linux shares the processors out
-    # among sessions first, and only then among the processes of one: sched(7), the autogroup feature.
+    # The machine needs real time, so as root it gets precedence over other programs. Linux divides processor time
+    # among sessions first, and only then among the processes of one (sched(7), the autogroup feature).
     with contextlib.suppress(OSError):
         Path(f"/proc/{process.pid}/autogroup").write_text(PRECEDENCE)
     lines: queue.Queue[str | None] = queue.Queue()

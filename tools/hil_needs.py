@@ -1,4 +1,4 @@
-"""What the emulated machine needs of this one: programs, a kernel with CAN; how to install them."""
+"""Requirements of the emulated machine on this one: programs, a kernel with CAN, and their installation."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ MODULES = (
     "drivers/block/virtio_blk",
     "fs/squashfs/squashfs",
 )
-"""What the machine loads: drivers of the emulated cards, of CAN, of the disk that it is given."""
+"""Modules that the machine loads: drivers of the emulated cards, of CAN, of its disk."""
 DRIVERS = (*MODULES, "net/9p/9pnet_virtio", "fs/9p/9p")
-"""Without all of these a kernel will not do: the last two bring it the host's folders."""
+"""Drivers that a kernel must have; the last two give it access to the host's folders."""
 BUSYBOXES = ("busybox-static", "busybox.static", "busybox")
-"""Programs of that name may be linked statically: the machine begins without a library."""
+"""Names of programs that may be linked statically, because the machine boots without libraries."""
 PT_INTERP = 3
-"""The segment of an ELF file that names what links it to libraries (elf(5))."""
+"""Type of the segment of an ELF file that names its dynamic linker (elf(5))."""
 
 PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "modprobe": "kmod", "udevadm": "udev"}
 PROGRAMS |= {"ip": "iproute2", "candump": "can-utils", "chrt": "util-linux", "mksquashfs": "squashfs-tools"}
 PROGRAMS |= {"tshark": "tshark"}
-"""Each program that is needed, and the package of Debian and Ubuntu that has it."""
+"""Required programs, and the package of Debian and Ubuntu that contains each."""
 KERNELS = {"debian": "linux-image-amd64", "ubuntu": "linux-image-generic"}
-"""The package of a kernel with CAN and its drivers."""
+"""Package of a kernel with CAN and its drivers."""
 
 
 class Failed(Exception):
-    """What is missing or wrong, with the remedy or the log that tells more."""
+    """A requirement is missing or a check failed; the message has the remedy or the log with details."""
 
 
 def lacking() -> tuple[str, ...]:
-    """The Debian packages that are missing on this machine."""
+    """Return the Debian packages that are missing on this machine."""
     there = {program: shutil.which(program, path=SEARCH) for program in PROGRAMS} | {"busybox": busybox()}
     packages = [package for program, package in PROGRAMS.items() if there[program] is None]
     if not kernels():
@@ -51,13 +51,13 @@ def lacking() -> tuple[str, ...]:
 
 
 def busybox() -> str | None:
-    """The busybox that needs no library; None where there is none: that of initramfs-tools is no such one."""
+    """Return the busybox that needs no library; None if there is none: that of initramfs-tools needs some."""
     found = (shutil.which(name, path=folder) for name in BUSYBOXES for folder in SEARCH.split(":"))
     return next((path for path in found if path is not None and is_static(Path(path))), None)
 
 
 def is_static(file: Path) -> bool:
-    """Whether a file is a program in ELF that no other one has to link."""
+    """Return whether a file is an ELF program without a dynamic linker."""
     try:
         with file.open("rb") as opened:
             head = opened.read(64)
@@ -76,7 +76,7 @@ def is_static(file: Path) -> bool:
 
 
 def has_drivers(modules: Path) -> bool:
-    """Whether a kernel's folder of modules has all DRIVERS, or says that they are built in."""
+    """Return whether a kernel's folder of modules contains all DRIVERS, or lists them as built in."""
     try:
         built_in = (modules / "modules.builtin").read_text().split()
     except OSError:
@@ -85,7 +85,7 @@ def has_drivers(modules: Path) -> bool:
 
 
 def kernels(boot: Path = Path("/boot"), modules: Path = Path("/lib/modules")) -> list[Path]:
-    """Installed kernels that have the drivers and can be read, the newest last."""
+    """Return the installed, readable kernels with the drivers, newest last."""
     found = (
         image
         for image in boot.glob("vmlinuz-*")
@@ -95,7 +95,7 @@ def kernels(boot: Path = Path("/boot"), modules: Path = Path("/lib/modules")) ->
 
 
 def requirements() -> Path:
-    """The kernel to boot. Raises Failed with what to install."""
+    """Return the kernel to boot. Raises Failed with the package to install."""
     if packages := lacking():
         raise Failed(f"missing here: apt-get install {' '.join(packages)} (Debian, Ubuntu); or, as root: make hil")
     if not (BIN / "vng").exists():
@@ -104,7 +104,7 @@ def requirements() -> Path:
 
 
 def install(say: Callable[[str], None]) -> None:
-    """Install missing packages, as root where there is apt; else they are named by `requirements`."""
+    """Install missing packages, as root with apt; otherwise `requirements` names them."""
     packages = lacking()
     if not packages or os.geteuid() != 0 or shutil.which("apt-get") is None:
         return

@@ -1,4 +1,4 @@
-"""The programs that run inside the emulated machine: the doctor, drives, candump and the service, each with its log."""
+"""Programs inside the emulated machine: the doctor, drives, candump and the service, each with its log."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 WITHIN = 300.0
-"""How long anything may take in this slow machine [s]; the whole run has a time limit of its own, outside."""
+"""Time limit of any step in this slow machine [s]; the whole run has a limit of its own, outside."""
 BUFFER = 8_000_000
-"""Of candump's socket [bytes]: it shall see every frame, however busy the machine is."""
+"""Receive buffer of candump's socket [bytes], large enough for every frame on a busy machine."""
 SILENT = 10.0
-"""How long a process may give no sign of life in this slow machine [s]: while the others start, its turn comes late."""
+"""Heartbeat time-out of a process in this slow machine [s]: while others start, it is scheduled late."""
 PATIENT = (
     "from trirail.cli import app; from trirail.processes import supervisor; "
     f"supervisor.START_WITHIN = supervisor.END_WITHIN = {WITHIN}; supervisor.SILENT = {SILENT}; app.main()"
 )
-"""`trirail`, with more patience: the interpreters alone take a minute to start here, and a black
-box for each fault some seconds to be written."""
+"""`trirail` with longer time-outs: the interpreters alone take a minute to start here, and each fault's
+black box takes some seconds to write."""
 
 
 class Failed(Exception):
-    """Something is not as it has to be."""
+    """A requirement is violated."""
 
 
 class Machine:
-    """The programs under test, each with its output in a log in `folder`; all ended when the context is left."""
+    """Programs under test, each with its output in a log in `folder`; leaving the context ends them all."""
 
     def __init__(self, folder: Path, memory: Path) -> None:
-        """`memory` is a folder that is fast to write."""
+        """`memory` is a folder with fast writes."""
         self._folder = folder
         self._memory = memory
         self._systemd: dict[str, socket.socket] = {}
@@ -69,24 +69,24 @@ class Machine:
         return process
 
     def end(self, process: subprocess.Popen[bytes], name: str) -> None:
-        """End a program by SIGTERM. Raises Failed unless it ends as one that was told to."""
+        """End a program by SIGTERM. Raises Failed unless it ends as after a regular stop."""
         process.send_signal(signal.SIGTERM)
         self.await_end(process, name)
 
     def await_end(self, process: subprocess.Popen[bytes], name: str) -> None:
-        """Wait for the end of a program that was told to. Raises Failed unless it ends well."""
+        """Wait for the end of a program that received SIGTERM. Raises Failed unless it ends regularly."""
         until(lambda: process.poll() is not None, f"{name} ends")
         if process.returncode != 0:
             raise Failed(f"{name} ended with exit code {process.returncode}, not 0, after SIGTERM")
 
     def log(self, name: str) -> str:
-        """What a program has said so far."""
+        """Return the output of a program up to now."""
         return (self._folder / f"{name}.log").read_text(errors="replace")
 
     def doctor(self) -> Callable[[], str]:
-        """Begin `trirail doctor`; return what waits for it and tells what it says of can0.
+        """Start `trirail doctor`; return a function that waits for it and returns its result for can0.
 
-        That raises Failed unless all of it is well.
+        That function raises Failed unless all checks pass.
         """
         command = (sys.executable, "-P", "-m", "trirail", "doctor", self._folder / "robot.toml", "--quick", "--json")
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
@@ -102,7 +102,7 @@ class Machine:
         return verdict
 
     def candump(self, channel: str, name: str) -> None:
-        """Start the log of all frames that pass an interface: NAME, in memory."""
+        """Start the log NAME, in memory, of all frames on an interface."""
         with (self._memory / name).open("wb") as log:
             command = ("candump", "-L", "-D", "-r", str(BUFFER), channel)
             self._processes.append(subprocess.Popen(command, stdout=log))
@@ -114,9 +114,19 @@ class Machine:
         more = ("--faults", self._folder / faults) if faults else ()
         return self.begin("tools/virtual_drives.py", config, channel, name, *more)
 
+    def restart_drives(self, config: str, channel: str, name: str, faults: str) -> None:
+        """Start virtual drives beside running services: they get their priority after their imports."""
+        process = self.start(
+            name,
+            *(sys.executable, "tools/virtual_drives.py", self._folder / config),
+            *("--interface", "socketcan", "--channel", channel, "--faults", self._folder / faults),
+        )
+        self.await_drives(process, name)
+        run("chrt", "--all-tasks", "--fifo", "--pid", "50", str(process.pid))
+
     def begin(self, program: str, config: str, channel: str, name: str, *more: object) -> subprocess.Popen[bytes]:
-        """Start a program that is a configuration's drives on an interface."""
-        # Real drives do not share a processor with a desktop: these get theirs before everything but the loop.
+        """Start a program that simulates a configuration's drives on an interface."""
+        # Real drives do not share a processor with a desktop: these have precedence over everything but the loop.
         return self.start(
             name,
             *("chrt", "--fifo", "50", sys.executable, program, self._folder / config),
@@ -124,11 +134,11 @@ class Machine:
         )
 
     def await_drives(self, process: subprocess.Popen[bytes], name: str = "drives") -> None:
-        """Wait until the last of a program's drives says its state."""
+        """Wait until the last of a program's drives reports its state."""
         until(lambda: "C " in self.log(name), f"{name} are there", process)
 
     def begin_service(self, config: str, name: str = "service") -> subprocess.Popen[bytes]:
-        """Start the service, which tells systemd, whose place is taken here, when it is up."""
+        """Start the service, which notifies systemd, replaced by this program, when it is up."""
         self._systemd[name] = systemd = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         address = self._memory / f"notify-{name}"
         systemd.bind(str(address))
@@ -137,7 +147,7 @@ class Machine:
         return self.start(name, *command, NOTIFY_SOCKET=str(address))
 
     def await_service(self, process: subprocess.Popen[bytes], name: str = "service") -> None:
-        """Wait until a service that was begun is up."""
+        """Wait until a started service is up."""
         with self._systemd.pop(name) as systemd:
             until(lambda: _received(systemd) == "READY=1", f"{name} is up", process)
 
@@ -148,7 +158,7 @@ def run(*command: str) -> None:
 
 
 def until(condition: Callable[[], bool], what: str, process: subprocess.Popen[bytes] | None = None) -> None:
-    """Wait for something to come true. Raises Failed if it does not in time, or if the process ends instead."""
+    """Wait for a condition. Raises Failed if it does not hold in time, or if the process ends first."""
     deadline = time.monotonic() + WITHIN
     while not condition():
         if process is not None and process.poll() is not None:

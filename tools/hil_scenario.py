@@ -1,4 +1,4 @@
-"""What happens in the emulated machine, in order: motion, stops, and what neighbours on a bus do to a robot."""
+"""Scenario in the emulated machine, in order: motion, stops, and disturbances by other nodes on the bus."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from trirail.errors import RefusedError
 from trirail.wire.state import State
 
 Held = Callable[[str, str], None]
-"""Takes what held, and how."""
+"""Function that records a passed check and its details."""
 
 FLOOD_GAP = "4"
-"""Between two frames of a flood [ms]: 250 a second, of the highest priority that a stranger's data frames may have."""
+"""Time between two frames of a flood [ms]: 250 per second, with the highest priority of foreign data frames."""
 PRE_OPERATIONAL_B = "000#8002"
-"""NMT: drive B, into pre-operational, as a foreign master would send it (CiA 301, 7.2.8.3.1)."""
+"""NMT command that a foreign master would send to put drive B into pre-operational (CiA 301, 7.2.8.3.1)."""
 
 
 def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, Any]) -> None:
-    """Move, stop, and be disturbed: by strangers on the bus, and by either card that goes down in motion.
+    """Move, stop, and apply disturbances: foreign nodes on the bus, and loss of either card in motion.
 
-    `result` gets "cut": the time up to which the frames on the bus are those of a robot that nobody disturbs.
+    `result` gets "cut": the time up to which the frames on the bus are those of an undisturbed robot.
     """
     held("service", "up on can0, its drives set up and read back by SDO")
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
-        recover(robot)  # a machine that stalls while all begins is a fault rightly told, and none of the service's
+        recover(robot)  # a stall of the machine at the start correctly faults, and is no error of the service
         held("enable", "confirmed, the robot holds")
         moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(WITHIN)
         expect(moved, "done", robot)
@@ -59,7 +59,7 @@ def _refused(robot: Robot, held: Held) -> None:
 
 def _stopped(robot: Robot, held: Held) -> None:
     goal = robot.move_to(x=-0.08, y=0.0, phi=0.0)
-    _until_moving(robot, goal.id)
+    until_moving(robot, goal.id)
     robot.stop()
     result = goal.wait(WITHIN)
     expect(result, "stopped", robot)
@@ -67,9 +67,9 @@ def _stopped(robot: Robot, held: Held) -> None:
 
 
 def quick_stopped(robot: Robot, held: Held, name: str = "quick stop and reset") -> float:
-    """Stop by a quick stop in motion, reset and enable; return when the stop was asked for [s since 1970]."""
+    """Stop by a quick stop in motion, reset and enable; return the time of the stop command [s since 1970]."""
     goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
-    _until_moving(robot, goal.id)
+    until_moving(robot, goal.id)
     at = time.time()
     robot.quick_stop()
     expect(goal.wait(WITHIN), "faulted", robot)
@@ -90,18 +90,18 @@ def _flooded(robot: Robot, held: Held) -> None:
 
 
 def _thrown_out(robot: Robot, held: Held) -> None:
-    """Let a foreign master take drive B out of operational in motion: the robot must stop and say which."""
+    """Take drive B out of operational in motion like a foreign master: the robot must stop and name the drive."""
     goal = robot.move_to(x=-0.08, y=0.0, phi=0.0)
-    _until_moving(robot, goal.id)
+    until_moving(robot, goal.id)
     run("cansend", "can1", PRE_OPERATIONAL_B)
     held("a foreign master's NMT", _faulted(robot, goal.wait(WITHIN), "drive B"))
     recover(robot)
 
 
 def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
-    """Let the drives' card go down in motion: they must stop by themselves, and come back."""
+    """Take the drives' card down in motion: they must stop by themselves, and recover."""
     goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
-    _until_moving(robot, goal.id)
+    until_moving(robot, goal.id)
     run("ip", "link", "set", "can1", "down")
     words = _faulted(robot, goal.wait(WITHIN), "drive")
     until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
@@ -112,7 +112,7 @@ def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
 
 def _link_down(robot: Robot, machine: Machine, held: Held) -> None:
     goal = robot.move_to(x=0.0, y=0.0, phi=0.0)
-    _until_moving(robot, goal.id)
+    until_moving(robot, goal.id)
     run("ip", "link", "set", "can0", "down")
     held("interface down in motion", _faulted(robot, goal.wait(WITHIN), "CAN bus"))
     until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
@@ -120,7 +120,7 @@ def _link_down(robot: Robot, machine: Machine, held: Held) -> None:
 
 
 def _faulted(robot: Robot, result: Result, whose: str) -> str:
-    """Return the fault in words. Raises Failed unless a goal ended by one that names whose it is."""
+    """Return the text of the fault. Raises Failed unless the goal ended by a fault that names its origin."""
     expect(result, "faulted", robot)
     state = until_state(robot, lambda state: state.mode == "fault", "fault")
     if not any(whose in fault for fault in state.faults):
@@ -129,7 +129,7 @@ def _faulted(robot: Robot, result: Result, whose: str) -> str:
 
 
 def recover(robot: Robot) -> None:
-    """Reset as soon as the cause is gone, where there is a fault, and enable as soon as the sliders stand."""
+    """Reset any fault as soon as its cause is gone, and enable as soon as the sliders are at rest."""
 
     def enabled() -> bool:
         try:
@@ -143,7 +143,8 @@ def recover(robot: Robot) -> None:
     until(enabled, "reset and enabled")
 
 
-def _until_moving(robot: Robot, goal: str) -> None:
+def until_moving(robot: Robot, goal: str) -> None:
+    """Wait until a goal is well under way."""
     until_state(
         robot,
         lambda state: state.goal is not None and state.goal.id == goal and state.goal.progress > 0.2,
@@ -152,7 +153,7 @@ def _until_moving(robot: Robot, goal: str) -> None:
 
 
 def until_state(robot: Robot, condition: Callable[[State], bool], what: str) -> State:
-    """Return the first state for which something holds."""
+    """Return the first state that satisfies a condition."""
     deadline = time.monotonic() + WITHIN
     for state in robot.states(timeout=WITHIN):
         if condition(state):
@@ -173,13 +174,13 @@ def _about(state: State) -> str:
 
 
 def _in_fault(log: str) -> bool:
-    """Whether the newest line of each drive says that its watchdog has put it in fault, where it has no power."""
+    """Return whether the newest line of each drive reports fault, without power, caused by its watchdog."""
     newest = {line[0]: line for line in log.splitlines() if line[:2] in {"A ", "B ", "C "}}
     return len(newest) == 3 and all(line[2:].startswith("fault,") for line in newest.values())
 
 
 def loop_of(state: State) -> dict[str, Any]:
-    """How a loop kept its time."""
+    """Return the timing of the loop."""
     loop = state.loop
     return {
         "cycles": loop.cycles,

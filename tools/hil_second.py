@@ -1,34 +1,37 @@
-"""A second robot in the emulated machine: at another rate, on vcan0, one drive to be homed and one that others made.
+"""Second robot in the emulated machine: another rate, on vcan0, with a drive that needs homing and a third-party one.
 
-Its service starts while the first one ends: both are slow there, and neither is in motion.
+Its service starts while the first one ends, because both are slow then, and neither is in motion. Its bus is down at
+that time, and is lost at rest and in motion later. The same service survives all of this.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from subprocess import Popen
 from typing import Any
 
 from hil_programs import WITHIN, Failed, Machine, until
-from hil_scenario import Held, expect, loop_of, quick_stopped, recover
+from hil_programs import run as run_command
+from hil_scenario import Held, expect, loop_of, quick_stopped, recover, until_moving, until_state
 from trirail.client.client import Robot
 from trirail.config import Config
 
 CHANNEL = "vcan0"
 MAKE = "maxon_epos4_compact50_5"
-"""Of tests/data/drives: what python-canopen serves as drive C."""
+"""Name in tests/data/drives of the drive that python-canopen serves as drive C."""
 COUNTS = 819_200.0
-"""Its counts per metre: 4096 a turn, a screw of 5 mm lead."""
+"""Counts per metre of drive C: 4096 per turn, a screw of 5 mm lead."""
 REVOLUTIONS = 200.0
-"""Its turns per metre, for it reckons in rpm."""
+"""Turns per metre of drive C, which uses rpm."""
 CLOSE = 1e-4
-"""How far a drive at rest may be from where the service says that it is [m]."""
+"""Maximum deviation of a drive at rest from the position that the service reports [m]."""
 
 CHANGES = {
     'name = "robot"': 'name = "second"',
     "rate_hz = 20": "rate_hz = 10",
     'channel = "can0"': f'channel = "{CHANNEL}"',
-    # At 10 Hz and 0.1 m/s a setpoint that is ahead and feedback that is behind alone are 20 mm.
+    # A setpoint one cycle ahead and feedback one cycle behind alone are 20 mm at 10 Hz and 0.1 m/s.
     "following_error = 0.03 ": "following_error = 0.06 ",
     "following_error = 0.04": "following_error = 0.08",
     "[can.simulated]\n": "[can.simulated]\nstart = [0.01, 0.0, 0.0]\n",
@@ -42,13 +45,15 @@ CHANGES = {
     "/zenoh": "/zenoh-second",
     "/recordings": "/recordings-second",
 }
-"""What its configuration has that differs from the first robot's."""
+"""Differences of its configuration from that of the first robot."""
+DOWN = f"CAN bus {CHANNEL} is down: "
+"""Beginning of the fault while its bus is lost."""
 FAULTS = "C silent\n"
-"""Of the virtual drives: the third gives its place to the foreign one."""
+"""Faults of the virtual drives: the third is replaced by the foreign one."""
 
 
 def configure(first: str) -> str:
-    """The second robot's configuration from the first one's."""
+    """Return the second robot's configuration, derived from that of the first."""
     for before, after in CHANGES.items():
         if first.count(before) != 1:
             raise Failed(f"{before!r} is not there once; CHANGES of tools/hil_second.py needs it")
@@ -56,24 +61,43 @@ def configure(first: str) -> str:
     return first
 
 
-def begin(machine: Machine) -> Popen[bytes]:
-    """Start its drives, its log of frames and its service, and wait for none of them but the drives."""
+def begin(machine: Machine) -> tuple[Popen[bytes], Popen[bytes]]:
+    """Start its drives, its log of frames and its service, on a bus that is down; return service and virtual drives.
+
+    Waits only for the drives.
+    """
     machine.candump(CHANNEL, "second-bus.log")
     virtual = machine.begin_drives("second.toml", CHANNEL, "second-drives", "second.faults")
     foreign = machine.begin("tools/hil_foreign.py", "second.toml", CHANNEL, "foreign")
     machine.await_drives(virtual, "second-drives")
     machine.await_drives(foreign, "foreign")
-    return machine.begin_service("second.toml", "second-service")
+    _set_link("down")
+    return machine.begin_service("second.toml", "second-service"), virtual
 
 
-def run(machine: Machine, service: Popen[bytes], config: Config, held: Held, result: dict[str, Any]) -> None:
-    """Home, move, be stopped by a quick stop; the drive that others made must be where it was sent."""
+def run(
+    machine: Machine,
+    service: Popen[bytes],
+    virtual: Popen[bytes],
+    config: Config,
+    held: Held,
+    result: dict[str, Any],
+) -> None:
+    """Home, move, stop by a quick stop, lose the bus and the drives; the foreign drive must reach its target.
+
+    `virtual`: the process of its first two drives.
+    """
     machine.await_service(service, "second-service")
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
+        state = until_state(robot, lambda state: state.mode == "fault", "fault without a bus")
+        if not state.faults[0].startswith(DOWN):
+            raise Failed(f"the fault of a start without a bus does not begin with {DOWN!r}: {state.faults}")
+        held("start on a bus that is down", state.faults[0])
+        _set_link("up")
+        recover(robot)
         lacking = ", ".join(each.object for each in robot.info().missing_protections)
         where = f"up on {CHANNEL} at {config.loop.rate_hz} Hz"
         held("second service", f"{where}; drive C is python-canopen's, of {MAKE}, and lacks {lacking}")
-        recover(robot)
         robot.home()
         held("homing", f"drive A has found its switch, {robot.state().sliders.position[0] * 1e3:.3f} mm")
         moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(WITHIN)
@@ -89,12 +113,48 @@ def run(machine: Machine, service: Popen[bytes], config: Config, held: Held, res
     if abs(there - told) > CLOSE:
         raise Failed(f"the foreign drive is at {there * 1e3:.3f} mm, the service says {told * 1e3:.3f} mm")
     held("foreign drive", f"followed to {there * 1e3:.3f} mm, as the service says; no power")
+    _disturb(machine, virtual, config, held)
     machine.end(service, "the second service")
     held("second end", "exit code 0 after SIGTERM")
 
 
+def _disturb(machine: Machine, virtual: Popen[bytes], config: Config, held: Held) -> None:
+    """Lose the bus at rest and in motion, then drives A and B; reset, enable, home and a goal suffice each time."""
+    with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
+        robot.enable()
+        held("bus lost at rest", _recovered(robot, lambda: _set_link("down"), lambda: _set_link("up"), DOWN))
+        goal = robot.move_to(x=0.03, y=0.0, phi=0.0)
+        until_moving(robot, goal.id)
+        lost = _recovered(robot, lambda: _set_link("down"), lambda: _set_link("up"), DOWN)
+        expect(goal.wait(WITHIN), "faulted", robot)
+        held("bus lost in motion", lost)
+
+        def restart() -> None:
+            machine.restart_drives("second.toml", CHANNEL, "second-drives-again", "second.faults")
+
+        held("drives killed and started again", _recovered(robot, virtual.kill, restart, "drive "))
+
+
+def _recovered(robot: Robot, lose: Callable[[], object], restore: Callable[[], object], fault: str) -> str:
+    """Cause a loss and restore it; return the passed check. Raises Failed unless the `fault` begins as expected."""
+    lose()
+    state = until_state(robot, lambda state: state.mode == "fault", "fault")
+    if not state.faults[0].startswith(fault):
+        raise Failed(f"the fault does not begin with {fault!r}: {state.faults}")
+    restore()
+    recover(robot)
+    robot.home()
+    moved = robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN)
+    expect(moved, "done", robot)
+    return f"{state.faults[0]}; then reset, enabled, homed, goal done"
+
+
+def _set_link(state: str) -> None:
+    run_command("ip", "link", "set", CHANNEL, state)
+
+
 def _at(machine: Machine) -> float | None:
-    """Where the foreign drive is [m], if it says as its newest that it has no power."""
+    """Return the position of the foreign drive [m], if its newest output reports no power."""
     lines = machine.log("foreign").splitlines()
     found = re.fullmatch(r"C switch on disabled, (-?[\d.]+) mm", lines[-1]) if lines else None
     return float(found[1]) * 1e-3 if found else None

@@ -15,7 +15,8 @@ from typing import Any
 import docstrings
 import msgspec
 from trirail.errors import RefusalCode
-from trirail.wire import goals, looks, messages, state, vocabulary
+from trirail.wire import goal_kind, goals, looks, messages, state, vocabulary
+from trirail.wire.event_codes import EventCode
 from trirail.wire.vocabulary import Command, NoContent
 
 FOLDER = Path(messages.__file__).parent / "schemas"
@@ -41,13 +42,13 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "alignment": (looks.AlignmentLook, "What is sent to alignment/<user>, and the reply where it is taken."),
     "info": (state.Info, "The reply to a query on info."),
 }
-"""By file: the type, and where the message is met."""
-MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), vocabulary, looks, messages, state)
-"""Where the types in them are."""
+"""Type of each message, and a description of where it is used, by file."""
+MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), goal_kind, vocabulary, looks, messages, state)
+"""Modules that define the types in the messages."""
 
 
 def schemas() -> dict[str, str]:
-    """Return the text of each schema by its file's name."""
+    """Return the text of each schema by file name."""
     made = {}
     for name, (kind, where) in MESSAGES.items():
         (schema,), definitions = msgspec.json.schema_components(
@@ -60,7 +61,15 @@ def schemas() -> dict[str, str]:
                     {"const": code, "description": f"{code.meaning}; {code.remedy}"} for code in RefusalCode
                 ]
                 continue
+            if struct == EventCode.__name__:
+                del definition["enum"]
+                definition["oneOf"] = [{"const": code, "description": _described(code)} for code in EventCode]
+                continue
             told = next(getattr(module, struct) for module in MODULES if hasattr(module, struct))
+            if struct == state.Pose.__name__:  # an array: its items carry the descriptions of the fields
+                for item, (field, text) in zip(definition["prefixItems"], docstrings.fields(told).items(), strict=True):
+                    item["description"] = f"{field}: {text}"
+                continue
             on_the_wire = {field.name: field.encode_name for field in msgspec.structs.fields(told)}
             for field, text in docstrings.fields(told).items():
                 if field in on_the_wire:
@@ -70,15 +79,19 @@ def schemas() -> dict[str, str]:
     return made
 
 
+def _described(code: EventCode) -> str:
+    return f"{code.meaning}; params: {', '.join(code.params)}" if code.params else code.meaning
+
+
 def _anything(kind: type) -> dict[str, Any]:
-    """Allow every value where the type does, as in the limits and geometry of Info, which are the configuration's."""
+    """Allow every value if the type does, as in the limits and geometry of Info, which the configuration defines."""
     if kind is object:
         return {"description": "As in the configuration."}
     raise NotImplementedError
 
 
 def stale(folder: Path = FOLDER) -> list[str]:
-    """Return the names of files that are missing, superfluous, or not what the types say."""
+    """Return the names of files that are missing, superfluous, or different from the types."""
     made = schemas()
     there = {path.name: path.read_text(encoding="utf-8") for path in folder.glob("*.json")}
     return sorted(name for name in {*made, *there} if made.get(name) != there.get(name))
@@ -92,10 +105,11 @@ def main() -> int:
         for name in (old := stale()):
             print(f"{FOLDER / name} is not what the types say: run python tools/message_schemas.py")
         return 1 if old else 0
+    made = schemas()
     FOLDER.mkdir(exist_ok=True)
     for path in FOLDER.glob("*.json"):
         path.unlink()
-    for name, text in schemas().items():
+    for name, text in made.items():
         (FOLDER / name).write_text(text, encoding="utf-8")
     return 0
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from trirail.client import own_service
+from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.panel.server import Panel
 from websockets.sync.client import connect
@@ -53,7 +54,8 @@ def main() -> None:
             tour = threading.Thread(target=_tour, args=[robot, over])
             tour.start()
             try:
-                with Panel(robot, 0) as panel, _page(browser, Path(folder, "profile"), panel.url) as call:
+                shown = Panel(AsyncRobot("demo", locator, user="ann"), 0)
+                with shown as panel, _page(browser, Path(folder, "profile"), panel.url) as call:
                     deadline = time.monotonic() + WITHIN
                     while not call("Runtime.evaluate", expression=f"Boolean({WANTED})")["result"]["value"]:
                         if time.monotonic() > deadline:

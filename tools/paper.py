@@ -1,10 +1,10 @@
-"""The paper's figures 3 to 11, three times: computed, from tables of 50 digits, and from the running service.
+"""Figures 3 to 11 of the paper by three methods: computed, from tables of 50 digits, and from the running service.
 
 python tools/paper.py --output DIR  (needs trirail[analysis])
 
-It draws the motion of the sliders in the paper's examples by equation (5) and the recursion, starts a service of its
-own on simulated drives that follows the same three motions, lays what that recorded over the curves, and prints how
-far the three are from each other. With --offline it does without the service.
+It draws the motion of the sliders in the paper's examples by equation (5) and the recursion, starts its own service on
+simulated drives that follows the same three motions, plots its recording over the curves, and prints the differences
+between the three. With --offline it starts no service.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from trirail.errors import ServiceError, TrirailError
 
 
 class Comparison(NamedTuple):
-    """A figure's greatest value, and the greatest differences over sliders and times, in its unit."""
+    """Maximum of a figure, and maximum differences over sliders and times, in its unit."""
 
     figure: int
     example: str
@@ -42,16 +42,16 @@ class Comparison(NamedTuple):
     unit: str
     greatest: float
     difference: float
-    """Of what is computed from the table, at the table's times."""
+    """Difference between computed values and the table, at the table's times."""
     service: float | None
-    """Of the service's setpoints from what is computed, at every cycle."""
+    """Difference between the service's setpoints and computed values, at every cycle."""
     measured: float | None
-    """Of the measured sliders from what is computed; of displacements alone, which drives measure."""
+    """Difference between measured and computed sliders; only for displacements, which drives measure."""
     picture: str
 
 
 def compare(pictures: Mapping[str, Path], service: Mapping[str, Driven]) -> list[Comparison]:
-    """Hold what is computed against the tables, and the service, if it ran, against that. Raises TrirailError."""
+    """Compare computed values with the tables, and with the service if it ran. Raises TrirailError."""
     found = []
     for number, example, quantity in figures():
         exact = tabulated(example)
@@ -80,7 +80,7 @@ def compare(pictures: Mapping[str, Path], service: Mapping[str, Driven]) -> list
 
 
 def over_all(comparisons: Sequence[Comparison], of: str) -> dict[str, float]:
-    """Return the greatest of one of the differences of each quantity in its unit, over the examples."""
+    """Return the maximum over the examples of one of the differences, for each quantity in its unit."""
     greatest: dict[str, float] = {}
     for row in comparisons:
         value = getattr(row, of)
@@ -90,14 +90,14 @@ def over_all(comparisons: Sequence[Comparison], of: str) -> dict[str, float]:
 
 
 def first_jerk() -> float:
-    """Return the greatest jerk of a slider in the cycle that begins or ends a motion [m/s³]."""
+    """Return the maximum jerk of a slider in the cycle that begins or ends a motion [m/s³]."""
     ends = np.array([0.0, DURATION])
     step = max(float(np.max(np.abs(computed(example, ends).acceleration))) for example in EXAMPLES)
     return step / load(SIM).period
 
 
 def show(comparisons: Sequence[Comparison]) -> None:
-    """Print the comparisons for people."""
+    """Print the comparisons as text."""
     with_service = any(row.service is not None for row in comparisons)
     heads = ("computed − table", *(("service − computed", "measured − computed") if with_service else ()))
     print(f"{'figure':<8}{'motion':<16}{'quantity':<14}{'greatest':>10}" + "".join(f"{head:>21}" for head in heads))
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _driven(recording: Path, quiet: bool) -> dict[str, Driven]:
-    """Have the service follow the motions, and say so unless `quiet`; return what it did by the motions' names."""
+    """Follow the motions by the service, with progress messages unless `quiet`; return its motions by name."""
     try:
         recording.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

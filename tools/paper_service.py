@@ -1,9 +1,9 @@
-"""The paper's three motions by a running service: sent to it over Zenoh, read back from its recording.
+"""The paper's three motions by a running service, sent to it over Zenoh and read back from its recording.
 
-The service is one of its own, on simulated drives (configs/sim.toml), on a socket in a folder that is removed again.
-Each motion of equation (5) goes to it as a timed trajectory. Equation (5) begins and ends with an acceleration at
-standstill, of up to 0.032 m/s² at a slider: that is a jerk of 32 m/s³ for one cycle of 1 ms, at its beginning and its
-end, which the sliders' limit of configs/sim.toml, 400 m/s³, allows.
+The service is private, on simulated drives (configs/sim.toml), on a socket in a temporary folder.
+It receives each motion of equation (5) as a timed trajectory. Equation (5) begins and ends with an acceleration at
+standstill of up to 0.032 m/s² at a slider: a jerk of 32 m/s³ for one cycle of 1 ms at either end, which the sliders'
+limit of 400 m/s³ in configs/sim.toml allows.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ from trirail.client.client import GoalHandle, Robot
 from trirail.config import SIM, load
 from trirail.errors import RefusedError, ServiceError
 from trirail.kinematics.arrays import Array
-from trirail.telemetry.reading import Recording, read
+from trirail.telemetry.reading import read
+from trirail.telemetry.recording import Recording
 from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.vocabulary import MODES, Mode
 
 SPACING = 0.02
-"""Between the points of a trajectory [s]. The remainder of the service's quintics between them is
+"""Time between the points of a trajectory [s]. The remainder of the service's quintics between them is
 f⁽⁶⁾ τ³ (h − τ)³ / 720 at a time τ of an interval h: in position, velocity and acceleration at most h⁶/46080,
-√5 h⁵/30000 and h⁴/1920 of the sixth derivative, here 5e-17 m, 9e-15 m/s and 3e-12 m/s². Rounding is no smaller, and
-grows as points come closer."""
+√5 h⁵/30000 and h⁴/1920 of the sixth derivative, here 5e-17 m, 9e-15 m/s and 3e-12 m/s². Rounding errors are not
+smaller, and grow with closer points."""
 WITHIN = 60.0
-"""How long a motion may take: a busy machine's time runs slower [s]."""
+"""Time limit of a motion, which takes longer on a busy machine [s]."""
 USER = "paper"
 REACHED = 2
-"""Cycles from the one that writes a setpoint to the SYNC at which a drive should have reached it: it takes the setpoint
-up at the SYNC between (trirail.control.control.Control.observe)."""
+"""Cycles from the one that writes a setpoint to the SYNC at which a drive should have reached it: the drive applies
+the setpoint at the SYNC in between (trirail.control.control.Control.observe)."""
 
 
 class Driven(NamedTuple):
-    """A motion as the service carried it out, at t = 1, 2, … periods."""
+    """A motion executed by the service, at t = 1, 2, … periods."""
 
     commanded: Curves
     """Setpoints of the sliders."""
     measured: Array
-    """Where the drives say that the sliders were when they were to reach these, (N, 3) [m]."""
+    """Slider positions reported by the drives at the times of these setpoints, (N, 3) [m]."""
 
 
 def drive(recording: Path, say: Callable[[str], None]) -> dict[Example, Driven]:
-    """Have a service of its own follow the motions, recorded to a file, and return what it did. Raises TrirailError."""
+    """Follow the motions by a private service, recorded to a file; return its motions. Raises TrirailError."""
     period = load(SIM).period
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
         config, locator = own_service.private(Path(folder))
@@ -77,13 +78,13 @@ def points(example: Example) -> list[TrajectoryPoint]:
 
 
 def driven(recording: Recording, goal: str, period: float) -> Driven:
-    """Cut the motion to a goal out of a recording, in time with equation (5). Raises ServiceError.
+    """Extract the motion to a goal from a recording, in time with equation (5). Raises ServiceError.
 
-    Nothing is fitted. The log names the goal and the cycle that set the robot in motion for it. In that cycle the
-    motion advanced by one period for the first time (trirail.control.control.Control.solve), so its setpoints
-    are those of t = 1 period, those of the k-th cycle of motion t = k periods, and t = 0 is the standstill before. It
-    ends with its path, since it does not wait for the robot to settle.
-    That time ran like this throughout is checked by the progress in each record.
+    Nothing is fitted. The log names the goal and the cycle that started its motion. In that cycle the motion advanced
+    by one period for the first time (trirail.control.control.Control.solve), so its setpoints are those of t = 1
+    period, those of the k-th cycle of motion belong to t = k periods, and t = 0 is the standstill before. The motion
+    ends with its path, because it does not wait for the robot to settle.
+    The progress in each record confirms this timing throughout.
     """
     records = recording.records
     said = [(line.t, line.event) for line in recording.events if line.event is not None]
@@ -94,7 +95,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     moving = records["mode"][first:] == MODES.index(Mode.MOVING)
     n = int(np.argmin(np.append(moving, False)))
     wanted = round(DURATION / period)
-    n -= n > wanted and records["progress"][first + n - 1] >= 1.0  # the cycle behind its end, which finds it ended
+    n -= n > wanted and records["progress"][first + n - 1] >= 1.0  # the cycle after its end, which detects the end
     span = records[first : first + n + REACHED]
     t = np.arange(1.0, n + 1.0) * period
     if n != wanted or not np.array_equal(np.diff(span["cycle"]), np.ones(n + REACHED - 1)):

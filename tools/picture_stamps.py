@@ -1,7 +1,7 @@
-"""Stamps the guides' pictures with what they were drawn from: python tools/picture_stamps.py, for make screenshots.
+"""Stamp the guides' pictures with a digest of their sources: python tools/picture_stamps.py, for make screenshots.
 
-A stamp is a digest of the files that decide how a picture looks, in a text chunk of the PNG. A test compares: where
-it differs, the picture is older than what it shows.
+A stamp is a digest of the files that determine a picture, in a text chunk of the PNG. A test compares them: if they
+differ, the picture is older than its subject.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ SOURCES: dict[str, tuple[str, ...]] = {
              "service/trirail/telemetry/curves.py", "service/trirail/telemetry/palette.py", "tools/screenshot.py"),
     "paper": ("tools/paper_figures.py", "tools/paper_motions.py"),
 }  # fmt: skip
-"""Of each picture: patterns of files, below the checkout."""
+"""Sources of each picture: patterns of files, relative to the checkout."""
 
 
 def digest(name: str) -> str:
-    """Return that of the files from which a picture is drawn. Raises FileNotFoundError for a pattern without any."""
+    """Return the digest of a picture's source files. Raises FileNotFoundError for a pattern without files."""
     found = hashlib.sha256()
     for file in _files(name):
         found.update(file.relative_to(ROOT).as_posix().encode() + b"\0")
@@ -38,14 +38,14 @@ def digest(name: str) -> str:
 
 
 def stamp(name: str) -> str | None:
-    """Return the digest with which a picture was stamped; None where it was not."""
+    """Return the digest stamped into a picture; None if there is none."""
     with Image.open(PICTURES / f"{name}.png") as picture:
         said: str | None = picture.info.get(KEYWORD)
         return said
 
 
 def main() -> int:
-    """Stamp all, or those that are named; return the exit code."""
+    """Stamp all pictures, or the named ones; return the exit code."""
     for name in sys.argv[1:] or SOURCES:
         note = PngInfo()
         note.add_text(KEYWORD, digest(name))

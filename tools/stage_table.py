@@ -1,11 +1,11 @@
-"""A stage in numbers, of either kind: what its sliders do at some poses, closed form beside 60 digits and small angles.
+"""Numbers of a stage of either kind at some poses: closed form compared with 60 digits and with small angles.
 
 python tools/stage_table.py [CONFIG] [--pose X Y PHI] [--velocity VX VY W] [--json]
 
-Lengths and angles may have units, as 1mm and 5arcsec. A row tells, at one pose and velocity of the platform, where
-sliders and cross slides are and how fast the sliders go; by how much all of these, and the pose that comes back by the
-forward kinematics, differ from 60-digit arithmetic; and by how much the sliders' places differ from those of the
-equations for small angles that most programs use.
+Lengths and angles may have units, such as 1mm and 5arcsec. A row contains, for one pose and velocity of the platform,
+the positions of sliders and cross slides and the velocities of the sliders; the differences of all these, and of the
+pose returned by the forward kinematics, from 60-digit arithmetic; and the differences of the slider positions from
+those of the small-angle equations that most programs use.
 """
 
 from __future__ import annotations
@@ -45,28 +45,28 @@ POSES = tuple(
         (-3, 2, -5),
     )
 )
-"""Those of the guide to the kinds, and some beside them [m, rad]."""
+"""Poses of the guide to the kinds, and some more [m, rad]."""
 PLATFORM = 0.01, -0.005, 0.1
-"""The platform's velocity [m/s, m/s, rad/s]."""
+"""Velocity of the platform [m/s, m/s, rad/s]."""
 STEP = Decimal("1e-20")
-"""Of the difference that is the 60-digit velocity [s]: its error is of 1e-40."""
+"""Step of the difference quotient for the 60-digit velocity [s]: its error is of order 1e-40."""
 
 
 class StageRow(NamedTuple):
-    """One pose, (3,) each."""
+    """Row for one pose, (3,) each."""
 
     pose: list[float]
-    """[m, m, rad]."""
+    """Pose of the platform [m, m, rad]."""
     sliders: list[float]
-    """[m]."""
+    """Positions of the sliders [m]."""
     passive: list[float]
-    """Of the cross slides [m]."""
+    """Positions of the cross slides [m]."""
     velocity: list[float]
-    """Of the sliders [m/s]."""
+    """Velocities of the sliders [m/s]."""
     difference: float
-    """The greatest from 60 digits: of sliders, cross slides [m], their velocities [m/s], and the pose [m, rad]."""
+    """Maximum difference from 60 digits, of sliders, cross slides [m], their velocities [m/s], and pose [m, rad]."""
     small_angles: float
-    """The greatest of the sliders as small angles have them [m]."""
+    """Maximum difference of the sliders from those of the small-angle equations [m]."""
 
 
 def rows(robot: Geometry, poses: Sequence[Sequence[float]], velocity: Sequence[float]) -> list[StageRow]:
@@ -101,7 +101,7 @@ def rows(robot: Geometry, poses: Sequence[Sequence[float]], velocity: Sequence[f
 
 
 def _true(robot: Geometry, pose: Sequence[float], velocity: Sequence[float]) -> tuple[Array, Array]:
-    """Return where sliders and cross slides are, (2, 3) [m], and how fast they go [m/s], by 60 digits."""
+    """Return the positions of sliders and cross slides, (2, 3) [m], and their velocities [m/s], by 60 digits."""
     with localcontext() as context:
         context.prec = exact.DIGITS
         after, before = (
@@ -122,7 +122,7 @@ def _exact(leg: AnyLeg, pose: Sequence[float | Decimal]) -> tuple[Decimal, Decim
 
 
 def show(robot: Geometry, velocity: Sequence[float], table: Sequence[StageRow]) -> None:
-    """Print the table for people."""
+    """Print the table as text."""
     a, b, c = robot.labels
     vx, vy, w = velocity
     print(f"{robot.kind}, platform at {vx * 1e3:g} mm/s, {vy * 1e3:g} mm/s, {w / DEGREE:.4g} °/s\n")

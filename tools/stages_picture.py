@@ -1,4 +1,4 @@
-"""The picture of the two kinds of stages, tools/pictures/stages.svg, from the shipped geometries. Needs matplotlib.
+"""Picture of the two kinds of stages, tools/pictures/stages.svg, from the shipped geometries. Needs matplotlib.
 
 python tools/stages_picture.py [FILE]
 """
@@ -23,25 +23,25 @@ from trirail.workspace.part_positions import RobotParts
 FILE = Path(__file__).parent / "pictures/stages.svg"
 INK, GREY, RAIL, TABLE, CARRIAGE, CROSS = "#1f2933", "#7b8794", "#d3d9e0", "#f0772b", "#1b7f4d", "#2166ac"
 TURNED = 0.0, 0.0, math.radians(12.0)
-"""Farther than the shipped stages may turn: so that it is seen [m, rad]."""
+"""Pose beyond the rotation limit of the shipped stages, to be visible [m, rad]."""
 PANELS = (
     ("uvw", "kind 1, 3-PRP: the cross slides turn with the table"),
     ("uvw-ppr", "kind 2, 3-PPR: the cross slides keep their direction"),
 )
 SLIDE = 0.014
-"""Half of what is drawn of a cross slide [m]."""
+"""Half of the drawn length of a cross slide [m]."""
 
 
 def draw(file: Path) -> None:
-    """Draw both kinds, turned, in millimetres; what turns is orange, the tables at zero are dashed."""
-    # Text as text and no date: the file is small, and the same for the same stages.
+    """Draw both kinds, turned, in millimetres; turning parts are orange, the tables at zero are dashed."""
+    # Text as text and no date keep the file small, and identical for identical stages.
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "stages"}):
         figure = Figure(figsize=(10.0, 5.2), layout="constrained")
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
         for panel, (name, title) in zip(panels, PANELS, strict=True):
             config = load(SIM.with_name(f"{name}.toml"))
             robot = geometry(config.geometry)
-            _stage(panel, robot, RobotParts.of(robot, config.limits.slider))
+            _stage(panel, robot, RobotParts.from_geometry(robot, config.limits.slider))
             panel.set_title(title, color=INK, fontsize=12)
             panel.set_aspect("equal")
             panel.set_axis_off()
@@ -55,13 +55,13 @@ def _stage(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
         panel.plot(*(1e3 * rail.T), color=RAIL, linewidth=9.0, solid_capstyle="round", zorder=1)
     table = parts.outline[-1]
     panel.plot(*(1e3 * table.T), color=GREY, linewidth=1.0, linestyle=(0, (4, 3)), zorder=2)
-    (turned,) = part_positions.placed([table], TURNED)
+    (turned,) = part_positions.transform_lines([table], TURNED)
     panel.add_patch(Polygon(1e3 * turned, facecolor=TABLE, edgecolor=TABLE, alpha=0.15, zorder=2))
     panel.plot(*(1e3 * turned.T), color=TABLE, linewidth=1.8, zorder=3)
     pose = np.array([TURNED])
-    at = part_positions.sliders(robot, inverse(robot, pose).position)
-    held = part_positions.pivots(robot, at, pose)[0]
-    lines = part_positions.cross_slides(robot, parts, at, pose[:, 2])[0]
+    at = part_positions.slider_points(robot, inverse(robot, pose).position)
+    held = part_positions.pivot_points(robot, at, pose)[0]
+    lines = part_positions.cross_slide_lines(robot, parts, at, pose[:, 2])[0]
     for label, carriage, pivot, line in zip(robot.labels, at[0], held, lines, strict=True):
         along = (line[1] - line[0]) / np.linalg.norm(line[1] - line[0])
         slide = np.array([carriage - SLIDE * along, carriage + SLIDE * along])
@@ -74,7 +74,7 @@ def _stage(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
 
 
 def _legend(panel: Axes) -> None:
-    """Say what is what."""
+    """Draw the legend."""
     for style, colour, name in (
         ("s", CARRIAGE, "carriage, driven on its rail"),
         ("|", CROSS, "cross slide, not driven"),

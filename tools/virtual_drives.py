@@ -1,9 +1,9 @@
-"""The simulated drives as a program of its own, on any python-can bus.
+"""Simulated drives as a separate program, on any python-can bus.
 
 python tools/virtual_drives.py configs/sim.toml --interface unix --channel /tmp/can.sock
 python tools/virtual_drives.py configs/vcan.toml --interface socketcan --channel vcan0 --faults faults.txt
 
-Faults come from a file, or are typed while it runs: `A silent for 0.5`, `with 0.01 C drop tpdo2`; `help` lists them.
+Faults come from a file or the keyboard: `A silent for 0.5`, `with 0.01 C drop tpdo2`; `help` lists them.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from trirail_drivers.simulated import SimulatedBus
 from trirail_drivers.simulated.faultlines import HELP, FaultSyntaxError
 
 _POLLS = 5
-"""So many times a cycle the drives' own timers are looked at, if no frame comes."""
+"""Polls of the drives' own timers per cycle without frames."""
 
 
 class Report:
-    """One line on stdout for each change of a drive's power state."""
+    """Printer of one line on stdout for each change of a drive's power state."""
 
     def __init__(self, drives: Drives, bus: SimulatedBus) -> None:
         self._axes = list(zip(NAMES, drives.each, bus.drives, strict=True))
         self._said: dict[str, str] = {}
 
     def once(self, text: str) -> None:
-        """Say something, the first time only."""
+        """Print a text, the first time only."""
         if text not in self._said:
             self._said[text] = text
             say(text)
 
     def update(self) -> None:
-        """Say what has changed."""
+        """Print the changes of state."""
         for name, axis, drive in self._axes:
             state = str(drive.state)
             if self._said.get(name) != state:
@@ -57,7 +57,7 @@ class Report:
 
 
 class Console:
-    """Takes up what is typed, line by line, without waiting for it."""
+    """Non-blocking reader of typed lines."""
 
     def __init__(self, bus: SimulatedBus) -> None:
         self._faults = bus.faults
@@ -65,7 +65,7 @@ class Console:
         self._open = sys.stdin is not None
 
     def poll(self) -> None:
-        """Carry out the lines that have come since."""
+        """Execute the lines that have arrived since the last call."""
         if not self._open or not select.select([sys.stdin], [], [], 0.0)[0]:
             return
         chunk = os.read(sys.stdin.fileno(), 4096)
@@ -93,29 +93,29 @@ class Console:
 
 
 def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Console, poll: float) -> None:
-    """Carry frames between a bus and the simulated drives, until interrupted; look at their timers each `poll` [s]."""
+    """Carry frames between a bus and the simulated drives until interrupted; poll their timers every `poll` [s]."""
     while True:
         console.poll()
         try:
             frame = wire.recv(poll)
-        except can.CanOperationError as error:  # a bus that is down: their watchdogs run, and it may come back
+        except can.CanOperationError as error:  # a bus that is down: the watchdogs run, and it may recover
             report.once(f"cannot receive: {error}")
             frame = None
             time.sleep(poll)
         if frame is not None:
-            with contextlib.suppress(can.CanOperationError):  # bus-off: nobody hears it
+            with contextlib.suppress(can.CanOperationError):  # bus-off: no receiver
                 drives.send(frame)
         while (answer := drives.recv(0.0)) is not None:
             if not answer.is_error_frame or _carries_error_frames(wire):
                 try:
                     wire.send(answer)
-                except can.CanOperationError as error:  # a full queue or a bus that is down: drives go on without
+                except can.CanOperationError as error:  # a full queue or a bus that is down: drives continue
                     report.once(f"cannot send: {error}")
         report.update()
 
 
 def _carries_error_frames(wire: can.BusABC) -> bool:
-    """Whether the others get an error frame as one; a real controller would send a data frame in its place."""
+    """Return whether others receive error frames as such; a real controller would send a data frame instead."""
     return isinstance(wire, UnixBus) or "vcan" in wire.channel_info or "virtual" in wire.channel_info.lower()
 
 
@@ -151,7 +151,7 @@ def main() -> int:
 
 
 def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
-    """The bus of the drives, with the file's bitrate and options; of a unix socket they are the end that listens."""
+    """Return the bus of the drives, with the file's bitrate and options; on a unix socket, it is the listening end."""
     if interface == "unix":
         return UnixBus(channel, listen=True)
     section = msgspec.structs.replace(config.can, interface=interface, channel=channel)
@@ -159,7 +159,7 @@ def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
 
 
 def say(text: str) -> None:
-    """Print at once, also into a pipe."""
+    """Print immediately, even into a pipe."""
     print(text, flush=True)
 
 

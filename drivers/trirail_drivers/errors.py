@@ -1,24 +1,24 @@
-"""The root of every error trirail raises, and the drives' branch of it."""
+"""Root of all trirail errors, and the errors of drives."""
 
 from __future__ import annotations
 
-LONGEST = 500
-"""Characters of a message at most."""
-_CUT = " … "
+MAX_MESSAGE_LENGTH = 500
+"""Largest length of a message [characters]."""
+_ELLIPSIS = " … "
 
 
-def shortened(text: str, longest: int = LONGEST) -> str:
-    """Cut a text that is too long in its middle: it begins with what is wrong and where, and ends with the remedy."""
+def shortened(text: str, longest: int = MAX_MESSAGE_LENGTH) -> str:
+    """Shorten a long text in the middle: its beginning names the problem, its end the remedy."""
     if len(text) <= longest:
         return text
     end = longest // 3
-    return f"{text[: longest - end - len(_CUT)]}{_CUT}{text[-end:]}"
+    return f"{text[: longest - end - len(_ELLIPSIS)]}{_ELLIPSIS}{text[-end:]}"
 
 
 class TrirailError(Exception):
-    """Anything trirail refuses or cannot do; the message is one line that says what, where and the remedy.
+    """Refusal or failure of trirail; the message is one line with object, problem and remedy.
 
-    It is of bounded length, for it may repeat what a file or a message held.
+    Its length is bounded, since it may repeat the content of a file or a message.
     """
 
     def __init__(self, message: str) -> None:
@@ -26,7 +26,7 @@ class TrirailError(Exception):
 
 
 class FileError(TrirailError):
-    """A file that cannot be read, or cannot be made where it is to be."""
+    """A file cannot be read or created."""
 
 
 class DriveError(TrirailError):
@@ -37,6 +37,10 @@ class BusError(DriveError):
     """The CAN interface is missing, down, or cannot carry the configured traffic."""
 
 
+class BusAbsentError(BusError):
+    """The CAN interface is missing or down, but may appear or come up later."""
+
+
 class DriveTimeout(DriveError):
     """A drive did not answer in time."""
 
@@ -45,14 +49,18 @@ class DriveTimeout(DriveError):
         self.drive = drive
 
 
+class DriveAbsentError(DriveTimeout):
+    """A drive has answered nothing at all."""
+
+
 class ConfigurationRefused(DriveError):
-    """A drive did not take a value: what was read back differs from what was written."""
+    """A drive did not keep a written value: another one was read back."""
 
     def __init__(
-        self, drive: str, name: str, index: int, subindex: int, wanted: object, found: object, seconds: float
+        self, drive: str, name: str, index: int, subindex: int, wanted: object, read_back: object, seconds: float
     ) -> None:
         super().__init__(
-            f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): wanted {wanted}, found {found} "
+            f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): wanted {wanted}, found {read_back} "
             f"after {seconds:.3g} s"
         )
         self.drive = drive

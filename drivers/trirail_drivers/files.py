@@ -1,17 +1,21 @@
-"""Files: those that people name are read without waiting, if they are regular ones; what must last is written whole."""
+"""Reading of regular files without blocking, and writing of files that survive a crash whole."""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import stat
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from trirail_drivers.errors import FileError
 
 LARGEST_TEXT = 16_000_000
-"""The largest text that is read [bytes]: some hundred thousand points of a trajectory."""
+"""Largest text file that is read [bytes]: some hundred thousand points of a trajectory."""
 
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
@@ -23,9 +27,9 @@ _KINDS = {
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file to be read. Raises FileError, where there is none or where reading might never end."""
+    """Open a regular file for reading. Raises FileError if it is missing, or not regular and might never end."""
     try:
-        # Opening a device may do something, and a FIFO without O_NONBLOCK waits for somebody to write to it.
+        # Checked before: opening a device may have effects, and opening a FIFO without O_NONBLOCK waits for a writer.
         check(path)
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     except OSError as error:
@@ -41,7 +45,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def text(path: Path) -> str:
-    """Read a text file in UTF-8. Raises FileError."""
+    """Return the content of a text file in UTF-8. Raises FileError."""
     with open_regular(path) as file:
         try:
             content = file.read(LARGEST_TEXT + 1)
@@ -56,10 +60,10 @@ def text(path: Path) -> str:
 
 
 def replace(path: Path, content: bytes, mode: int = 0o644) -> None:
-    """Write a file such that a crash or a power cut, whenever it comes, leaves the old one or the new one, whole.
+    """Replace a file such that a crash or a power cut leaves either the old or the new one, whole.
 
-    It is written beside its place, where only its owner can read it, and is on the disk before it takes its name; the
-    name is on the disk when this returns. Raises OSError.
+    The content is written to a temporary file beside it, which only its owner can read, and synced before the rename;
+    the rename is synced before this returns. Raises OSError.
     """
     descriptor, beside = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # 0600
     try:
@@ -76,20 +80,72 @@ def replace(path: Path, content: bytes, mode: int = 0o644) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and those above it that are missing, such that a power cut does not take them. Raises OSError."""
+    """Create a folder and its missing parents, and sync them to the disk. Raises OSError."""
     if not folder.is_dir():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)
         _sync_folder(folder.parent)
 
 
+PREFIX = "trirail-run-"
+"""Prefix of a temporary folder's name; folders with other names are never removed."""
+
+
+@contextmanager
+def temporary_folder(parent: str | None = None) -> Iterator[Path]:
+    """Create a folder and remove it afterwards; remove those that killed processes of this user have left.
+
+    A folder is in use while a process holds its lock, which ends with the process. Raises OSError.
+    """
+    base = Path(parent or tempfile.gettempdir())
+    for left in base.glob(f"{PREFIX}*"):
+        _remove_unused(left)
+    folder, lock = _locked_folder(base)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _locked_folder(base: Path) -> tuple[Path, int]:
+    """Return a new folder and the descriptor of its lock; try again if another process removes it before the lock."""
+    while True:
+        folder = tempfile.mkdtemp(prefix=PREFIX, dir=base)
+        with suppress(FileNotFoundError, BlockingIOError):
+            lock = _lock(folder)
+            if os.fstat(lock).st_nlink:
+                return Path(folder), lock
+            os.close(lock)
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove a folder of this user that is not locked."""
+    with suppress(OSError):
+        if folder.lstat().st_uid != os.getuid():
+            return
+        lock = _lock(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _lock(folder: Path | str) -> int:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
 def check(path: Path) -> None:
-    """Raise FileError for what is there but is no regular file, OSError where nothing is there."""
+    """Raise FileError for a path that is no regular file, OSError if it does not exist."""
     _check(path, os.stat(path))
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk: fsync of a file keeps its content, not its name."""
+    """Sync the names in a folder to the disk: fsync of a file covers its content, not its name."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -97,6 +153,6 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _check(path: Path, found: os.stat_result) -> None:
-    if not stat.S_ISREG(found.st_mode):
-        raise FileError(f"{path}: {_KINDS.get(stat.S_IFMT(found.st_mode), 'no file')}; wanted a regular file")
+def _check(path: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise FileError(f"{path}: {_KINDS.get(stat.S_IFMT(status.st_mode), 'no file')}; wanted a regular file")

@@ -1,4 +1,4 @@
-"""What the control loop needs of three drives together."""
+"""Interface between the control loop and three drives."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import NamedTuple, Protocol
 from msgspec import Struct
 
 NAMES = ("A", "B", "C")
-"""The drives are named as the sliders they move."""
+"""Names of the drives, which are those of their sliders."""
 
 Triple = tuple[float, float, float]
 
 Clock = Callable[[], float]
-"""Tells the time [s]: monotonic, or that of a simulation."""
+"""Function that returns the time [s]: monotonic, or simulated."""
 
 
 class PowerState(IntEnum):
-    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton); other drives' are told as these."""
+    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton), used for every protocol."""
 
     NOT_READY_TO_SWITCH_ON = 0
     SWITCH_ON_DISABLED = 1
@@ -34,126 +34,160 @@ class PowerState(IntEnum):
 
 
 class DriveFault(NamedTuple):
-    """Why a drive must not be moved any more; lasts until it is reset."""
+    """Fault of a drive or the bus, latched until it is reset."""
 
     drive: str
-    """Name of the drive, or "" where the bus itself is at fault."""
+    """Name of the drive, or "" for a fault of the bus."""
     cause: str
     """One of emcy, fault, silent, heartbeat, state, timeout, homing, frame, setpoint, bus."""
     code: int
-    """The EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
+    """The EMCY or 603Fh error code, or an ODrive's error bits; 0 if there is none."""
     message: str
     """One line for people, of bounded length, with drive, cause and code in words."""
 
 
 class MissingProtection(Struct, frozen=True):
-    """What would stop a drive where the service cannot, and what it does without, as its configuration accepts."""
+    """A protection that a drive lacks, as its configuration accepts."""
 
     drive: str
     """Name of the drive."""
     object: str
-    """As `accept_without` names it: the object's index, as 1006."""
+    """Name in `accept_without`: the object's index, as 1006, or an ODrive's setting."""
     means: str
-    """One line for people: what it is for, and what is so without."""
+    """One line for people: its purpose, and the consequence of lacking it."""
 
 
 class Counts(NamedTuple):
-    """What of one drive's cyclic traffic went wrong since the start; none of it is a fault by itself."""
+    """Numbers of late and lost positions and setpoints of one drive since the start; none is a fault by itself."""
 
     feedback_late: int = 0
-    """Positions that came a cycle later than the one before did."""
+    """Positions that came a cycle later than the previous one did."""
     feedback_lost: int = 0
     """SYNCs that were never answered, as far as later answers show."""
     setpoints_late: int = 0
     """Setpoints written after the next SYNC was due."""
     setpoints_lost: int = 0
-    """Setpoints that the bus did not take."""
+    """Setpoints that the bus refused."""
+
+
+class Unready(NamedTuple):
+    """Reason for which a drive cannot be reset yet, and the progress of its set-up."""
+
+    reason: str
+    """One line for people: it does not answer, restarted, or is refused."""
+    objects: int = 0
+    """Number of its objects read or written until now; 0 outside a set-up."""
+    expected: int = 0
+    """Number of them in its last set-up; 0 if it had none."""
+    counted: str = "objects"
+    """Name of the things counted, for people."""
+
+    def __str__(self) -> str:
+        of = f" of {self.expected}" if self.expected >= self.objects else ""
+        return f"{self.reason} ({self.objects}{of} {self.counted})" if self.objects else self.reason
+
+
+UnreadyDrives = tuple[Unready | None, Unready | None, Unready | None]
+"""Reason for which each drive cannot be reset yet; None if it is configured."""
 
 
 class Feedback(NamedTuple):
-    """What the three drives have said by now."""
+    """Feedback of the three drives."""
 
     position: Triple
     """Measured slider positions [m]."""
     state: tuple[PowerState, PowerState, PowerState]
     fault: DriveFault | None
-    """The first fault since the last reset, or that a drive did not stop after it; else None."""
+    """First fault since the last reset, or the fault of a drive that did not stop after it; else None."""
     counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
     warnings: tuple[str, ...] = ()
-    """What people should know and is no fault, a line each; told in one feedback only."""
+    """New warnings for people, a line each; each appears in one feedback only."""
     age: tuple[int, int, int] = (0, 0, 0)
-    """How many SYNCs before the newest one each position was sampled: 0 where a drive has answered it already, 1
-    where the answer is still on its way, more where answers were lost."""
+    """Number of SYNCs between the one at which each position was sampled and the newest: 0 if the drive has answered
+    it already, 1 if its answer is still on its way, more if answers were lost."""
     homing: bool = False
-    """Drives are being homed."""
+    """Whether a drive is being homed."""
     follows: tuple[bool, bool, bool] = (True, True, True)
-    """Whether each drive follows setpoints; one that is being homed moves by itself."""
+    """Whether each drive follows setpoints; a drive that is being homed moves by itself."""
     homed: tuple[bool, bool, bool] = (True, True, True)
-    """Whether each position is counted from a known place: always with absolute encoders, else after homing."""
+    """Whether each position is counted from a known place: always with absolute encoders, otherwise after homing."""
+    unready: UnreadyDrives = (None, None, None)
+    """Reason for which each drive cannot be reset yet; None if it is configured. A drive without a position since the
+    start is reported at its zero, and as not homed."""
 
 
 class DriveGroup(Protocol):
     """Three drives that follow a position setpoint every cycle.
 
-    `configure` and `close` may block and raise DriveError. All else is for the cycle: it never blocks and never
-    raises; what goes wrong is a fault in the next feedback.
+    `configure` and `close` may block and raise DriveError. All other methods are for the cycle and never block or
+    raise; an error becomes a fault in the next feedback.
     """
 
     bus_load: float
-    """Worst-case share of the bus that the cyclic traffic takes, with stuffing; 1.0 is full."""
-    missing_protections: tuple[MissingProtection, ...]
-    """What the drives do without; known once they are set up."""
+    """Worst-case share of the bus that the cyclic traffic takes, with bit stuffing; 1.0 is full."""
+
+    @property
+    def missing_protections(self) -> tuple[MissingProtection, ...]:
+        """Protections that the configured drives lack."""
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames sent and heard since the start, each with worst-case stuffing; what a kernel filters out
-        is not heard."""
+        """Bits of all frames sent and received since the start, each with worst-case stuffing, without those that the
+        kernel filters out."""
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
-        """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
+        """First fault that each drive itself has reported since the last reset, or None."""
 
-    def configure(self, period: float, fastest: float | None = None) -> None:
-        """Set the drives up for a cycle of `period` seconds, check what can be read back, start them without power.
+    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
+        """Set the drives up for a cycle of `period` seconds, read back what can be read, start them without power.
 
-        `fastest` is the sliders' limit of velocity [m/s]: where it is given, drives that cannot be told it are refused.
+        Parameters
+        ----------
+        period
+            Cycle period [s].
+        fastest
+            Velocity limit of the sliders [m/s]; if given, drives that cannot take it are refused.
+        awaits
+            Whether a drive that does not answer is a fault instead of an error: the following cycles configure it
+            when it appears, like a drive that restarts.
         """
 
     def sync(self) -> None:
-        """Begin a cycle: the drives take up the setpoints written in the last one and sample their positions."""
+        """Begin a cycle: the drives adopt the setpoints written in the last one and sample their positions."""
 
     def read(self) -> Feedback:
-        """Take in every frame that has arrived."""
+        """Handle every frame that has arrived; return the feedback."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC."""
+        """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC."""
 
     def enable(self, alone: str | None = None) -> None:
-        """Begin to power up, all drives, or the one of this name `alone`: the others are kept without power.
+        """Begin to power up all drives, or only the drive `alone`, the others staying without power.
 
-        The following cycles carry it out, the feedback's states tell when it is done. Drives that have power, or are
-        getting it, first have to be disabled.
+        The following cycles carry it out, as the states in the feedback show. Drives with power, or getting it, must
+        be disabled first.
         """
 
     def home(self) -> None:
         """Begin to home the drives whose positions are not absolute; the following cycles carry it out.
 
-        Powered drives at standstill only; one that was enabled alone is homed alone. What is written for a drive is
-        not for it while it does not follow; in the cycle in which it follows again, that must be the position that was
-        fed back one cycle before.
+        Only for powered drives at standstill; a drive that was enabled alone is homed alone. While a drive does not
+        follow, its setpoints are ignored; in the cycle in which it follows again, its setpoint must be the position
+        of the previous cycle's feedback.
         """
 
     def stop_homing(self) -> None:
-        """Halt the drive that is being homed; in the end every drive follows setpoints again, where it stands."""
+        """Halt the drive that is being homed; then every drive follows setpoints again, at its present position."""
 
     def disable(self) -> None:
-        """Take power off; meant for a robot at standstill."""
+        """Take the power off, at standstill."""
 
     def quick_stop(self) -> None:
-        """Make every drive stop by its quick-stop ramp, beginning in this cycle."""
+        """Begin the quick-stop ramp of every drive in this cycle."""
 
     def reset(self) -> None:
-        """Forget the fault and clear the drives' own; never powers them up."""
+        """Clear the latched fault and the drives' own faults, without powering up."""
 
     def close(self) -> None:
-        """Leave the drives without power and not operational, and let go of the bus."""
+        """Leave the drives without power and not operational, and close the bus."""

@@ -1,7 +1,7 @@
 """trirail: a background service that drives a 3-PRP planar parallel robot in real time.
 
-What most programs need is here; each name is loaded when it is first asked for, so that `import trirail` costs
-nothing, `Robot` neither compiles nor draws, and the kinematics needs no network.
+Public names of the package. Each is loaded on first access: `import trirail` stays fast, `Robot` needs neither compiled
+code nor plots, and the kinematics needs no network.
 
 from trirail import Robot, AsyncRobot            # a connection to a running service
 from trirail import read                         # a recording, into numpy
@@ -18,7 +18,15 @@ if TYPE_CHECKING:
 
     from trirail.client.async_client import AsyncRobot
     from trirail.client.client import Robot
-    from trirail.errors import ConfigError, KinematicsError, RefusalCode, RefusedError, ServiceError, TrirailError
+    from trirail.errors import (
+        ConfigError,
+        KinematicsError,
+        RefusalCode,
+        RefusedError,
+        ServiceError,
+        TrirailError,
+        WaitTimeoutError,
+    )
     from trirail.kinematics.geometry import CrossLeg, Geometry, Leg
     from trirail.kinematics.robot import forward, inverse, jacobians
     from trirail.telemetry.reading import read
@@ -35,6 +43,7 @@ __all__ = [
     "Robot",
     "ServiceError",
     "TrirailError",
+    "WaitTimeoutError",
     "__version__",
     "forward",
     "inverse",
@@ -42,26 +51,29 @@ __all__ = [
     "read",
 ]
 
-_HOMES = {
+_NAMES_BY_MODULE = {
     "trirail.client.async_client": ("AsyncRobot",),
     "trirail.client.client": ("Robot",),
-    "trirail.errors": ("ConfigError", "KinematicsError", "RefusalCode", "RefusedError", "ServiceError", "TrirailError"),
+    "trirail.errors": (
+        *("ConfigError", "KinematicsError", "RefusalCode", "RefusedError", "ServiceError", "TrirailError"),
+        "WaitTimeoutError",
+    ),
     "trirail.kinematics.geometry": ("Geometry", "Leg", "CrossLeg"),
     "trirail.kinematics.robot": ("forward", "inverse", "jacobians"),
     "trirail.telemetry.reading": ("read",),
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
+_MODULE_OF = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names}
 
 
 def __getattr__(name: str) -> object:
     """Load a public name from its module: PEP 562."""
     if name == "__version__":
-        from importlib.metadata import version  # it takes longer than all the rest
+        from importlib.metadata import version  # its import takes longer than all others
 
         return version("trirail")
-    if name not in _HOME:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOME[name]), name)
+    value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
     return value
 
 

@@ -1,4 +1,4 @@
-"""`trirail` and `python -m trirail`."""
+"""Entry point of `trirail` and `python -m trirail`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import sys
 
 
 def main() -> None:
-    """Run a command. While the command line is loaded, a third of a second, Ctrl-C ends it as it ends any program."""
+    """Run a command. While the command line loads, for a third of a second, Ctrl-C ends the process at signal level."""
     _open_standard_streams()
-    handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored, as under nohup
+    handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # nohup ignores it
     if handled:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from trirail.cli import app
@@ -21,12 +21,12 @@ def main() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Open those that are closed, as by `>&-`: else what a command opens has their number, and is written to."""
+    """Open the standard streams that are closed, as by `>&-`: else a file that a command opens takes their number."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
             os.set_inheritable(number, True)
     sys.stdin = sys.stdin or os.fdopen(0, closefd=False)
     sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)

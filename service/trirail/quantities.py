@@ -1,42 +1,62 @@
-"""A quantity in words for people: millimetres and degrees. What programs get is in SI units."""
+"""Formatting of quantities for people, in millimetres and degrees; programs get SI units."""
 
 from __future__ import annotations
 
 import math
 from typing import Final
 
-SHOWN: Final = {"m": (" mm", 1e3), "rad": ("°", 180.0 / math.pi)}
-"""What people read in place of a unit, and how many of it that is."""
+DISPLAY_UNITS: Final = {"m": (" mm", 1e3), "rad": ("°", 180.0 / math.pi)}
+"""Displayed unit of an SI unit, and the factor to it."""
 _SMALLER: Final = {"m": ((" µm", 1e6), (" nm", 1e9)), "rad": ((" mrad", 1e3), (" µrad", 1e6), (" nrad", 1e9))}
 _DIGITS: Final = 6
-_NOTHING: Final = 1e-12
-"""Less of mm or ° is 0."""
+FAMILIAR_UNITS: Final = {"m": (1e-3, 1.0), "rad": (math.pi / 180.0, 2.0)}
+"""Millimetre and degree in SI, and the smallest number that suggests that they were intended."""
+_ZERO: Final = 1e-12
+"""Magnitude below which a number of mm or ° is displayed as 0."""
 
 
 def worded(value: float, unit: str) -> str:
-    """Write a value in SI, of m or rad or any rate of these, with six significant digits."""
+    """Format a value in m, rad or a rate of these, with six significant digits."""
     return apart(value, value, unit)[0]
 
 
 def apart(value: float, other: float, unit: str) -> tuple[str, str]:
-    """Write two values with six significant digits, or as many more as it takes to tell them apart."""
+    """Format two values with six significant digits, or with as many as distinguish them."""
     base, per, rate = unit.partition("/")
-    name, size = SHOWN.get(base, (f" {base}" if base else "", 1.0))
+    shown, size = DISPLAY_UNITS.get(base, (f" {base}" if base else "", 1.0))
     digits = _DIGITS
     while digits < 17 and value != other and _same(value * size, other * size, digits):
         digits += 1
-    return f"{_number(value * size, digits)}{name}{per}{rate}", f"{_number(other * size, digits)}{name}{per}{rate}"
+    return f"{_number(value * size, digits)}{shown}{per}{rate}", f"{_number(other * size, digits)}{shown}{per}{rate}"
 
 
-def beyond(what: str, value: float, limit: float, unit: str) -> str:
-    """Say that a value is beyond its limit; by how much, where six digits do not show that."""
+def beyond(name: str, value: float, limit: float, unit: str) -> str:
+    """Describe a value beyond its limit, by the difference if six digits do not show it."""
     base, per, rate = unit.partition("/")
-    size = SHOWN.get(base, ("", 1.0))[1]
+    size = DISPLAY_UNITS.get(base, ("", 1.0))[1]
     if math.isfinite(value) and _same(value * size, limit * size, _DIGITS):
         smaller = _SMALLER.get(base, ((f" {base}" if base else "", 1.0),))
-        name, more = next((each for each in smaller if abs(value - limit) * each[1] >= 1.0), smaller[-1])
-        return f"{what} is {abs(value - limit) * more:.3g}{name}{per}{rate} beyond its limit {worded(limit, unit)}"
-    return f"{what} {worded(value, unit)} is beyond its limit {worded(limit, unit)}"
+        unit_name, factor = next((each for each in smaller if abs(value - limit) * each[1] >= 1.0), smaller[-1])
+        return (
+            f"{name} is {abs(value - limit) * factor:.3g}{unit_name}{per}{rate} beyond its limit {worded(limit, unit)}"
+        )
+    return f"{name} {worded(value, unit)} is beyond its limit {worded(limit, unit)}"
+
+
+_WHOLE_TOLERANCE: Final = 1e-6
+"""Rounding error of an angle that was converted from degrees [0.01°]."""
+
+
+def meant(value: float, limit: float, unit: str) -> float | None:
+    """Return a bare number above a limit in SI, as if it were in millimetres or degrees; None if that is implausible.
+
+    An angle of whole hundredths of a degree is taken as converted from degrees already.
+    """
+    size, minimum = FAMILIAR_UNITS[unit.removesuffix("/s")]
+    hundredths = 100.0 * math.degrees(value)
+    if unit.startswith("rad") and math.isfinite(hundredths) and abs(hundredths - round(hundredths)) < _WHOLE_TOLERANCE:
+        return None
+    return value * size if abs(value) >= minimum and abs(value) * size <= abs(limit) else None
 
 
 def _same(value: float, other: float, digits: int) -> bool:
@@ -44,4 +64,4 @@ def _same(value: float, other: float, digits: int) -> bool:
 
 
 def _number(value: float, digits: int) -> str:
-    return f"{0.0 if abs(value) < _NOTHING else value:.{digits}g}"  # 0 and -0 are one number
+    return f"{0.0 if abs(value) < _ZERO else value:.{digits}g}"  # 0 and -0 are one number

@@ -7,10 +7,10 @@ from collections.abc import Callable, Generator, Mapping
 from typing import TypeVar
 
 import numpy as np
-from trirail.alignment.camera_calibration import placed
-from trirail.alignment.images import CameraView, Lens, Pair, pixels
-from trirail.alignment.procedure import LOOK, Sighting, StageMotion, Wish
-from trirail.alignment.rigid import turned
+from trirail.alignment.camera_calibration import to_base_frame
+from trirail.alignment.images import CameraView, Lens, Pair, project_points
+from trirail.alignment.procedure import LOOK, AlignmentRequest, Observation, StageMotion
+from trirail.alignment.rigid_motion import rotation_matrix
 from trirail_drivers.interface import Triple
 
 T = TypeVar("T")
@@ -21,7 +21,7 @@ FOCUS = 2.6e5
 def camera(rng: np.random.Generator, at: Pair, lens: Lens = "affine") -> CameraView:
     """Return a camera above a point: any turn, mirrored or not, scale within 20 %, skewed by a few per cent."""
     mirror = np.diag([1.0, rng.choice([-1.0, 1.0])])
-    matrix = FOCUS * rng.uniform(0.8, 1.2) * turned(rng.uniform(-math.pi, math.pi)) @ mirror
+    matrix = FOCUS * rng.uniform(0.8, 1.2) * rotation_matrix(rng.uniform(-math.pi, math.pi)) @ mirror
     matrix = matrix @ (np.eye(2) + rng.uniform(-0.02, 0.02, (2, 2)))
     bend = {
         "affine": (0.0, 0.0),
@@ -35,7 +35,7 @@ def camera(rng: np.random.Generator, at: Pair, lens: Lens = "affine") -> CameraV
 
 def part_at(part: Mapping[str, Pair], error: Triple) -> dict[str, Pair]:
     """Return the places of a part's marks on the table when the part lies away by x, y [m] and phi [rad]."""
-    return {name: (float(x), float(y)) for name, (x, y) in ((n, placed(q, error)) for n, q in part.items())}
+    return {name: (float(x), float(y)) for name, (x, y) in ((n, to_base_frame(q, error)) for n, q in part.items())}
 
 
 class Stage:
@@ -56,7 +56,10 @@ class Stage:
         self.motions = 0
 
     def look(self) -> dict[str, Pair]:
-        seen = {name: pixels(self.views[name], placed(q, self.pose)[None])[0] for name, q in self.part.items()}
+        seen = {
+            name: project_points(self.views[name], to_base_frame(q, self.pose)[None])[0]
+            for name, q in self.part.items()
+        }
         noisy = {name: (at + self._noise * self._rng.standard_normal(2)).tolist() for name, at in seen.items()}
         return {name: (u, v) for name, (u, v) in noisy.items()}
 
@@ -68,10 +71,10 @@ class Stage:
         x, y, turn = self._moved(motion.by)
         self.way = max(self.way, math.hypot(x, y))
         phi = self.pose[2] + turn
-        at = placed(motion.tool, self.pose) + np.array([x, y]) - turned(phi) @ motion.tool
+        at = to_base_frame(motion.tool, self.pose) + np.array([x, y]) - rotation_matrix(phi) @ motion.tool
         self.pose = (float(at[0]), float(at[1]), phi)
 
-    def drive(self, wishes: Generator[Wish, Sighting, T]) -> T:
+    def drive(self, wishes: Generator[AlignmentRequest, Observation, T]) -> T:
         marks: Mapping[str, Pair] = {}
         try:
             wish = next(wishes)
@@ -80,6 +83,6 @@ class Stage:
                     marks = self.look()
                 elif isinstance(wish, StageMotion):
                     self.go(wish)
-                wish = wishes.send(Sighting(marks, self.pose, float(self.motions)))
+                wish = wishes.send(Observation(marks, self.pose, float(self.motions)))
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]

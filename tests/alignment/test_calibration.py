@@ -7,15 +7,15 @@ import pytest
 from alignment.cameras import Stage, camera
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.alignment.camera_calibration import CameraCalibration, Sight, calibrate, placed
-from trirail.alignment.images import LENSES, Lens, pixels, places, slopes
-from trirail.alignment.procedure import MOVES, calibration_by_moves
+from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate, to_base_frame
+from trirail.alignment.images import LENSES, Lens, locate_pixels, project_points, projection_jacobians
+from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves
 from trirail.errors import AlignmentError, AlignmentFault
 from trirail_drivers.interface import Triple
 
 SEEDS = st.integers(0, 2**32 - 1)
 MORE: tuple[Triple, ...] = (
-    *MOVES,
+    *DEFAULT_MOVES,
     *(
         (x * 1e-3, y * 1e-3, math.radians(phi))
         for x, y, phi in ((2, 2, 0.5), (2, -2, -1), (-2, 2, -1), (-2, -2, 1), (0, 2, 2))
@@ -40,16 +40,16 @@ def one_camera(seed: int, lens: Lens = "affine") -> Stage:
 def test_exact_looks_give_the_exact_camera_and_marks(seed: int, lens: Lens, one: bool) -> None:
     stage = one_camera(seed, lens) if one else two_cameras(seed, lens)
     views = dict.fromkeys(stage.part, "camera") if one else None
-    found = stage.drive(calibration_by_moves(MORE, views, lens, (1000.0, 800.0)))
+    found = stage.drive(calibrate_by_moves(MORE, views, lens, (1000.0, 800.0)))
     assert found.noise < 1e-6
     for name, place in stage.part.items():
         assert found.marks[name].place == pytest.approx(place, abs=1e-9)
         view, true = found.views[found.marks[name].view], stage.views[name]
         near = np.array(place) + 1e-3 * np.array([(1.0, 1.0), (-1.0, 0.5), (0.2, -1.0)])
-        assert pixels(view, near) == pytest.approx(pixels(true, near), abs=1e-4)
+        assert project_points(view, near) == pytest.approx(project_points(true, near), abs=1e-4)
         assert view.mirrored == true.mirrored
     assert found.reach == pytest.approx(
-        max(np.linalg.norm(placed(q, p) - np.array(q)) for q in stage.part.values() for p in MORE), rel=1e-6
+        max(np.linalg.norm(to_base_frame(q, p) - np.array(q)) for q in stage.part.values() for p in MORE), rel=1e-6
     )
 
 
@@ -58,12 +58,12 @@ def test_places_are_the_inverse_of_pixels_and_slopes_their_derivative(seed: int,
     rng = np.random.default_rng(seed)
     view = camera(rng, (0.01, -0.02), lens)
     points = np.array(view.origin) + rng.uniform(-2e-3, 2e-3, (5, 2))
-    assert places(view, pixels(view, points)) == pytest.approx(points, abs=1e-12)
+    assert locate_pixels(view, project_points(view, points)) == pytest.approx(points, abs=1e-12)
     step = 1e-7
     for axis in range(2):
         d = step * np.eye(2)[axis]
-        difference = (pixels(view, points + d) - pixels(view, points - d)) / (2 * step)
-        assert slopes(view, points)[:, :, axis] == pytest.approx(difference, rel=1e-5, abs=1.0)
+        difference = (project_points(view, points + d) - project_points(view, points - d)) / (2 * step)
+        assert projection_jacobians(view, points)[:, :, axis] == pytest.approx(difference, rel=1e-5, abs=1.0)
 
 
 def test_its_noise_and_deviations_are_those_that_there_are() -> None:
@@ -71,7 +71,7 @@ def test_its_noise_and_deviations_are_those_that_there_are() -> None:
     for seed in range(300):
         stage = two_cameras(0, noise=0.1)
         stage._rng = np.random.default_rng(1000 + seed)
-        found = stage.drive(calibration_by_moves())
+        found = stage.drive(calibrate_by_moves())
         noises.append(found.noise**2)
         marks.append(
             [(np.array(found.marks[name].place) - q) / found.marks[name].deviation for name, q in PART.items()]
@@ -85,14 +85,14 @@ def test_marks_that_stand_still_are_refused() -> None:
     frozen = stage.look()
     stage.look = lambda: frozen  # type: ignore[method-assign]
     with pytest.raises(AlignmentError) as refused:
-        stage.drive(calibration_by_moves())
+        stage.drive(calibrate_by_moves())
     assert refused.value.fault is AlignmentFault.STILL
 
 
 @pytest.mark.parametrize(
     "moves",
     [
-        MOVES[:2],
+        DEFAULT_MOVES[:2],
         [(x * 1e-4, 0.0, 0.0) for x in range(1, 9)],
         [(x * 1e-4, 2e-4 * x, 0.0) for x in range(1, 9)],
         [(0.0, 0.0, x * 1e-3) for x in range(1, 9)],
@@ -102,13 +102,13 @@ def test_marks_that_stand_still_are_refused() -> None:
 )
 def test_moves_that_do_not_tell_it_are_refused(moves: list[Triple]) -> None:
     with pytest.raises(AlignmentError) as refused:
-        two_cameras(4).drive(calibration_by_moves(moves))
+        two_cameras(4).drive(calibrate_by_moves(moves))
     assert refused.value.fault is AlignmentFault.MOVES
 
 
 def test_a_lens_that_so_few_looks_cannot_tell_is_refused() -> None:
     with pytest.raises(AlignmentError) as refused:
-        two_cameras(5, "perspective").drive(calibration_by_moves(MOVES[:4], lens="perspective"))
+        two_cameras(5, "perspective").drive(calibrate_by_moves(DEFAULT_MOVES[:4], lens="perspective"))
     assert refused.value.fault is AlignmentFault.MOVES
 
 
@@ -120,7 +120,7 @@ def test_a_mark_that_is_missing_in_a_look_is_missed_in_none_of_the_others() -> N
         seen = stage.look()
         if n == 3:
             del seen["left"]
-        sights.append(Sight(pose, seen))
+        sights.append(CalibrationSample(pose, seen))
     found: CameraCalibration = calibrate(sights)
     assert found.marks["left"].place == pytest.approx(PART["left"], abs=1e-9)
     assert "left" not in found.residuals[3]
@@ -128,5 +128,5 @@ def test_a_mark_that_is_missing_in_a_look_is_missed_in_none_of_the_others() -> N
 
 def test_no_mark_at_all_is_refused() -> None:
     with pytest.raises(AlignmentError) as refused:
-        calibrate([Sight((0.0, 0.0, 0.0), {})])
+        calibrate([CalibrationSample((0.0, 0.0, 0.0), {})])
     assert refused.value.fault is AlignmentFault.MISSING

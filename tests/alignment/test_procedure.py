@@ -11,7 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.alignment.images import Pair
-from trirail.alignment.procedure import BEYOND, Alignment, AlignmentEnd, Task, align, calibration_by_moves, look_only
+from trirail.alignment.procedure import (
+    MAX_UNCONFIRMED_TRAVEL,
+    Alignment,
+    AlignmentEnd,
+    AlignmentTask,
+    align,
+    calibrate_by_moves,
+    measure_part,
+)
 from trirail.errors import AlignmentError, AlignmentFault
 from trirail_drivers.interface import Triple
 
@@ -24,7 +32,7 @@ def ready(seed: int, noise: float = 0.0, part: dict[str, Pair] = PART) -> Ready:
     """Return a stage, its calibration and the targets: where the marks of the part as it lies now are seen."""
     rng = np.random.default_rng(seed)
     stage = Stage({name: camera(rng, place) for name, place in part.items()}, part, rng, noise)
-    calibration = stage.drive(calibration_by_moves())
+    calibration = stage.drive(calibrate_by_moves())
     return stage, calibration, stage.look()
 
 
@@ -41,7 +49,7 @@ def test_exact_looks_need_one_correction_for_any_camera(seed: int, error: Triple
     part = {f"m{k}": (0.06 * math.cos(a), 0.05 * math.sin(a)) for k, a in enumerate(angles)}
     stage, calibration, targets = ready(seed, part=part)
     lay(stage, error, part)
-    found = stage.drive(align(Task(calibration, targets, tolerance=1e-9, angle=1e-8)))
+    found = stage.drive(align(AlignmentTask(calibration, targets, tolerance=1e-9, angle=1e-8)))
     assert found.reached
     assert len(found.corrections) <= 1
     now = stage.look()
@@ -52,7 +60,7 @@ def test_exact_looks_need_one_correction_for_any_camera(seed: int, error: Triple
 def test_noisy_looks_leave_no_more_than_the_noise(seed: int, error: Triple) -> None:
     stage, calibration, targets = ready(seed, noise=0.1)
     lay(stage, error)
-    found = stage.drive(align(Task(calibration, targets, tolerance=2e-6)))
+    found = stage.drive(align(AlignmentTask(calibration, targets, tolerance=2e-6)))
     assert found.reached
     assert len(found.measurements) == len(found.corrections) + 1
 
@@ -71,7 +79,7 @@ def test_a_stage_that_moves_otherwise_does_not_walk_away(wrong: str, seed: int, 
     stage, calibration, targets = ready(seed)
     lay(stage, error)
     stage._moved = WRONG[wrong]
-    found: Alignment = stage.drive(align(Task(calibration, targets)))
+    found: Alignment = stage.drive(align(AlignmentTask(calibration, targets)))
     assert len(found.corrections) <= 3
     if found.why is AlignmentEnd.GROWING:  # by its first correction that went the wrong way
         assert found.measurements[-1].worst > found.measurements[-2].worst
@@ -94,24 +102,24 @@ CHANGED = {
 def test_cameras_that_were_turned_or_mirrored_since_do_not_lead_away(how: str, seed: int, error: Triple) -> None:
     stage, calibration, targets = ready(seed)
     lay(stage, error)
-    first = stage.drive(look_only(Task(calibration, targets))).worst
+    first = stage.drive(measure_part(AlignmentTask(calibration, targets))).worst
     for name, view in stage.views.items():
         (a, b), (c, d) = (CHANGED[how] @ np.array(view.matrix)).tolist()
         stage.views[name] = msgspec.structs.replace(view, matrix=((a, b), (c, d)))
     with contextlib.suppress(AlignmentError):
-        stage.drive(align(Task(calibration, targets)))
+        stage.drive(align(AlignmentTask(calibration, targets)))
     truth = Stage({name: calibration.views[name] for name in PART}, stage.part, np.random.default_rng(0))
     truth.pose = stage.pose
-    left = truth.drive(look_only(Task(calibration, targets, distance=1.0))).worst
+    left = truth.drive(measure_part(AlignmentTask(calibration, targets, distance=1.0))).worst
     assert left <= 3.5 * first + 1e-9
 
 
 def test_the_first_correction_of_a_fresh_calibration_is_bounded_and_the_others_are_not() -> None:
     stage, calibration, targets = ready(7)
     lay(stage, (0.004, 0.003, 0.0))
-    found = stage.drive(align(Task(calibration, targets)))
+    found = stage.drive(align(AlignmentTask(calibration, targets)))
     assert stage.way <= 0.005
-    assert found.corrections[0].share == pytest.approx(BEYOND * calibration.reach / 0.005, rel=1e-3)
+    assert found.corrections[0].share == pytest.approx(MAX_UNCONFIRMED_TRAVEL * calibration.reach / 0.005, rel=1e-3)
     assert [c.share for c in found.corrections[1:]] == [1.0]
     assert found.reached
     assert found.confirmed
@@ -120,7 +128,7 @@ def test_the_first_correction_of_a_fresh_calibration_is_bounded_and_the_others_a
 def test_a_confirmed_calibration_goes_all_the_way() -> None:
     stage, calibration, targets = ready(7)
     lay(stage, (0.004, 0.003, 0.0))
-    found = stage.drive(align(Task(msgspec.structs.replace(calibration, confirmed=True), targets)))
+    found = stage.drive(align(AlignmentTask(msgspec.structs.replace(calibration, confirmed=True), targets)))
     assert [c.share for c in found.corrections] == [1.0]
 
 
@@ -133,7 +141,7 @@ def test_a_part_of_another_size_is_refused_with_the_number_and_nothing_moves(
     stage.part = {name: (x * (1 + wrong), y * (1 + wrong)) for name, (x, y) in PART.items()}
     moved = stage.motions
     with pytest.raises(AlignmentError) as refused:
-        stage.drive(align(Task(calibration, targets)))
+        stage.drive(align(AlignmentTask(calibration, targets)))
     assert refused.value.fault is AlignmentFault.DISTANCE
     assert refused.value.value == pytest.approx(wrong, abs=1e-5)
     assert f"{wrong * 1e6:+.0f}"[:3] in str(refused.value)
@@ -144,12 +152,12 @@ def test_swapped_marks_of_one_camera_are_refused_and_nothing_moves() -> None:
     rng = np.random.default_rng(8)
     part = {"left": (0.018, 0.0105), "right": (0.021, 0.0095)}
     stage = Stage(dict.fromkeys(part, camera(rng, (0.02, 0.01))), part, rng)
-    calibration = stage.drive(calibration_by_moves(views=dict.fromkeys(part, "camera")))
+    calibration = stage.drive(calibrate_by_moves(views=dict.fromkeys(part, "camera")))
     targets = stage.look()
     moved = stage.motions
     stage.part = {"left": part["right"], "right": part["left"]}
     with pytest.raises(AlignmentError) as refused:
-        stage.drive(align(Task(calibration, targets)))
+        stage.drive(align(AlignmentTask(calibration, targets)))
     assert refused.value.fault is AlignmentFault.SWAPPED
     assert stage.motions == moved
 
@@ -159,39 +167,39 @@ def test_a_mark_that_is_not_found_is_named(missing: str) -> None:
     stage, calibration, targets = ready(9)
     del stage.part[missing]
     with pytest.raises(AlignmentError, match=f"not found: {missing}") as refused:
-        stage.drive(align(Task(calibration, targets)))
+        stage.drive(align(AlignmentTask(calibration, targets)))
     assert refused.value.fault is AlignmentFault.MISSING
 
 
 def test_a_target_without_a_calibration_is_named() -> None:
     stage, calibration, targets = ready(9)
     with pytest.raises(AlignmentError, match="not in the calibration: third"):
-        stage.drive(align(Task(calibration, {**targets, "third": (1.0, 2.0)})))
+        stage.drive(align(AlignmentTask(calibration, {**targets, "third": (1.0, 2.0)})))
 
 
 def test_pictures_that_show_no_number_are_refused() -> None:
     stage, calibration, targets = ready(9)
     stage.look = lambda: {**targets, "left": (math.nan, 1.0)}  # type: ignore[method-assign]
     with pytest.raises(AlignmentError, match="finite pixels"):
-        stage.drive(align(Task(calibration, targets)))
+        stage.drive(align(AlignmentTask(calibration, targets)))
 
 
 def test_a_look_alone_moves_nothing_and_tells_the_same() -> None:
     stage, calibration, targets = ready(10)
     lay(stage, (2e-4, -1e-4, 1e-3))
     moved = stage.motions
-    told = stage.drive(look_only(Task(calibration, targets)))
+    told = stage.drive(measure_part(AlignmentTask(calibration, targets)))
     assert stage.motions == moved
-    assert told == stage.drive(align(Task(calibration, targets))).measurements[0]
+    assert told == stage.drive(align(AlignmentTask(calibration, targets))).measurements[0]
 
 
 def test_more_pictures_are_less_noise() -> None:
     ratios = []
     for seed in range(60):
         stage, calibration, targets = ready(seed, noise=0.3)
-        task = Task(calibration, targets)
+        task = AlignmentTask(calibration, targets)
         one, many = (
-            np.std([stage.drive(look_only(task._replace(looks=looks))).shift for _ in range(8)], axis=0).mean()
+            np.std([stage.drive(measure_part(task._replace(looks=looks))).shift for _ in range(8)], axis=0).mean()
             for looks in (1, 9)
         )
         ratios.append(many / one)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.style import Style
 from trirail.analysis import charts
-from trirail.analysis.summary import UNKNOWN
+from trirail.analysis.summary import UNKNOWN_LABEL
 from trirail.cli import recording_commands, terminal
 from trirail.config import SIM, load
 from trirail.telemetry import palette
@@ -32,7 +32,7 @@ def test_every_mode_has_a_colour_of_its_own_wherever_it_is_shown() -> None:
 
 
 def test_every_outcome_has_one_colour_wherever_it_is_shown() -> None:
-    assert set(palette.OUTCOMES) == {*get_args(Outcome), UNKNOWN}
+    assert set(palette.OUTCOMES) == {*get_args(Outcome), UNKNOWN_LABEL}
     assert all(Style.parse(palette.code(colour)).color is not None for colour in palette.OUTCOMES.values())
     for (one, of_one), (other, of_other) in combinations(palette.OUTCOMES.items(), 2):
         assert math.dist(of_one, of_other) > 40.0, f"{one} looks like {other}"
@@ -67,7 +67,7 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
     recorder = Recorder(load(SIM), tmp_path, path=tmp_path / "session.rrd", live=False)
     for half in np.split(records, 2):
         recorder.records(half.tobytes())
-    for n in range(charts.LISTED + 2):
+    for n in range(charts.MAX_LISTED_FAULTS + 2):
         fault = Event("fault", "error", f"drive B: fault $_{{{n}}} $", seq=n + 1, t=0.15 * n, cycle=150 * n, time=1.7e9)
         recorder.event(fault)
     name = "g $x_{1}$ %s"
@@ -77,8 +77,8 @@ def test_faults_are_numbered_at_their_moment_and_told_below_the_curves(tmp_path:
     picture = tmp_path / "session.svg"
     assert recording_commands.report(tmp_path / "session.rrd", plot=picture) == 0
     drawn = picture.read_text()
-    assert all(f"<!-- {number} -->" in drawn for number in range(1, charts.LISTED + 1))
-    for n in range(charts.LISTED):
+    assert all(f"<!-- {number} -->" in drawn for number in range(1, charts.MAX_LISTED_FAULTS + 1))
+    for n in range(charts.MAX_LISTED_FAULTS):
         assert f"{n + 1}   {0.15 * n:.3f} s   drive B: fault $_{{{n}}} $" in drawn
     assert "and 2 more" in drawn
     assert f"<!-- {name} -->" in drawn

@@ -13,9 +13,11 @@ from pyarrow import csv, parquet
 from trirail.analysis import export
 from trirail.config import SIM, load
 from trirail.errors import ServiceError
-from trirail.telemetry import recording_table
-from trirail.telemetry.reading import Line, Recording, read
+from trirail.telemetry import recording as recordings
+from trirail.telemetry.journal import Line
+from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.recording import Recording
 from trirail.wire.goals import MoveGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, GoalRequest
@@ -89,18 +91,18 @@ def test_a_part_has_the_cycles_between_and_the_first_of_every_so_long(
 
 
 def test_columns_are_names_of_fields_or_words_of_these(recording: Recording) -> None:
-    every = set(recording_table.table(recording).column_names)
+    every = set(recordings.table(recording).column_names)
     for name in DTYPE.names or ():
-        found = set(recording_table.table(recording, [name]).column_names)
+        found = set(recordings.table(recording, [name]).column_names)
         assert found - {"t"} == {column for column in every if column.removeprefix(name) in ENDINGS}
     for word in {word for name in DTYPE.names or () for word in name.split("_")} - set(DTYPE.names or ()):
-        found = set(recording_table.table(recording, [word]).column_names) - {"t"}
+        found = set(recordings.table(recording, [word]).column_names) - {"t"}
         assert found == {column for column in every if word in column.split("_")}
-    assert recording_table.table(recording, ["error", "following_error"]).num_columns == 4
+    assert recordings.table(recording, ["error", "following_error"]).num_columns == 4
     with pytest.raises(ServiceError, match=r"no column poze: did you mean pose\?"):
-        recording_table.table(recording, ["poze"])
+        recordings.table(recording, ["poze"])
     with pytest.raises(ServiceError, match="no column torque: a word of these was expected: wall, mode, cycle"):
-        recording_table.table(recording, ["torque"])
+        recordings.table(recording, ["torque"])
 
 
 def test_a_dataframe_is_the_table_by_time(recording: Recording) -> None:

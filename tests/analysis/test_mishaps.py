@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from processes.test_loop import Shell, shell
-from trirail.analysis.replay import again
-from trirail.telemetry.reading import Recording
+from trirail.analysis.replay import replay_session
+from trirail.telemetry.recording import Recording
 from trirail.wire.goals import PoseGoal
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Kind, decode_answer, message
 from trirail.wire.records import unpack
@@ -68,12 +68,12 @@ def test_a_mishap_comes_out_the_same(shell: Shell, happen: Callable[[Shell], Non
     shell.cycles(600)
     recording = recorded(shell)
     assert np.any(recording.records["mode"] != MODES.index(Mode.MOVING))
-    compared = again(recording, shell.rig.config, simulated=False)
+    compared = replay_session(recording, shell.rig.config, simulated=False)
     assert compared.cycles == len(recording.records) > 600
     assert compared.differing == 0
     without = recording._replace(requests=recording.requests[:3])  # enabled, sent a goal, and that is planned
     if len(recording.requests) > 3:  # of a pushed slider the drives' positions tell by themselves
-        assert again(without, shell.rig.config, simulated=False).differing > 0
+        assert replay_session(without, shell.rig.config, simulated=False).differing > 0
 
 
 def test_a_goal_that_came_too_late_is_too_late_again(shell: Shell) -> None:
@@ -83,5 +83,5 @@ def test_a_goal_that_came_too_late_is_too_late_again(shell: Shell) -> None:
     shell.gateway.send(message(GoalRequest(2, "ann", "g-1", PoseGoal(0.08, 0.0, 0.0, valid_for=0.5), then)))
     shell.cycles(100)
     recording = recorded(shell)
-    assert again(recording, shell.rig.config, simulated=False).differing == 0
+    assert replay_session(recording, shell.rig.config, simulated=False).differing == 0
     assert not recording.records["commanded_velocity"].any()

@@ -13,15 +13,16 @@ import msgspec
 import numpy as np
 import pytest
 from processes.test_service import until
-from trirail.analysis.replay import again
-from trirail.analysis.summary import summary
+from trirail.analysis.replay import replay_session
+from trirail.analysis.summary import summarise
 from trirail.client import own_service
 from trirail.client.client import Robot
 from trirail.config import SIM, Config, geometry, load
-from trirail.config.as_built import AsBuilt, geometry_of, written
+from trirail.config.as_built import AsBuilt, format_map, geometry_of
 from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry import provenance
-from trirail.telemetry.reading import Recording, join, read
+from trirail.telemetry.reading import join, read
+from trirail.telemetry.recording import Recording
 from trirail.wire.goals import VelocityGoal
 from trirail.wire.packets import CommandRequest, Disturbance, DrivesFault, GoalRequest
 from trirail.wire.plan_packets import Extended, NotPlanned, Planned
@@ -111,7 +112,7 @@ def test_the_recording_is_whole(recording: Recording) -> None:
 
 
 def test_it_comes_out_the_same_to_the_last_bit(recording: Recording, config: Config) -> None:
-    compared = again(recording, config, simulated=False)
+    compared = replay_session(recording, config, simulated=False)
     assert compared.cycles == len(recording.records)
     assert compared.lacking == 0
     assert (compared.differing, compared.first) == (0, None)
@@ -123,7 +124,7 @@ def test_a_corrected_session_comes_out_the_same_without_the_maps_file(tmp_path: 
     made = geometry_of(geometry(load(SIM).geometry))
     nodes = np.random.default_rng(8).uniform(-2e-5, 2e-5, (5, 5, 5, 3)).tolist()
     low, high = (-0.15, -0.15, -1.2), (0.15, 0.15, 0.85)
-    (tmp_path / "as_built.toml").write_text(written(AsBuilt("today", made, low, high, nodes)), encoding="utf-8")
+    (tmp_path / "as_built.toml").write_text(format_map(AsBuilt("today", made, low, high, nodes)), encoding="utf-8")
     file, locator = own_service.private(tmp_path)
     told = '\n[correction]\nmap = "as_built.toml"\nbacklash = [5e-5, 5e-5, 5e-5]\n'
     file.write_text(file.read_text(encoding="utf-8") + told, encoding="utf-8")
@@ -139,13 +140,13 @@ def test_a_corrected_session_comes_out_the_same_without_the_maps_file(tmp_path: 
     assert np.abs(recording.records["backlash"]).max() == pytest.approx(2.5e-5)
     config = provenance.configuration(recording.texts)
     assert config is not None
-    compared = again(recording, config, simulated=False)
+    compared = replay_session(recording, config, simulated=False)
     assert (compared.lacking, compared.differing, compared.plans_differing) == (0, 0, 0)
     assert compared.plans >= 3
 
 
 def test_what_was_planned_is_planned_the_same_again(recording: Recording, config: Config) -> None:
-    compared = again(recording, config, simulated=False)
+    compared = replay_session(recording, config, simulated=False)
     answers = [what for what in recording.requests if isinstance(what.given, Planned | Extended | NotPlanned)]
     assert compared.plans == len(answers) > 5
     assert compared.plans_differing == 0
@@ -161,9 +162,9 @@ def test_an_answer_that_would_be_another_now_is_noticed_and_used_all_the_same(
     )
     assert isinstance(what.given, Planned)
     requests = list(recording.requests)
-    answer = msgspec.structs.replace(what.given, duration=(what.given.duration or 0.0) + 1.0)
+    answer = msgspec.structs.replace(what.given, reply=what.given.reply.with_duration(1000.0))
     requests[number] = msgspec.structs.replace(what, given=answer)
-    compared = again(recording._replace(requests=tuple(requests)), config, simulated=False)
+    compared = replay_session(recording._replace(requests=tuple(requests)), config, simulated=False)
     assert (compared.plans_differing, compared.differing) == (1, 0)
 
 
@@ -172,12 +173,12 @@ def test_a_recording_without_answers_is_planned_anew(recording: Recording, confi
     kinds = Planned | Extended | NotPlanned | DrivesFault
     kept = [what for what in recording.requests if not isinstance(what.given, kinds)]
     numbered = tuple(msgspec.structs.replace(what, seq=seq) for seq, what in enumerate(kept, start=1))
-    compared = again(recording._replace(requests=numbered), config, simulated=True)
+    compared = replay_session(recording._replace(requests=numbered), config, simulated=True)
     assert (compared.plans, compared.cycles) == (0, len(recording.records))
 
 
 def test_on_simulated_drives_it_comes_out_the_same_too(recording: Recording, config: Config) -> None:
-    assert again(recording, config, simulated=True).differing == 0
+    assert replay_session(recording, config, simulated=True).differing == 0
 
 
 def test_a_motion_one_cycle_later_is_noticed(recording: Recording, config: Config) -> None:
@@ -186,7 +187,7 @@ def test_a_motion_one_cycle_later_is_noticed(recording: Recording, config: Confi
     )
     requests = list(recording.requests)
     requests[number] = msgspec.structs.replace(what, cycle=what.cycle + 1)
-    compared = again(recording._replace(requests=tuple(requests)), config, simulated=False)
+    compared = replay_session(recording._replace(requests=tuple(requests)), config, simulated=False)
     assert compared.differing > 0
     assert compared.first is not None
     assert what.cycle <= compared.first <= what.cycle + 30
@@ -196,14 +197,14 @@ def test_a_motion_one_cycle_later_is_noticed(recording: Recording, config: Confi
 def test_after_a_gap_nothing_is_compared(recording: Recording, config: Config) -> None:
     half = len(recording.records) // 2
     kept = np.delete(recording.records, slice(half, half + 20))
-    compared = again(recording._replace(records=kept), config, simulated=False)
+    compared = replay_session(recording._replace(records=kept), config, simulated=False)
     assert (compared.cycles, compared.differing) == (half, 0)
     assert compared.lacking == len(kept) - half
 
 
 def test_after_a_request_that_lacks_nothing_is_compared(recording: Recording, config: Config) -> None:
     requests = recording.requests[:5] + recording.requests[6:]
-    compared = again(recording._replace(requests=requests), config, simulated=False)
+    compared = replay_session(recording._replace(requests=requests), config, simulated=False)
     assert compared.cycles == recording.requests[4].cycle
     assert compared.differing == 0
 
@@ -211,15 +212,15 @@ def test_after_a_request_that_lacks_nothing_is_compared(recording: Recording, co
 def test_what_begins_in_motion_is_refused(recording: Recording, config: Config) -> None:
     moving = int(np.flatnonzero(np.any(recording.records["commanded_velocity"] != 0.0, axis=1))[0])
     late = recording._replace(records=recording.records[moving:])
-    # What is advised must be possible: what a recorder wrote that was started again has no file before it.
-    with pytest.raises(ServiceError, match=r"in mode moving, and what led there is not in it.*started again.*report"):
-        again(late, config, simulated=False)
+    # What is advised must be possible: the file of a recorder that was restarted has none before it.
+    with pytest.raises(ServiceError, match=r"in mode moving; a replay needs .* begins disabled.*restarted.*report"):
+        replay_session(late, config, simulated=False)
 
 
 def test_another_rate_is_refused(recording: Recording, config: Config) -> None:
     slower = msgspec.structs.replace(config, loop=msgspec.structs.replace(config.loop, rate_hz=500))
-    with pytest.raises(ServiceError, match="500: the recording has 1000 cycles a second"):
-        again(recording, slower, simulated=True)
+    with pytest.raises(ServiceError, match="500 Hz, but the recording has 1000 cycles a second"):
+        replay_session(recording, slower, simulated=True)
 
 
 def test_parts_are_put_together(recording: Recording) -> None:
@@ -242,7 +243,7 @@ def test_parts_are_put_together(recording: Recording) -> None:
 
 
 def test_every_goal_has_the_outcome_that_was_said(recording: Recording) -> None:
-    summed = summary(recording)
+    summed = summarise(recording)
     events = [line.event for line in reversed(recording.events) if line.event is not None]
     said = {event.id: event.outcome for event in events if event.outcome}
     assert {goal.id: goal.outcome for goal in summed.goals} == said
@@ -251,12 +252,12 @@ def test_every_goal_has_the_outcome_that_was_said(recording: Recording) -> None:
 
 
 def test_the_quick_stop_is_the_fault(recording: Recording) -> None:
-    (fault,) = summary(recording).faults
+    (fault,) = summarise(recording).faults
     assert fault.message == "quick_stop by ann"
 
 
 def test_errors_are_those_of_enabled_drives(recording: Recording) -> None:
-    summed = summary(recording)
+    summed = summarise(recording)
     assert all(0.0 < each.rms <= each.max < 0.004 for each in summed.tracking)
     assert sum(summed.modes.values()) == pytest.approx(summed.cycles / summed.rate_hz)
 

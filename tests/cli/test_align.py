@@ -20,7 +20,7 @@ from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.cli import mark_source
-from trirail.cli.mark_options import MarkSource
+from trirail.cli.mark_source import MarkSource
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
 from trirail_drivers.interface import Triple
@@ -31,8 +31,8 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from trirail import Robot
-from trirail.alignment.camera_calibration import placed
-from trirail.alignment.images import CameraView, pixels
+from trirail.alignment.camera_calibration import to_base_frame
+from trirail.alignment.images import CameraView, project_points
 with Robot("demo", sys.argv[1]) as robot:
     for _ in sys.stdin:
         pose, seen = robot.state().pose, {}
@@ -41,7 +41,7 @@ with Robot("demo", sys.argv[1]) as robot:
                 view = CameraView((-0.06, 0.01), (900.0, 700.0), ((2.5e5, 1e4), (1e4, -2.5e5)))
             else:
                 view = CameraView((0.06, 0.01), (900.0, 700.0), ((-2.5e5, 1e4), (1e4, 2.5e5)))
-            seen[name] = pixels(view, placed(place, pose)[None])[0].tolist()
+            seen[name] = project_points(view, to_base_frame(place, pose)[None])[0].tolist()
         print(json.dumps(seen), flush=True)
 """
 
@@ -80,7 +80,7 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     assert "the part lies right" in trirail("align", "run", kept, *marks, *loose).stdout
     part.write_text(json.dumps({"left": [-0.06, 0.01], "right": [0.061, 0.01]}), encoding="utf-8")
     refused = trirail("align", "run", kept, *marks, *loose, code=1).stderr
-    assert "ppm from their distance" in " ".join(refused.split())
+    assert "distance between marks" in " ".join(refused.split())
 
 
 @pytest.mark.parametrize(

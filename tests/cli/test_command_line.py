@@ -21,11 +21,13 @@ import pytest
 from cyclopts import App
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.cli import app, help_pages, live, notation, terminal, typed, view
+from trirail.cli import app, help_pages, live, notation, terminal, view
 from trirail.client import client, connection
 from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
+from trirail.wire.goal_kind import GoalKind, field_description
+from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, VelocityGoal
 from trirail.wire.messages import GoalReply
 from trirail.wire.state import NamedPose
 
@@ -61,6 +63,19 @@ def test_every_argument_is_described(name: str, page: App, run: Run) -> None:
             assert argument.parameter.help, f"{name} {argument.name}"
 
 
+@pytest.mark.parametrize(
+    ("command", "kind"), [("goto", PoseGoal), ("move", MoveGoal), ("sliders", SlidersGoal), ("jog", VelocityGoal)]
+)
+def test_an_option_of_a_goal_is_described_as_its_field_is(command: str, kind: type[GoalKind]) -> None:
+    page = dict(pages())[command]
+    told = {
+        argument.name.removeprefix("--"): argument.parameter.help
+        for argument in page.assemble_argument_collection(parse_docstring=True)
+    }
+    for field in {"speed", "blend", "tool", "frame"} & set(told):
+        assert str(told[field]).lower().startswith(field_description(kind, field).lower())
+
+
 def test_help_shows_groups_and_examples(run: Run) -> None:
     code, out, _ = run("--help")
     assert code == 0
@@ -86,17 +101,17 @@ def test_what_is_seldom_needed_is_on_the_page_of_all_alone(run: Run) -> None:
 @given(
     st.lists(st.sampled_from(["10mm", "-20", "5deg", "0.5", "-.1e-3", "1in"]), min_size=3, max_size=3),
     st.sampled_from([" ", ",", ", ", ";", "; "]),
-    st.sampled_from(typed.OF_THREE),
+    st.sampled_from(notation.OF_THREE),
 )
 def test_three_numbers_may_have_commas_between(numbers: list[str], between: str, command: str) -> None:
-    assert typed.spread([command, *between.join(numbers).split()]) == [command, *numbers]
+    assert notation.spread([command, *between.join(numbers).split()]) == [command, *numbers]
 
 
 @pytest.mark.parametrize(
     "line", ["goto 10,5 20 3", "goto pick", "goto a,b,c", "goto 1 2 3 --tool 20,0", "export x --columns 1,2,3", ""]
 )
 def test_nothing_else_is_read_otherwise_for_its_commas(line: str) -> None:
-    assert typed.spread(line.split()) == line.split()
+    assert notation.spread(line.split()) == line.split()
 
 
 @pytest.mark.long
@@ -166,8 +181,8 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         (
             f"stop --connect {NOBODY}",
             1,
-            f"no service at {NOBODY}: connection refused; start what is to answer there, trirail run or trirail "
-            "router, or name another address with --connect (in Python connect=)",
+            f"no service at {NOBODY}: connection refused; start what is to answer there, trirail run or zenohd"
+            ", or name another address with --connect (in Python connect=)",
         ),
         ("stop --connect tcp/no..name:1", 1, "its host name is none; start what is to answer there"),
     ],

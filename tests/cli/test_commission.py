@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from trirail.cli import commission
 from trirail.cli.app import app
-from trirail.commissioning.person import Question, Quit
+from trirail.commissioning.person import Question, QuitRequest
 from trirail.config import SIM
 from trirail.errors import ConfigError
 from trirail_drivers.errors import FileError
@@ -100,9 +100,9 @@ def test_ctrl_c_ends_it_and_the_report_stays(
 
 def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path: Path) -> None:
     (tmp_path / "precious.toml").write_text("precious")
-    with pytest.raises(ConfigError, match=r"precious\.toml exists already: name another file with --out"):
+    with pytest.raises(ConfigError, match=r"precious\.toml exists already; name another file with --out"):
         run(robot, "--out", "precious.toml")
-    with pytest.raises(FileError, match=r"precious\.toml exists already: name another file with --report"):
+    with pytest.raises(FileError, match=r"precious\.toml exists already; name another file with --report"):
         run(robot, "--report", "precious.toml")
     with pytest.raises(FaultSyntaxError, match="did you mean reversed"):
         run(robot, "--yes", "--fault", "A reverse", "--report", "a.json")
@@ -129,7 +129,7 @@ def test_lines_are_answers_and_the_end_is_none(typed: int, written: bytes, answe
     person = commission.Console(by_itself=False, quiet=True)
     found = [person.ask(Question("?", "default"), lambda: None) for _ in answers]
     assert found == answers
-    with pytest.raises(Quit):
+    with pytest.raises(QuitRequest):
         person.ask(Question("?", "default"), lambda: None)
 
 

@@ -51,6 +51,9 @@ def test_what_is_shipped_is_listed_with_a_line_each(capsys: pytest.CaptureFixtur
     files = answer("config")["files"]
     assert {str(path.relative_to(SIM.parent)) for path in SHIPPED} | {
         "trirail.service",
+        "trirail-can@.service",
+        "trirail-user.conf",
+        "trirail.nft",
         "prometheus.yml",
         "grafana.json",
     } == set(files)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from trirail.cli import doctor, doctor_cycle, doctor_network, probes
+from trirail.cli import doctor, doctor_cycle, probes
 from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import SIM, Config, Tls, everything, load
 from trirail.diagnosis import Check, bare_loop, drive_checks
@@ -268,8 +268,8 @@ def test_protections_that_drives_may_lack_are_listed_once_each_with_their_drives
     )
     found = bad(doctor.examine(config, GOOD))
     assert {name: check.found for name, check in found.items()} == {
-        "lacking 1006": "drives A, C may lack 1006, its watch on SYNC; without: it goes on without SYNC",
-        "lacking 6041": "drives C may lack 6041, saying that it follows setpoints; without: that is not looked at",
+        "lacking 1006": "drives A, C may lack 1006, its watch on SYNC; without: it continues without SYNC",
+        "lacking 6041": "drives C may lack 6041, its report that it follows setpoints; without: that is not checked",
     }
     assert {check.verdict for check in found.values()} == {"warning"}
     assert all("trirail drives" in check.remedy for check in found.values())
@@ -334,7 +334,7 @@ def test_without_ip_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_the_bare_loop_counts_its_cycles_and_what_the_drives_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bare_loop, "TURN", 0.02)
+    monkeypatch.setattr(bare_loop, "BATCH_S", 0.02)
     shares: list[float] = []
     found = bare_loop.measure(SIMULATED.loop, 500, 0.1, shares.append)
     assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
@@ -427,13 +427,13 @@ def test_the_command(json_wanted: bool) -> None:
 )
 def test_who_can_read_the_metrics_is_told(address: str, tls: bool, verdict: str, by: str) -> None:
     config = changed(SIMULATED, "telemetry", metrics_port=9464, metrics_address=address)
-    (check,) = doctor_network.metrics(changed(config, "zenoh", tls=Tls() if tls else None))
+    (check,) = doctor.metrics(changed(config, "zenoh", tls=Tls() if tls else None))
     assert (check.verdict, check.found) == (verdict, f"tcp/{address}:9464: {by} can read them")
-    assert doctor_network.metrics(SIMULATED) == []
+    assert doctor.metrics(SIMULATED) == []
 
 
 def test_whether_the_routers_answer_is_told() -> None:
-    good, bad = doctor_network.routers([("tls/192.0.2.9:7447", ""), ("tls/192.0.2.8:7447", "connection refused")])
+    good, bad = doctor.routers([("tls/192.0.2.9:7447", ""), ("tls/192.0.2.8:7447", "connection refused")])
     assert (good.verdict, good.found) == ("ok", "tls/192.0.2.9:7447 answers")
     assert (bad.verdict, bad.found) == ("warning", "tls/192.0.2.8:7447: connection refused")
     assert bad.remedy

@@ -63,12 +63,11 @@ def test_drives_that_tell_nothing(tmp_path: Path) -> None:
 def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("drives", "save", str(tmp_path)) == 0
     assert "drive C, node 3: 67 parameters in" in capsys.readouterr().out
-    a, b = (tmp_path / f"drive-{name}.toml" for name in "AB")
+    a, b = (tmp_path / f"drive-{name}.dcf" for name in "AB")
     assert run("drives", "compare", str(a)) == 0
     assert "0 of 67 parameters differ" in capsys.readouterr().out
-    a.write_text(
-        a.read_text().replace('"6066:00" = { type = "u16", value = 0', '"6066:00" = { type = "u16", value = 77')
-    )
+    head, section, rest = a.read_text().partition("[6066]")
+    a.write_text(head + section + rest.replace("ParameterValue=0", "ParameterValue=77", 1))
     assert run("drives", "compare", str(a), "--json") == 1
     told = json.loads(capsys.readouterr().out)
     assert (told["ok"], told["other"]) == (False, "drive A")
@@ -84,6 +83,11 @@ def test_parameters_are_saved_compared_and_restored(tmp_path: Path, capsys: pyte
     assert "not stored: Object does not exist" in capsys.readouterr().out
     with pytest.raises(DriveError, match="drive A has serial 00000001h"):
         run("drives", "restore", str(b), "--drive", "A")
+    b.write_text(b.read_text().replace("NodeID=2", "NodeID=9"))
+    with pytest.raises(DriveError, match=r"drive-B\.dcf has node id 9, the drives have 1, 2, 3; say which by --drive"):
+        run("drives", "restore", str(b))
+    with pytest.raises(DriveError, match=r"drive B has node 00000002h \(the file's 00000009h\)"):
+        run("drives", "restore", str(b), "--drive", "B")
 
 
 def test_the_drives_that_answer_are_saved_and_the_others_named(
@@ -97,16 +101,16 @@ def test_the_drives_that_answer_are_saved_and_the_others_named(
     assert run("drives", "save", str(tmp_path), "--config", str(tmp_path / "robot.toml"), "--json") == 1
     told = json.loads(capsys.readouterr().out)
     assert (sorted(told["drives"]), sorted(told["failed"])) == (["A", "C"], ["B"])
-    assert sorted(path.name for path in tmp_path.glob("drive-*")) == ["drive-A.toml", "drive-C.toml"]
+    assert sorted(path.name for path in tmp_path.glob("drive-*")) == ["drive-A.dcf", "drive-C.dcf"]
 
 
 def test_a_file_is_never_written_over(tmp_path: Path) -> None:
     assert run("drives", "save", str(tmp_path), "--drive", "B") == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["drive-B.toml"]
-    with pytest.raises(FileError, match=r"drive-B\.toml exists already"):
+    assert [path.name for path in tmp_path.iterdir()] == ["drive-B.dcf"]
+    with pytest.raises(FileError, match=r"drive-B\.dcf exists already"):
         run("drives", "save", str(tmp_path))
     with pytest.raises(FileError, match="nowhere: no such folder"):
         run("drives", "save", str(tmp_path / "nowhere"))
-    with pytest.raises(FileError, match=r"drive-B\.toml: a file, no folder; a configuration follows --config"):
-        run("drives", "save", str(tmp_path / "drive-B.toml"))
-    assert [path.name for path in tmp_path.iterdir()] == ["drive-B.toml"]
+    with pytest.raises(FileError, match=r"drive-B\.dcf: a file, no folder; a configuration follows --config"):
+        run("drives", "save", str(tmp_path / "drive-B.dcf"))
+    assert [path.name for path in tmp_path.iterdir()] == ["drive-B.dcf"]

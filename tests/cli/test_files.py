@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from trirail.cli import app
 from trirail.config import SIM
 from trirail_drivers import files
-from trirail_drivers.errors import LONGEST, FileError, TrirailError, shortened
+from trirail_drivers.errors import MAX_MESSAGE_LENGTH, FileError, TrirailError, shortened
 
 pytestmark = pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
 
@@ -35,7 +35,7 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         assert (ended.value.code, said.out) == (1, "")
         assert said.err.startswith("trirail: ")
         assert said.err.count("\n") == 1
-        assert len(said.err) <= LONGEST + MARGIN
+        assert len(said.err) <= MAX_MESSAGE_LENGTH + MARGIN
         return said.err
 
     return call
@@ -72,7 +72,7 @@ def test_what_is_no_regular_file_is_refused(kind: str, command: list[str], tmp_p
 
 
 def test_who_names_no_configuration_is_told_how_to_get_one(tmp_path: Path, refused: Say) -> None:
-    assert "`trirail config copy sim` gives one to start from" in refused(["run", str(tmp_path / "x.toml")])
+    assert "`trirail config copy sim` makes one to start from" in refused(["run", str(tmp_path / "x.toml")])
 
 
 def test_a_fifo_that_nobody_writes_to_is_refused_by_the_program(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_any_content_is_read_or_refused(suffix: str, content: bytes, tmp_path: P
     except TrirailError as error:
         said = str(error)
     assert str(path) in said
-    assert len(said) <= LONGEST
+    assert len(said) <= MAX_MESSAGE_LENGTH
 
 
 @given(st.text(max_size=2000), st.integers(10, 1000))
@@ -162,3 +162,32 @@ def test_a_text_that_is_too_long_keeps_its_beginning_and_its_end(text: str, long
         assert text.startswith(begin)
         assert text.endswith(end)
         assert min(len(begin), len(end)) >= longest // 3 - 3
+
+
+HOLDS = """
+import sys, time
+from trirail_drivers import files
+with files.temporary_folder(sys.argv[1]) as folder:
+    (folder / "socket").touch()
+    print(folder, flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_temporary_folder_that_a_killed_process_has_left_goes_with_the_next_one_and_no_other(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLDS, str(tmp_path)]
+    others = [tmp_path / name for name in ("trirail-other", "run-trirail-run-", "file")]
+    for other in others:
+        other.mkdir()
+    (tmp_path / "trirail-run-link").symlink_to(others[0])
+    (tmp_path / "trirail-run-file").touch()
+    kept = [*others, tmp_path / "trirail-run-link", tmp_path / "trirail-run-file"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as living:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as killed:
+            folders = [Path(each.stdout.readline().strip()) for each in (living, killed) if each.stdout]
+            killed.kill()
+        assert all((folder / "socket").exists() for folder in folders)
+        with files.temporary_folder(str(tmp_path)) as folder:
+            assert set(tmp_path.iterdir()) == {*kept, folders[0], folder}
+        assert set(tmp_path.iterdir()) == {*kept, folders[0]}
+        living.kill()

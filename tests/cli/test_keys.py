@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from control_rig import CONFIG
 from cyclopts import CycloptsError
-from trirail.cli import app, doctor_network, key_folder, probes, terminal
+from trirail.cli import app, doctor, key_folder, probes, terminal
 from trirail.cli.key_folder import KeyFolder
 from trirail.config import Tls, Zenoh
 from trirail.errors import ServiceError
@@ -217,14 +217,14 @@ def test_what_is_expired_and_who_has_no_certificate_stand_out(
     users = dict.fromkeys(("ann", "bob", "ghost", "nobody"), Role.VIEWER)
     zenoh = Zenoh(listen=("tls/127.0.0.1:7447",), tls=Tls(str(here / "keys")), users=users)
     config = msgspec.structs.replace(CONFIG, zenoh=zenoh)
-    told = doctor_network.without_certificate(Guard(config).users, probes.issued(config))
+    told = doctor.without_certificate(Guard(config).users, probes.issued(config))
     assert [(check.verdict, check.found) for check in told] == [
         ("warning", f"ann cannot connect: {troubles['ann']}"),
         ("warning", f"ghost cannot connect: {troubles['ghost'].replace('keys/users', f'{here}/keys/users')}"),
         ("warning", "nobody has a role and no certificate"),
     ]
     (here / "keys/ca-key.pem").unlink()  # the authority is on another machine
-    assert doctor_network.without_certificate(Guard(config).users, probes.issued(config)) == []
+    assert doctor.without_certificate(Guard(config).users, probes.issued(config)) == []
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,17 @@ from rich.console import Console
 from trirail.cli import live
 from trirail.config import SIM, load
 from trirail.processes.publications import info
-from trirail.wire.state import Commanded, CorrectionTold, FrameCounts, GoalState, LoopState, Percentiles, Sliders, State
+from trirail.wire.state import (
+    Commanded,
+    CorrectionTold,
+    FrameCounts,
+    GoalState,
+    LoopState,
+    Percentiles,
+    Pose,
+    Sliders,
+    State,
+)
 from trirail.wire.units import ANGLE, LENGTH, VELOCITY, quantity
 from trirail_drivers.interface import NAMES
 
@@ -29,10 +39,10 @@ def a_state(**changed: Any) -> State:
         seq=1,
         t=1.0,
         mode="holding",
-        pose=REST,
+        pose=Pose(*REST),
         velocity=REST,
         acceleration=REST,
-        commanded=Commanded(REST, REST, REST, REST, REST, REST),
+        commanded=Commanded(Pose(*REST), REST, REST, REST, REST, REST),
         sliders=Sliders(REST, REST, REST, REST, ("operation enabled",) * 3, (COUNTS,) * 3),
         goal=None,
         settled=True,
@@ -66,14 +76,14 @@ def test_what_is_printed_can_be_typed(pose: tuple[float, float, float], slider: 
 
 
 def test_measured_and_commanded_stand_below_each_other() -> None:
-    commanded = Commanded((0.01, -0.02, 0.1), REST, REST, REST, REST, REST)
+    commanded = Commanded(Pose(0.01, -0.02, 0.1), REST, REST, REST, REST, REST)
     lines = printed(a_state(pose=(0.011, 0.0, 0.0), commanded=commanded))
     assert lines["measured"] == "x    11.000 mm   y     0.000 mm   φ    0.0000°"
     assert lines["commanded"] == "x    10.000 mm   y   -20.000 mm   φ    5.7296°"
 
 
 def test_a_goal_is_shown_with_its_target_and_how_far_it_is() -> None:
-    goal = GoalState("g-17", 0.25, 1.5, (0.05, 0.0, 0.0))
+    goal = GoalState("g-17", 0.25, 1.5, Pose(0.05, 0.0, 0.0))
     lines = printed(a_state(mode="moving", pose=(0.02, 0.0, 0.0), goal=goal, settled=False, override=0.5))
     assert lines["goal"] == "g-17  25%, 1.5 s left"
     assert lines["target"].startswith("x    50.000 mm")

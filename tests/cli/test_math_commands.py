@@ -11,7 +11,7 @@ import pytest
 from cyclopts import App, CycloptsError
 from matplotlib.image import imread
 from numpy.testing import assert_allclose
-from trirail.cli import math_commands, workspace_command
+from trirail.cli import math_commands
 from trirail.config import SIM
 from trirail.errors import KinematicsError, TrirailError
 from trirail.kinematics.geometry import Geometry
@@ -21,7 +21,7 @@ from trirail.workspace.singularity import conditioning, sensitivity
 PAPER = Geometry.symmetric(0.3)
 
 app = App()
-for command in (math_commands.ik, math_commands.fk, workspace_command.workspace):
+for command in (math_commands.ik, math_commands.fk, math_commands.workspace):
     app.command(command)
 
 

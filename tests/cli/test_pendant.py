@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
-from trirail.cli.keyboard import keys
-from trirail.cli.pendant import REPEAT, Pendant
+from trirail.cli.pendant import REPEAT, Pendant, keys
 from trirail.client import held_jog
 from waiting import wait_until
 
@@ -43,7 +42,7 @@ class Operator:
     def __init__(self) -> None:
         self.robot = FakeRobot()
         self.robot.command("enable")
-        self.pendant = Pendant(self.robot.robot(), TOP)
+        self.pendant = Pendant(self.robot.at_pendant(), TOP)
         self.now = 0.0
 
     def press(self, key: str) -> None:

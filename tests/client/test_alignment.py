@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from alignment.cameras import FOCUS, part_at
 from processes.test_service import told, until
-from trirail.alignment.camera_calibration import placed
-from trirail.alignment.images import CameraView, Pair, pixels
+from trirail.alignment.camera_calibration import to_base_frame
+from trirail.alignment.images import CameraView, Pair, project_points
 from trirail.client import calibration_file
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
@@ -33,7 +33,9 @@ ERROR = (0.0008, -0.0006, math.radians(0.35))
 
 
 def seen(part: dict[str, Pair], pose: tuple[float, float, float]) -> dict[str, Pair]:
-    return {name: tuple(pixels(VIEWS[name], placed(q, pose)[None])[0].tolist()) for name, q in part.items()}
+    return {
+        name: tuple(project_points(VIEWS[name], to_base_frame(q, pose)[None])[0].tolist()) for name, q in part.items()
+    }
 
 
 def to_go(event: Event) -> dict[str, object]:
@@ -164,9 +166,9 @@ def test_a_file_keeps_a_calibration_its_date_and_what_made_it(tmp_path: Path, ca
 @pytest.fixture
 def calibrated() -> Any:
     from alignment.test_calibration import two_cameras
-    from trirail.alignment.procedure import calibration_by_moves
+    from trirail.alignment.procedure import calibrate_by_moves
 
-    return two_cameras(1, noise=0.1).drive(calibration_by_moves())
+    return two_cameras(1, noise=0.1).drive(calibrate_by_moves())
 
 
 BROKEN: dict[str, Callable[[str], str]] = {

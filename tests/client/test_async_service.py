@@ -9,6 +9,7 @@ from contextlib import aclosing, suppress
 import pytest
 from refusals import refused_as
 from trirail.client.async_client import AsyncRobot
+from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.records import unpack
@@ -81,6 +82,24 @@ def test_a_session(locator: str) -> None:
         await robot.quick_stop()
         await robot.reset()
         await robot.disable()
+
+    run(locator, work)
+
+
+def test_a_goal_that_is_refused_for_its_id_leaves_the_handle_of_the_first(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        first = await robot.move_to(x=0.03, y=0.0, phi=0.0, id="same")
+        with refused_as(RefusalCode.DUPLICATE_ID):
+            await robot.move_to(x=0.0, y=0.0, phi=0.0, id="same")
+        assert (await first.wait(WITHIN)).outcome == "done"
+        with Robot("demo", locator, user="ann") as blocking:
+            second = blocking.move_to(x=0.0, y=0.0, phi=0.0, id="other")
+            with refused_as(RefusalCode.DUPLICATE_ID):
+                blocking.move_to(x=0.0, y=0.0, phi=0.0, id="other")
+            assert second.wait(WITHIN).outcome == "done"
+            assert repr(second) == "<GoalHandle other done>"
+        state = await robot.state()
+        assert (state.pose.x, state.pose.y, state.pose.phi) == state.pose
 
     run(locator, work)
 

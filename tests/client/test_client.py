@@ -12,10 +12,11 @@ import msgspec
 import pytest
 import zenoh
 from refusals import refused_as
-from trirail.client import client
+from trirail.client import async_client
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import GoalHandle, Robot
-from trirail.errors import RefusalCode, ServiceError
+from trirail.client.goal import AsyncGoalHandle
+from trirail.errors import RefusalCode, ServiceError, WaitTimeoutError
 from trirail.wire.messages import Event
 from trirail.wire.zenoh_session import open_service
 from waiting import WITHIN
@@ -55,6 +56,11 @@ def noisy(tmp_path: Path) -> Iterator[Robot]:
             publisher.join()
 
 
+def unheard(robot: Robot) -> GoalHandle:
+    """A goal of which nobody tells anything."""
+    return GoalHandle(AsyncGoalHandle("mine", robot._robot.command), robot._loop, robot.command)
+
+
 @pytest.mark.parametrize(
     ("call", "error"),
     [
@@ -62,7 +68,7 @@ def noisy(tmp_path: Path) -> Iterator[Robot]:
         (lambda robot: list(robot.events(history=True, timeout=TIMEOUT)), None),
         (lambda robot: list(robot.states(timeout=TIMEOUT)), None),
         (lambda robot: robot.state(timeout=TIMEOUT), ServiceError),
-        (lambda robot: GoalHandle("mine", robot.command).wait(timeout=TIMEOUT), TimeoutError),
+        (lambda robot: unheard(robot).wait(timeout=TIMEOUT), WaitTimeoutError),
         (lambda robot: robot.stop(), ServiceError),
         (lambda robot: robot.home(), ServiceError),
     ],
@@ -70,8 +76,8 @@ def noisy(tmp_path: Path) -> Iterator[Robot]:
 def test_a_call_ends_by_its_timeout_whatever_arrives(
     noisy: Robot, monkeypatch: pytest.MonkeyPatch, call: Callable[[Robot], object], error: type[Exception] | None
 ) -> None:
-    monkeypatch.setattr(client, "REPLY_WITHIN", TIMEOUT)
-    monkeypatch.setattr(client, "HOME_WITHIN", TIMEOUT)
+    monkeypatch.setattr(async_client, "REPLY_WITHIN", TIMEOUT)
+    monkeypatch.setattr(async_client, "HOME_WITHIN", TIMEOUT)
     ended = threading.Event()
     raised: list[type[BaseException] | None] = []
 
@@ -79,7 +85,7 @@ def test_a_call_ends_by_its_timeout_whatever_arrives(
         try:
             call(noisy)
             raised.append(None)
-        except (ServiceError, TimeoutError) as found:
+        except (ServiceError, WaitTimeoutError) as found:
             raised.append(type(found))
         ended.set()
 
@@ -98,7 +104,7 @@ def test_events_are_told_once_and_in_order_whatever_comes_again(noisy: Robot) ->
 def test_a_service_that_does_not_answer_in_time_is_told_as_that(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(client, "REPLY_WITHIN", TIMEOUT)
+    monkeypatch.setattr(async_client, "REPLY_WITHIN", TIMEOUT)
     locator, mute = f"unixsock-stream/{tmp_path}/zenoh", list[zenoh.Query]()
     with open_service([locator]) as session, session.declare_queryable("trirail/demo/**", mute.append):
         with Robot("demo", locator) as robot:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections.abc import Iterator
 
 import msgspec
 import pytest
 from refusals import refused_as
-from trirail.client.lease import SIGNS, Lease
+from trirail.client.blocking import Lease, LoopThread
+from trirail.client.lease import SIGNS, AsyncLease
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, ReleaseLease
@@ -20,12 +22,13 @@ OVER = RefusedError(RefusalCode.LEASE_OVER, "it is over")
 class Service:
     """Confirms what it is asked, or raises what it is told to; keeps what it was asked."""
 
-    def __init__(self, mode: str = "holding") -> None:
+    def __init__(self, loop: LoopThread, mode: str = "holding") -> None:
+        self._loop = loop
         self.asked: queue.Queue[tuple[Command, bytes]] = queue.Queue()
         self.refusal: Exception | None = None
         self.mode = mode
 
-    def command(self, name: Command, content: bytes) -> CommandReply:
+    async def command(self, name: Command, content: bytes) -> CommandReply:
         self.asked.put((name, content))
         if self.refusal is not None:
             raise self.refusal
@@ -35,15 +38,22 @@ class Service:
         return self.asked.get(timeout=WITHIN)
 
     def lease(self, **how: bool) -> Lease:
-        return Lease(self.command, force=how.get("force", False), timeout=0.1)
+        return Lease(AsyncLease(self.command, force=how.get("force", False), timeout=0.1), self._loop)
+
+
+@pytest.fixture
+def loop() -> Iterator[LoopThread]:
+    loop = LoopThread()
+    yield loop
+    loop.close()
 
 
 def sign(content: bytes) -> AcquireLease:
     return msgspec.json.decode(content, type=AcquireLease)
 
 
-def test_it_is_asked_for_kept_by_the_same_and_given_back() -> None:
-    service = Service()
+def test_it_is_asked_for_kept_by_the_same_and_given_back(loop: LoopThread) -> None:
+    service = Service(loop)
     with service.lease(force=True):
         name, content = service.next()
         first = sign(content)
@@ -57,8 +67,8 @@ def test_it_is_asked_for_kept_by_the_same_and_given_back() -> None:
     assert msgspec.json.decode(last[1], type=ReleaseLease).id == first.id
 
 
-def test_each_lease_has_an_id_of_its_own() -> None:
-    service = Service()
+def test_each_lease_has_an_id_of_its_own(loop: LoopThread) -> None:
+    service = Service(loop)
     ids = set()
     for _ in range(2):
         with service.lease():
@@ -68,16 +78,16 @@ def test_each_lease_has_an_id_of_its_own() -> None:
     assert len(ids) == 2
 
 
-def test_entering_returns_when_what_others_had_under_way_stands() -> None:
-    service = Service("stopping")
+def test_entering_returns_when_what_others_had_under_way_stands(loop: LoopThread) -> None:
+    service = Service(loop, "stopping")
     with service.lease():
         asked = {service.next()[0] for _ in range(service.asked.qsize())}
     assert Command.STOP in asked
 
 
 @pytest.mark.parametrize("error", [OVER, ServiceError("nobody answers")])
-def test_what_ends_it_is_kept_and_nothing_is_asked_any_more(error: Exception) -> None:
-    service = Service()
+def test_what_ends_it_is_kept_and_nothing_is_asked_any_more(loop: LoopThread, error: Exception) -> None:
+    service = Service(loop)
     with service.lease() as lease:
         assert lease.lost is None
         service.refusal = error
@@ -86,8 +96,8 @@ def test_what_ends_it_is_kept_and_nothing_is_asked_any_more(error: Exception) ->
     assert {service.next()[0] for _ in range(service.asked.qsize())} == {Command.ACQUIRE}
 
 
-def test_who_does_not_get_it_keeps_nothing_up() -> None:
-    service = Service()
+def test_who_does_not_get_it_keeps_nothing_up(loop: LoopThread) -> None:
+    service = Service(loop)
     service.refusal = RefusedError(RefusalCode.LEASED, "bob holds the lease")
     before = threading.active_count()
     with refused_as(RefusalCode.LEASED), service.lease():
@@ -96,14 +106,14 @@ def test_who_does_not_get_it_keeps_nothing_up() -> None:
     assert service.asked.qsize() == 1
 
 
-def test_who_cannot_wait_for_the_standstill_gives_it_back() -> None:
-    service = Service("stopping")
+def test_who_cannot_wait_for_the_standstill_gives_it_back(loop: LoopThread) -> None:
+    service = Service(loop, "stopping")
 
-    def command(name: Command, content: bytes) -> CommandReply:
+    async def command(name: Command, content: bytes) -> CommandReply:
         if name is Command.STOP:
             raise ServiceError("nobody answers")
-        return service.command(name, content)
+        return await service.command(name, content)
 
-    with pytest.raises(ServiceError), Lease(command, force=False, timeout=10.0):
+    with pytest.raises(ServiceError), Lease(AsyncLease(command, force=False, timeout=10.0), loop):
         raise AssertionError
     assert [service.next()[0] for _ in range(2)] == [Command.ACQUIRE, Command.RELEASE]

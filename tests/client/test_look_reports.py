@@ -14,9 +14,8 @@ from alignment.cameras import Stage, camera, part_at
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.alignment.images import Pair
-from trirail.alignment.procedure import Alignment, Task, align, calibration_by_moves, look_only
-from trirail.client.alignment import drive, drive_async
-from trirail.client.look_reports import UnrecordedAlignmentWarning
+from trirail.alignment.procedure import Alignment, AlignmentTask, align, calibrate_by_moves, measure_part
+from trirail.client.alignment import UnrecordedAlignmentWarning, drive, drive_async
 from trirail.errors import AlignmentError, ServiceError
 from trirail.wire import boundary
 from trirail.wire.looks import AlignmentLook
@@ -53,12 +52,12 @@ class Told:
         return drive(self, look or self.stage.look, wishes, 1.0, 0.0)  # type: ignore[arg-type]
 
 
-def task(told: Told, error: Triple) -> Task:
-    calibration = told.drive(calibration_by_moves())
+def task(told: Told, error: Triple) -> AlignmentTask:
+    calibration = told.drive(calibrate_by_moves())
     targets = told.stage.look()
     told.stage.part = part_at(PART, error)
     told.looks.clear()
-    return Task(calibration, targets, tolerance=5e-6, angle=1e-4)
+    return AlignmentTask(calibration, targets, tolerance=5e-6, angle=1e-4)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -81,7 +80,7 @@ def test_every_look_is_told_with_what_each_mark_has_to_go_and_what_follows(seed:
 
 def test_a_calibration_is_told_look_by_look_and_with_its_noise_at_the_end() -> None:
     told = Told(1)
-    calibration = told.drive(calibration_by_moves())
+    calibration = told.drive(calibrate_by_moves())
     *looks, last = told.looks
     assert [look.number for look in looks] == [1, 2, 3, 4, 5, 6, 7]
     assert all(set(PART) == {mark.name for mark in look.marks} for look in looks)
@@ -91,7 +90,7 @@ def test_a_calibration_is_told_look_by_look_and_with_its_noise_at_the_end() -> N
 def test_a_check_and_a_refusal_are_told() -> None:
     told = Told(2)
     wanted = task(told, (1e-4, 0.0, 0.0))
-    told.drive(look_only(wanted))
+    told.drive(measure_part(wanted))
     told.stage.part = {"left": (-0.06, 0.01), "right": (0.061, 0.01)}
     with pytest.raises(AlignmentError):
         told.drive(align(wanted))
@@ -123,7 +122,7 @@ class Interrupted:
 def test_whatever_ends_it_is_told_once_it_has_looked(looks: int, error: BaseException) -> None:
     told = Told(3)
     with pytest.raises(type(error)):
-        told.drive(calibration_by_moves(), Interrupted(told, looks, error))
+        told.drive(calibrate_by_moves(), Interrupted(told, looks, error))
     assert [look.end for look in told.looks] == [None] * looks + ["failed"] * (looks > 0)
     assert all(look.words == (str(error) or "KeyboardInterrupt") for look in told.looks[looks:])
 

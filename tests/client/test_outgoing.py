@@ -13,7 +13,7 @@ from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any, cast
 
 import msgspec
 import numpy as np
@@ -23,7 +23,9 @@ from control_rig import carried
 from cyclopts import App, CycloptsError
 from msgspec import structs
 from refusals import refused_as
+from trirail.alignment.camera_calibration import CameraCalibration
 from trirail.cli.app import app
+from trirail.cli.options import Service
 from trirail.cli.robot_commands import command_line_of
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
@@ -34,7 +36,7 @@ from trirail.wire.goals import KINDS as EVERY_KIND
 from trirail.wire.goals import Goal, OwnLimits, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import CommandReply, Event, GoalReply
 from trirail.wire.stop_protocol import STOPS
-from trirail.wire.vocabulary import AcquireLease, Command, Override, ReleaseLease, Stop
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, ReleaseLease, Stop
 from trirail.wire.zenoh_session import open_service
 
 ENDED = Event(seq=1, t=0.0, cycle=0, time=1.0, kind="goal", level="info", message="so it ended", outcome="done")
@@ -238,6 +240,31 @@ def test_the_command_line_sends_a_command_with_the_numbers_that_it_cannot_come_w
         made(["override", "--connect", connect], exit_on_error=False, print_error=False)
 
 
+class Label(CommandContent, frozen=True):
+    """A content that no command has yet, with a field of each plain type."""
+
+    text: Annotated[str, msgspec.Meta(max_length=64)]
+    size: float
+    count: int
+    bold: bool = False
+
+
+def test_a_new_commands_fields_of_any_type_are_arguments_of_its_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[object] = []
+
+    class Robot:
+        def command(self, _name: str, content: object) -> CommandReply:
+            sent.append(content)
+            return CommandReply("label", "holding", 1)
+
+    monkeypatch.setattr(Service, "open", lambda _: contextlib.nullcontext(Robot()))
+    command = SimpleNamespace(content=Label)
+    made = App()
+    made.command(command_line_of(command), name="label")  # type: ignore[arg-type]
+    made(["label", "hello there", "0.5", "3"], exit_on_error=False, result_action="return_value")
+    assert sent == [Label("hello there", 0.5, 3)]
+
+
 NONE: tuple[Any, ...] = (
     *("0.5", b"0.5", bytearray(b"1"), np.str_("0.5"), np.bytes_(b"1"), "", None, True, np.True_, [0.5], (0.5,), {}),
     *(np.array([0.5]), np.array([[0.5]]), np.array([]), np.array("0.5"), np.array(True), np.array(0.5 + 1j)),
@@ -378,7 +405,7 @@ def of_name(name: str) -> Call:
     return lambda robot, _: getattr(robot, name)()
 
 
-CALIBRATION: Any = SimpleNamespace(confirmed=True)
+CALIBRATION = CameraCalibration({}, {"a": cast(Any, None)}, 0.0, (), (), {}, confirmed=True)
 """Of a camera: nobody gets as far as to look into it."""
 CLOSED: dict[str, Call] = {
     **{name: of_name(name) for name in ("enable", "disable", "stop", "quick_stop", "reset", "home")},

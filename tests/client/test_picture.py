@@ -14,7 +14,7 @@ from trirail.client import picture
 from trirail.config import SIM, geometry, load
 from trirail.kinematics.robot import inverse
 from trirail.processes.publications import info
-from trirail.wire.state import Commanded, GoalState, Sliders, State
+from trirail.wire.state import Commanded, GoalState, Pose, Sliders, State
 from trirail.workspace import part_positions
 
 SHIPPED = sorted(SIM.parent.glob("*.toml"))
@@ -26,7 +26,7 @@ def at(pose: tuple[float, float, float], path: Path) -> State:
     moved = inverse(geometry(load(path).geometry), np.array(pose), np.zeros(3), np.zeros(3))
     a, b, c = moved.position.tolist()
     sliders = Sliders((a, b, c), (a, b, c), REST, REST, ("operation enabled",) * 3, (COUNTS,) * 3)
-    return a_state(pose=pose, sliders=sliders, commanded=Commanded(pose, REST, REST, (a, b, c), REST, REST))
+    return a_state(pose=pose, sliders=sliders, commanded=Commanded(Pose(*pose), REST, REST, (a, b, c), REST, REST))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -43,7 +43,7 @@ def test_the_drawing_shows_carriages_and_platform_where_they_are(
     left, top, width, height = map(float, svg.attrib["viewBox"].split())
     circles = [(float(each.attrib["cx"]), float(each.attrib["cy"])) for each in svg.iter(f"{SVG}circle")]
     robot = geometry(config.geometry)
-    carriages = part_positions.sliders(robot, np.array([state.sliders.position]))[0]
+    carriages = part_positions.slider_points(robot, np.array([state.sliders.position]))[0]
     np.testing.assert_allclose(circles[:3], carriages, rtol=1e-5, atol=1e-6 * width)
     np.testing.assert_allclose(circles[-1], pose[:2], rtol=1e-5, atol=1e-9)
     for x, y in circles:

@@ -12,8 +12,8 @@ from alignment.cameras import Stage, camera, part_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from trirail.alignment.images import CameraView, Pair, pixels
-from trirail.alignment.procedure import StageMotion, Task, align, calibration_by_moves
+from trirail.alignment.images import CameraView, Pair, project_points
+from trirail.alignment.procedure import AlignmentTask, StageMotion, align, calibrate_by_moves
 from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.client import stage_as_built
@@ -157,7 +157,7 @@ def test_a_mark_of_the_table_goes_where_the_table_really_goes() -> None:
     true = stage.pose_at(0.049)
     sliders = ends[1] - np.sign(np.where(np.abs(moved) > 2e-5, moved, 0.0)) * 2e-5
     assert inverse(ROBOT, true).position == pytest.approx(np.where(np.abs(moved) > 2e-5, sliders, ends[0]), abs=1e-12)
-    u, _ = pixels(VIEW, np.array([true[:2]]))[0]
+    u, _ = project_points(VIEW, np.array([true[:2]]))[0]
     assert moments(CAMERA.picture(stage.pose_at, 0.049, np.random.default_rng(0)))[0] == pytest.approx(u, abs=0.02)
 
 
@@ -197,13 +197,13 @@ def test_play_is_no_matter_where_the_table_always_comes_from_the_same_side(seed:
     rng = np.random.default_rng(seed)
     stage = StageWithPlay(rng, 2e-5)
     beyond = (4e-4, 3e-4, 3e-3)  # all three sliders turn back on the way from there
-    calibration = stage.drive(calibration_by_moves(approach=beyond))
+    calibration = stage.drive(calibrate_by_moves(approach=beyond))
     targets = stage.look()
     x, y, phi = rng.uniform(-1.0, 1.0, 3) * (5e-4, 5e-4, 4e-3)
     stage.part = part_at(PART, (float(x), float(y), float(phi)))
     for pose in ((-1e-3, -1e-3, -1e-2), (0.0, 0.0, 0.0)):
         stage.go(StageMotion(pose))  # as whoever brings the part: from the other side
-    found = stage.drive(align(Task(calibration, targets, tolerance=2e-6, angle=5e-5, approach=beyond)))
+    found = stage.drive(align(AlignmentTask(calibration, targets, tolerance=2e-6, angle=5e-5, approach=beyond)))
     assert found.reached
     assert len(found.corrections) == 1
 
@@ -214,9 +214,9 @@ def test_play_is_seen_where_the_table_comes_from_either_side() -> None:
     for seed in range(10):
         rng = np.random.default_rng(seed)
         stage = StageWithPlay(rng, 2e-5)
-        calibration = stage.drive(calibration_by_moves())
+        calibration = stage.drive(calibrate_by_moves())
         targets = stage.look()
         stage.part = part_at(PART, (3e-4, -2e-4, 2e-3))
-        found = stage.drive(align(Task(calibration, targets, tolerance=1e-7, angle=1e-9, corrections=1)))
+        found = stage.drive(align(AlignmentTask(calibration, targets, tolerance=1e-7, angle=1e-9, corrections=1)))
         left.append(found.measurements[-1].worst)
     assert 2e-6 < float(np.median(left)) < 3e-5

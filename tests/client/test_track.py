@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.client.goal import GoalHandle
-from trirail.client.track import Taker, Track
+from trirail.client.alignment import finish
+from trirail.client.goal import AsyncGoalHandle
+from trirail.client.track import AsyncTrack, Taker
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.goals import Goal, TrackGoal
 from trirail.wire.messages import GoalReply
@@ -15,7 +16,7 @@ POSE = 0.0, 0.0, 0.0
 UPDATES = 12
 
 
-def no_command(*_: object) -> None:
+async def no_command(*_: object) -> None:
     raise AssertionError("nothing was to be commanded")
 
 
@@ -25,12 +26,12 @@ class Sent:
     def __init__(self) -> None:
         self.goals: list[Goal] = []
         self.takers: list[Taker] = []
-        self.track = Track(self._begin, self._post, "target", 0.25)
+        self.track = AsyncTrack(self._begin, self._post, "target", 0.25)
         for _ in range(UPDATES + 1):
-            self.track.update(POSE)
+            finish(self.track.update(POSE))
 
-    def _begin(self, _: object, goal_id: str) -> GoalHandle:
-        handle = GoalHandle(goal_id, no_command)
+    async def _begin(self, _: object, goal_id: str) -> AsyncGoalHandle:
+        handle = AsyncGoalHandle(goal_id, no_command)
         handle.reply = GoalReply(goal_id, None, lag=0.0)
         return handle
 
@@ -41,7 +42,7 @@ class Sent:
     def told(self) -> TrirailError | None:
         """What the next update raises."""
         try:
-            self.track.update(POSE)
+            finish(self.track.update(POSE))
         except TrirailError as error:
             return error
         return None
@@ -75,6 +76,6 @@ def test_the_lag_is_what_the_service_last_said() -> None:
 
 def test_an_update_is_sent_as_it_is_said() -> None:
     sent = Sent()
-    sent.track.update((0.1, 0.2, 0.3), (1.0, 2.0, 3.0), time=5.0)
+    finish(sent.track.update((0.1, 0.2, 0.3), (1.0, 2.0, 3.0), time=5.0))
     said = TrackGoal(0.1, 0.2, 0.3, velocity=(1.0, 2.0, 3.0), time=5.0, id="target", timeout=0.25)
     assert sent.goals[-1] == said

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trirail.client.trajectory import read
+from trirail.client.trajectory import points_of, read
 from trirail.errors import TrirailError
-from trirail.wire.goals import TrajectoryPoint
+from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
 
 HEAD = ("t", "x", "y", "phi", "vx", "vy", "w")
 NUMBER = st.floats(-100.0, 100.0)
@@ -71,3 +71,21 @@ def test_a_trajectory_of_fewer_than_two_points_is_told_by_its_file(rows: int) ->
 def test_columns_are_those_that_there_are_each_once_and_by_threes(head: str) -> None:
     with pytest.raises(TrirailError, match=r"line 1: columns .*; wanted t, x, y, phi, and if known vx, vy, w and"):
         read_text(head + "\n")
+
+
+@pytest.mark.parametrize("number", [5001, 12_000])
+def test_more_points_than_fit_are_refused_before_sending_with_both_numbers(tmp_path: Path, number: int) -> None:
+    rows = [(0.01 * n, 0.0, 0.0, 0.0) for n in range(number)]
+    path = tmp_path / "path.csv"
+    path.write_text("t,x,y,phi\n" + "".join(f"{t},{x},{y},{phi}\n" for t, x, y, phi in rows))
+    for points in (rows, path):
+        with pytest.raises(TrirailError, match=rf"{number} points, a trajectory has 5000 at most: take every "):
+            points_of(points)
+
+
+@pytest.mark.parametrize("begins", [-86_400.5, 1e6, 1_795_245_300.25])
+def test_time_counts_from_the_first_point_whatever_clock_it_is_of(begins: float) -> None:
+    points = points_of([(begins + 0.5 * n, 0.001 * n, 0.0, 0.0) for n in range(3)])
+    assert [point.t - begins for point in TrajectoryGoal(points).points] == [0.0, 0.5, 1.0]
+    with pytest.raises(ValueError, match="they last 86401 s, a trajectory 86400 s at most"):
+        TrajectoryGoal(points_of([(begins, 0.0, 0.0, 0.0), (begins + 86_401.0, 0.0, 0.0, 0.0)]))

@@ -16,10 +16,10 @@ import pytest
 from control_rig import CONFIG
 from trirail.commissioning import bench as benches
 from trirail.commissioning.guide import Guide
-from trirail.commissioning.judgement import Judged
+from trirail.commissioning.judgement import Judgement
 from trirail.commissioning.opening import open_steps
-from trirail.commissioning.person import Question, Quit
-from trirail.commissioning.report import CommissioningReport, Keeper, StepReport
+from trirail.commissioning.person import Question, QuitRequest
+from trirail.commissioning.report import CommissioningReport, ReportFile, StepReport
 from trirail.commissioning.steps import Steps
 from trirail.config import SIM, Config, load
 from trirail_drivers import config
@@ -50,8 +50,8 @@ class Beside:
         if title := re.match(r"\d+/\d+  (.*)", line):
             self._title = title[1]
 
-    def judged(self, judged: Judged) -> None:
-        self.lines += judged.words
+    def show_judgement(self, judgement: Judgement) -> None:
+        self.lines += judgement.words
 
     def ask(self, question: Question, idle: Callable[[], object]) -> str:
         idle()
@@ -60,10 +60,10 @@ class Beside:
         for begin, own in self._answers.items():
             if text.startswith(begin) and own:
                 return own.pop(0)
-        if text.startswith("Do it?") and any(re.search(word, self._title) for word in self._skip):
+        if text.startswith("Run it?") and any(re.search(word, self._title) for word in self._skip):
             return "s"
         if question.default is None:
-            raise Quit
+            raise QuitRequest
         return question.default
 
 
@@ -79,7 +79,7 @@ class Run:
         source: Path = SIM,
     ) -> None:
         self.person = person or Beside()
-        self.keeper = Keeper(
+        self.keeper = ReportFile(
             CommissioningReport(robot.robot.name, str(source), "now", True, "tests"), folder / "report.json"
         )
         self.path = folder / "robot.toml"
@@ -283,7 +283,7 @@ def test_play_is_never_told_as_a_scale(play: str, tmp_path: Path) -> None:
 def test_a_motor_that_moves_nothing(tmp_path: Path) -> None:
     answers = {"Which slider moved": ["n"]}
     run = Run(tmp_path, person=Beside(only("A"), answers))
-    found(run, "move", "A", "coupling to the slider is loose", "coupling between motor A")
+    found(run, "move", "A", "the coupling between them is loose", "coupling between motor A")
 
 
 def test_a_switch_that_is_pressed_at_rest_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,19 +298,19 @@ def test_a_switch_that_is_pressed_at_rest_is_named(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(SimulatedDrive, "restarted", restarted)
     run = Run(tmp_path, robot=with_drives(ROBOT, homing=HOMING), person=person)
-    found(run, "switches", "A", "takes its positive limit switch for pressed", "normally closed")
+    found(run, "switches", "A", "reports its positive limit switch as pressed", "normally closed")
     assert run.of("home", "A").verdict == "skipped"
 
 
 def test_switches_that_are_not_seen_are_asked_about(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SimulatedDrive, "press", lambda self, switches: None)
-    answers = {"Seen were: none": ["n", "y"]}
+    answers = {"Switches that changed: none": ["n", "y"]}
     run = Run(tmp_path, person=Beside(["by hand", "Power"], answers))
     assert [run.of("switches", name).verdict for name in NAMES] == ["wrong", "ok", "ok"]
 
 
 def test_a_drive_that_breaks_down_is_named_and_the_step_can_be_repeated(tmp_path: Path) -> None:
-    answers = {"Go on with the next?": ["y"]}
+    answers = {"Continue with the next step?": ["y"]}
     run = Run(tmp_path, faults=["when A enabled A fault 4310"], person=Beside(only("A"), answers))
     tries = [entry for entry in run.keeper.report.steps if entry.step == "power"]
     assert [entry.verdict for entry in tries if entry.drive == "A"] == ["failed", "ok"]
@@ -319,8 +319,8 @@ def test_a_drive_that_breaks_down_is_named_and_the_step_can_be_repeated(tmp_path
 
 
 def test_a_wrong_geometry_is_seen_in_the_square(tmp_path: Path) -> None:
-    run = Run(tmp_path, person=Beside(["by hand"], {"Did the platform go": ["n"]}))
-    found(run, "square", "", "did as they were told", r"\[geometry\]")
+    run = Run(tmp_path, person=Beside(["by hand"], {"Did the platform move": ["n"]}))
+    found(run, "square", "", "followed their setpoints", r"\[geometry\]")
 
 
 def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:
@@ -355,9 +355,9 @@ def test_every_step_can_be_refused_and_nothing_moves(tmp_path: Path) -> None:
     run = Run(tmp_path, person=Beside(["by hand", "Power"]))
     assert {entry.verdict for entry in run.keeper.report.steps} == {"ok", "skipped"}
     assert (run.keeper.report.ok, run.keeper.report.complete) == (True, False)
-    assert {"push A", "power B", "square"} <= set(run.keeper.report.left)
-    assert run.steps.session.place.rules is not None
-    assert run.steps.session.place.rules.read() == (0.0, 0.0, 0.0)
+    assert {"push A", "power B", "square"} <= set(run.keeper.report.incomplete)
+    assert run.steps.session.environment.rules is not None
+    assert run.steps.session.environment.rules.read() == (0.0, 0.0, 0.0)
 
 
 def test_only_the_drive_of_the_step_ever_has_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -438,14 +438,14 @@ def test_ctrl_c_stops_in_that_cycle_and_ends_without_power(monkeypatch: pytest.M
 
 def test_the_report_is_in_its_files_after_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     person = Beside()
-    seen = person.judged
+    seen = person.show_judgement
 
-    def look(judged: Judged) -> None:
+    def look(judgement: Judgement) -> None:
         told = json.loads((tmp_path / "report.json").read_text())
-        assert told["steps"][-1]["words"] == list(judged.words)
-        seen(judged)
+        assert told["steps"][-1]["words"] == list(judgement.words)
+        seen(judgement)
 
-    monkeypatch.setattr(person, "judged", look)
+    monkeypatch.setattr(person, "show_judgement", look)
     run = Run(tmp_path, faults=["C reversed"], person=person)
     told = json.loads((tmp_path / "report.json").read_text())
     assert told["changes"] == {"drives.C.direction": -1}
@@ -459,7 +459,7 @@ def test_a_rule_that_is_read_coarsely_tells_no_scale_from_1_mm(tmp_path: Path) -
     answers = {"To how many mm": ["0.2"]}
     run = Run(tmp_path, faults=["A scale 0.8"], person=Beside(only("A"), answers))
     assert run.of("move", "A").verdict == "ok"
-    assert "does not tell the scale" in " ".join(run.of("move", "A").words)
+    assert "does not show the scale" in " ".join(run.of("move", "A").words)
 
 
 def test_no_rule_is_asked_for_what_was_answered_wrongly(tmp_path: Path) -> None:
@@ -467,4 +467,4 @@ def test_no_rule_is_asked_for_what_was_answered_wrongly(tmp_path: Path) -> None:
     run = Run(tmp_path, person=Beside(only("A"), answers))
     assert run.of("move", "A").verdict == "ok"
     assert sum("is no length" in line for line in run.person.lines) == 3
-    assert sum("is no answer here" in line for line in run.person.lines) == 1
+    assert sum("is not an answer" in line for line in run.person.lines) == 1

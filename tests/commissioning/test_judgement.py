@@ -7,12 +7,19 @@ import itertools
 import msgspec
 import pytest
 from control_rig import CONFIG
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
-from trirail.commissioning.coupling import COARSE, SCALE, MoveSeen, PushSeen, judge_move, judge_push
-from trirail.commissioning.judgement import Judged, judge_square, judge_switches, judge_watchdog
-from trirail.commissioning.moves import DISTANCE
-from trirail.commissioning.node_swaps import merged
+from trirail.commissioning.coupling import (
+    MAX_RULE_UNCERTAINTY,
+    SCALE_TOLERANCE,
+    MoveObservation,
+    PushObservation,
+    judge_move,
+    judge_push,
+)
+from trirail.commissioning.guide import merge_changes
+from trirail.commissioning.judgement import Judgement, judge_square, judge_switches, judge_watchdog
+from trirail.commissioning.moves import TEST_DISTANCE_M
 from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 
@@ -29,16 +36,19 @@ def drives(direction: int = 1, counts: float = 1e6) -> Drives:
     return found
 
 
-def moved(name: str = "A", **keys: object) -> MoveSeen:
-    usual = MoveSeen(name, DISTANCE, DISTANCE, -DISTANCE, 1e-5, "", name, DISTANCE, 0.0, 1e-5, 1e-7)
+def moved(name: str = "A", **keys: object) -> MoveObservation:
+    usual = MoveObservation(
+        name, TEST_DISTANCE_M, TEST_DISTANCE_M, -TEST_DISTANCE_M, 1e-5, "", name, TEST_DISTANCE_M, 0.0, 1e-5, 1e-7
+    )
     seen = usual._replace(**keys)  # type: ignore[arg-type]
     return seen if "back" in keys else seen._replace(back=-seen.out)
 
 
-def said(judged: Judged) -> str:
+def said(judged: Judgement) -> str:
     return " ".join(judged.words)
 
 
+@example(name="A", sign=-1.0, share=0.75, read_to=0.00017498, direction=1)  # play was named that the rule does not show
 @given(
     name=sliders,
     sign=signs,
@@ -49,10 +59,10 @@ def said(judged: Judged) -> str:
 def test_what_a_rule_cannot_tell_apart_is_right(
     name: str, sign: float, share: float, read_to: float, direction: int
 ) -> None:
-    asked = sign * DISTANCE
+    asked = sign * TEST_DISTANCE_M
     rule = asked + share * 1.9 * read_to
     assume(abs(rule) > 2.0 * read_to)
-    seen = moved(name, asked=asked, out=asked, rule_out=rule, rule_back=share * read_to, read_to=read_to)
+    seen = moved(name, commanded=asked, out=asked, rule_out=rule, rule_back=share * read_to, rule_resolution=read_to)
     judged = judge_move(seen, drives(direction))
     assert (judged.verdict, judged.changes, judged.remedy) == ("ok", {}, "")
 
@@ -75,7 +85,7 @@ def test_the_configuration_that_comes_of_it_measures_what_the_rule_reads(
     counted = [0.0, 0.0, 0.0]
     counted[NAMES.index(drive)] = way
     a, b, c = counted
-    judged = judge_push(PushSeen(slider, sign * rule, (a, b, c), -sign * rule, (-a, -b, -c), 1e-5, 1e-6), before)
+    judged = judge_push(PushObservation(slider, sign * rule, (a, b, c), -sign * rule, (-a, -b, -c), 1e-5, 1e-6), before)
     after = getattr(before, slider)
     for key, value in judged.changes.items():
         _, name, field = key.split(".")
@@ -84,9 +94,9 @@ def test_the_configuration_that_comes_of_it_measures_what_the_rule_reads(
     old = getattr(before, drive)
     counts = way * old.direction * old.counts_per_metre
     measured = counts / (after.direction * after.counts_per_metre)
-    assert measured == pytest.approx(sign * rule, rel=max(SCALE, 2.0 * 1.1e-5 / rule) * 1.1)
+    assert measured == pytest.approx(sign * rule, rel=max(SCALE_TOLERANCE, 2.0 * 1.1e-5 / rule) * 1.1)
     assert after.node == old.node
-    right = drive == slider and turned > 0 and abs(ratio - 1.0) <= SCALE
+    right = drive == slider and turned > 0 and abs(ratio - 1.0) <= SCALE_TOLERANCE
     assert judged.verdict == ("ok" if right else judged.verdict)
     assert ("swapped nodes" in said(judged)) is (drive != slider)
     assert ("wrong direction" in said(judged)) is (turned < 0)
@@ -95,9 +105,9 @@ def test_the_configuration_that_comes_of_it_measures_what_the_rule_reads(
 
 @given(name=sliders, rule=st.floats(2e-4, 0.01), sign=signs, counted=st.floats(-0.01, 0.19))
 def test_an_encoder_that_does_not_go_along_is_loose(name: str, rule: float, sign: float, counted: float) -> None:
-    asked = sign * DISTANCE
-    out = counted * sign * min(rule, DISTANCE)
-    seen = moved(name, asked=asked, out=out, rule_out=sign * rule, stopped="slider A: following error")
+    asked = sign * TEST_DISTANCE_M
+    out = counted * sign * min(rule, TEST_DISTANCE_M)
+    seen = moved(name, commanded=asked, out=out, rule_out=sign * rule, stopped="slider A: following error")
     judged = judge_move(seen, drives())
     assert judged.verdict == "wrong"
     assert "loose encoder" in said(judged)
@@ -106,8 +116,14 @@ def test_an_encoder_that_does_not_go_along_is_loose(name: str, rule: float, sign
 
 @given(name=sliders, lost=st.floats(0.11, 0.9), sign=signs)
 def test_one_that_comes_back_elsewhere_slips(name: str, lost: float, sign: float) -> None:
-    rule = sign * DISTANCE / (1.0 - lost)
-    seen = moved(name, asked=sign * DISTANCE, out=sign * DISTANCE, rule_out=rule, rule_back=rule - sign * DISTANCE)
+    rule = sign * TEST_DISTANCE_M / (1.0 - lost)
+    seen = moved(
+        name,
+        commanded=sign * TEST_DISTANCE_M,
+        out=sign * TEST_DISTANCE_M,
+        rule_out=rule,
+        rule_back=rule - sign * TEST_DISTANCE_M,
+    )
     judged = judge_move(seen, drives())
     assert (judged.verdict, judged.changes) == ("wrong", {})
     assert "slip" in said(judged)
@@ -134,9 +150,9 @@ def test_a_slip_is_never_told_as_a_scale(
     rule, rule_back = rules[1] - rules[0], rules[2] - rules[1]
     counted, counted_back = there * sign * way, -back * sign * way
     if power:
-        seen = moved(name, asked=counted, out=counted, back=counted_back, rule_out=rule, rule_back=rule + rule_back)
+        seen = moved(name, commanded=counted, out=counted, back=counted_back, rule_out=rule, rule_back=rule + rule_back)
         assume(counted)
-        judged = judge_move(seen._replace(read_to=read_to), drives())
+        judged = judge_move(seen._replace(rule_resolution=read_to), drives())
     else:
         judged = judge_push(pushed(name, rule, counted, rule_back, counted_back, read_to), drives())
     assert not [key for key in judged.changes if key.endswith("counts_per_metre")]
@@ -156,22 +172,22 @@ def test_a_scale_is_never_told_as_a_slip(name: str, way: float, sign: float, rat
     seen = pushed(name, rule, ratio * sign * way, rule_back, -ratio * sign * way, read_to)
     judged = judge_push(seen, drives())
     assert "slip" not in said(judged)
-    if abs(ratio - 1.0) > 1.5 * SCALE:
+    if abs(ratio - 1.0) > 1.5 * SCALE_TOLERANCE:
         assert judged.changes[f"drives.{name}.counts_per_metre"] == pytest.approx(1e6 * ratio, rel=0.01)
 
 
-def pushed(name: str, rule: float, way: float, rule_back: float, way_back: float, read_to: float) -> PushSeen:
+def pushed(name: str, rule: float, way: float, rule_back: float, way_back: float, read_to: float) -> PushObservation:
     """Slider and drive of one name; the others stood still."""
     ways, ways_back = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     ways[NAMES.index(name)], ways_back[NAMES.index(name)] = way, way_back
     (a, b, c), (d, e, f) = ways, ways_back
-    return PushSeen(name, rule, (a, b, c), rule_back, (d, e, f), read_to, 1e-7)
+    return PushObservation(name, rule, (a, b, c), rule_back, (d, e, f), read_to, 1e-7)
 
 
 @given(name=sliders, away=st.floats(0.06, 5.0), sign=signs)
 def test_one_that_counts_backwards_runs_away(name: str, away: float, sign: float) -> None:
-    asked = sign * DISTANCE
-    seen = moved(name, asked=asked, out=-away * asked, rule_out=away * asked, stopped="following error")
+    asked = sign * TEST_DISTANCE_M
+    seen = moved(name, commanded=asked, out=-away * asked, rule_out=away * asked, stopped="following error")
     judged = judge_move(seen, drives())
     assert judged.verdict == "wrong"
     assert "against its motor" in said(judged)
@@ -180,10 +196,10 @@ def test_one_that_counts_backwards_runs_away(name: str, away: float, sign: float
 
 @given(read_to=st.floats(1e-5, 5e-3), ratio=st.floats(0.3, 3.0))
 def test_no_scale_is_changed_by_what_a_rule_cannot_tell(read_to: float, ratio: float) -> None:
-    rule = DISTANCE / ratio
-    judged = judge_move(moved(rule_out=rule, read_to=read_to), drives())
+    rule = TEST_DISTANCE_M / ratio
+    judged = judge_move(moved(rule_out=rule, rule_resolution=read_to), drives())
     unread = 2.0 * (read_to + 1e-7) / rule
-    if unread > COARSE:
+    if unread > MAX_RULE_UNCERTAINTY:
         assert "drives.A.counts_per_metre" not in judged.changes
 
 
@@ -193,7 +209,7 @@ def test_nodes_go_where_their_sliders_are(moves: list[str]) -> None:
     changes = [
         judge_move(moved(name, slider=slider), before).changes for name, slider in zip(NAMES, moves, strict=True)
     ]
-    together, conflict = merged(changes, before)
+    together, conflict = merge_changes(changes, before)
     assert conflict == ""
     after = {name: together.get(f"drives.{name}.node", getattr(before, name).node) for name in NAMES}
     assert after == {slider: getattr(before, name).node for name, slider in zip(NAMES, moves, strict=True)}
@@ -206,7 +222,7 @@ def test_nodes_stay_different_where_only_some_were_looked_at(number: int, moves:
         judge_move(moved(name, slider=slider), before)
         for name, slider in zip(NAMES[:number], moves[:number], strict=True)
     ]
-    together, _ = merged([judged.changes for judged in seen], before)
+    together, _ = merge_changes([judged.changes for judged in seen], before)
     nodes = [together.get(f"drives.{name}.node", getattr(before, name).node) for name in NAMES]
     assert sorted(nodes) == sorted(drive.node for drive in before.each)
 
@@ -214,7 +230,7 @@ def test_nodes_stay_different_where_only_some_were_looked_at(number: int, moves:
 def test_two_drives_on_one_slider_are_no_exchange() -> None:
     before = drives()
     seen = [judge_move(moved(name, slider="C"), before).changes for name in ("A", "B")]
-    together, conflict = merged([*seen, {"drives.A.direction": -1}], before)
+    together, conflict = merge_changes([*seen, {"drives.A.direction": -1}], before)
     nodes = [together.get(f"drives.{name}.node", getattr(before, name).node) for name in NAMES]
     assert len(set(nodes)) == 3
     assert together["drives.A.direction"] == -1

@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.cli import doctor
 from trirail.config import SIM, Config, as_built, corrected_geometry, geometry, load
-from trirail.config.as_built import AsBuilt, geometry_of, parse, written
+from trirail.config.as_built import AsBuilt, format_map, geometry_of, parse
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry
-from trirail.motion.feasibility import PLANNED
+from trirail.motion.feasibility import SLIDER_PLAN_SHARES
 from trirail.motion.motion_planner import revision
 from trirail.processes.publications import info
 from trirail.telemetry import provenance
@@ -63,15 +63,15 @@ def refused(folder: Path, content: bytes) -> str:
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
-    assert parse(written(a_map())) == a_map()
-    config = load(robot_file(tmp_path, written(a_map()).encode()))
+    assert parse(format_map(a_map())) == a_map()
+    config = load(robot_file(tmp_path, format_map(a_map()).encode()))
     assert config.correction.as_built == a_map()
     assert corrected_geometry(config).correction is not None
     assert corrected_geometry(config) != PLAIN
 
 
 def test_a_recording_holds_the_map_itself(tmp_path: Path) -> None:
-    config = load(robot_file(tmp_path, written(a_map()).encode(), BOTH))
+    config = load(robot_file(tmp_path, format_map(a_map()).encode(), BOTH))
     (tmp_path / "as_built.toml").unlink()
     again = provenance.configuration(provenance.texts(config))
     assert again == config
@@ -79,8 +79,8 @@ def test_a_recording_holds_the_map_itself(tmp_path: Path) -> None:
 
 
 def test_another_correction_is_another_revision(tmp_path: Path) -> None:
-    config = load(robot_file(tmp_path, written(a_map()).encode()))
-    other = load(robot_file(tmp_path, written(a_map(seed=3)).encode()))
+    config = load(robot_file(tmp_path, format_map(a_map()).encode()))
+    other = load(robot_file(tmp_path, format_map(a_map(seed=3)).encode()))
     lash = msgspec.structs.replace(
         config, correction=msgspec.structs.replace(config.correction, backlash=(1e-5, 0.0, 0.0))
     )
@@ -88,17 +88,17 @@ def test_another_correction_is_another_revision(tmp_path: Path) -> None:
 
 
 def test_the_reserve_is_what_plans_leave() -> None:
-    assert pytest.approx([1.0 - share for share in PLANNED]) == as_built.RESERVE
+    assert pytest.approx([1.0 - share for share in SLIDER_PLAN_SHARES]) == as_built.RESERVE
 
 
 def test_what_is_wrong_with_a_map_is_said(tmp_path: Path) -> None:
-    good = written(a_map())
+    good = format_map(a_map())
 
     def said(found: AsBuilt) -> str:
-        return refused(tmp_path, written(found).encode())
+        return refused(tmp_path, format_map(found).encode())
 
     assert "correction.map:" in refused(tmp_path, b"")
-    assert "no map of as-built errors" in refused(tmp_path, b"")
+    assert "invalid map of as-built errors" in refused(tmp_path, b"")
     assert "not TOML" in refused(tmp_path, good.encode()[:-100])
     assert "not text in UTF-8" in refused(tmp_path, b"\xff\xfe" + good.encode())
     assert "missing required field made" in refused(tmp_path, good.replace('made = "2026-05-01"', "").encode())
@@ -107,7 +107,7 @@ def test_what_is_wrong_with_a_map_is_said(tmp_path: Path) -> None:
     assert "limits.platform.x is [-0.15, 0.15]" in said(a_map(low=(-0.1, -0.15, -1.2)))
     steep = said(a_map(3e-3))
     assert "too steep near x " in steep
-    assert "the limits have room for" in steep
+    assert "the limits allow" in steep
     ragged = a_map()
     ragged = msgspec.structs.replace(ragged, nodes=(ragged.nodes[0][:4], *ragged.nodes[1:]))
     assert "correction.as_built.nodes" in said(ragged)
@@ -121,7 +121,7 @@ def test_where_it_is_too_steep_and_by_how_much_is_said(tmp_path: Path) -> None:
     """One node that is off: the place that is named is beside it."""
     nodes = np.zeros((11, 11, 11, 3))
     nodes[7, 3, 5, 0] = 2e-3
-    said = refused(tmp_path, written(a_map(nodes=tupled(nodes.tolist()))).encode())
+    said = refused(tmp_path, format_map(a_map(nodes=tupled(nodes.tolist()))).encode())
     place = [float(number) for number in re.findall(r"(?:x|y|phi) (-?[\d.]+)", said.partition("near ")[2])[:3]]
     size = np.array([0.3, 0.3, 2.05]) / 8.0
     place = [place[0] * 1e-3, place[1] * 1e-3, math.radians(place[2])]
@@ -136,7 +136,7 @@ def test_a_map_that_brings_the_legs_to_a_singular_angle_is_refused(tmp_path: Pat
         nodes = np.zeros((4, 4, 4, 3))
         nodes[..., 2] = turn
         found = a_map(nodes=tupled(nodes.tolist()), high=(0.15, 0.15, 0.9))
-        (tmp_path / "as_built.toml").write_text(written(found), encoding="utf-8")
+        (tmp_path / "as_built.toml").write_text(format_map(found), encoding="utf-8")
         path.write_text(near + '\n[correction]\nmap = "as_built.toml"\n', encoding="utf-8")
         if right:
             assert load(path).correction.as_built == found
@@ -145,7 +145,7 @@ def test_a_map_that_brings_the_legs_to_a_singular_angle_is_refused(tmp_path: Pat
                 load(path)
 
 
-GOOD = written(a_map()).splitlines()
+GOOD = format_map(a_map()).splitlines()
 VALUES = ("0", "-1", "1e300", "nan", "inf", '""', "[]", "[[]]", "{}", "true", "[nan, 0, 0]", "9" * 400, "[" * 5000)
 
 
@@ -181,7 +181,7 @@ def test_the_geometry_is_told_from_others_by_a_nanometre() -> None:
 def test_who_asks_is_told_of_the_correction(tmp_path: Path) -> None:
     assert info(CONFIG).correction is None
     assert doctor.corrected(CONFIG) == []
-    config = load(robot_file(tmp_path, written(a_map()).encode(), BOTH))
+    config = load(robot_file(tmp_path, format_map(a_map()).encode(), BOTH))
     told = info(config).correction
     assert told is not None
     assert (told.file, told.made, told.backlash) == (str(tmp_path / "as_built.toml"), "2026-05-01", (5e-5, 0.0, 1e-5))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from pathlib import Path
 
@@ -14,8 +15,7 @@ from trirail.cli.app import app
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.config import geometry
-from trirail.control.commands import EFFECTS, Effect
-from trirail.control.completion import CommandProgress
+from trirail.control.commands import EFFECTS, CommandProgress, Effect
 from trirail.control.feedback import Measured
 from trirail.control.modes import ModeEvent
 from trirail.wire import packets
@@ -69,17 +69,17 @@ def test_the_control_answers_every_command(rig: ControlRig, name: Command, enabl
 def test_a_method_of_a_commands_name_sends_that_and_both_clients_have_it(name: Command) -> None:
     sent: list[str] = []
 
-    class Deaf(Robot):
+    class Deaf(AsyncRobot):
         def __init__(self) -> None:
             pass
 
-        def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
+        async def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
             sent.append(name)
             return CommandReply(name, "holding", 1)
 
     assert hasattr(Robot, name) == hasattr(AsyncRobot, name)
     if hasattr(Robot, name):
-        getattr(Deaf(), name)(*(50.0,) * (name is Command.OVERRIDE))
+        asyncio.run(getattr(Deaf(), name)(*(50.0,) * (name is Command.OVERRIDE)))
     assert sent == [name] * hasattr(Robot, name)
 
 

@@ -7,8 +7,7 @@ from itertools import product
 
 from control_rig import CONFIG
 from trirail.config import geometry
-from trirail.control.commands import EFFECTS
-from trirail.control.completion import CommandProgress, still_powered
+from trirail.control.commands import EFFECTS, CommandProgress, still_powered
 from trirail.control.feedback import Measured
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import DriveFault, Feedback, PowerState

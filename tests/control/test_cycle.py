@@ -19,7 +19,7 @@ from trirail.control.setpoints import Setpoints
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward, inverse
 from trirail.motion.limits import Bounds
-from trirail.motion.paths import FOR_EVER, Path
+from trirail.motion.paths import LAST_PIECE_S, Path
 from trirail.motion.runs import Run, Seam, rest
 from trirail.motion.schedule import Schedule
 from trirail.wire.goals import PoseGoal, SlidersGoal
@@ -35,6 +35,8 @@ ON = (PowerState.OPERATION_ENABLED,) * 3
 PLACES = st.tuples(*[st.floats(-0.03, 0.03)] * 2, st.floats(-0.2, 0.2))
 TERMS = st.tuples(*[st.floats(-0.05, 0.05)] * 3)
 RATES = st.floats(0.1, 2.0)
+ANYWHERE = np.full(9, np.inf)
+"""Where the robot may stand."""
 
 
 def bits(values: object) -> bytes:
@@ -70,7 +72,7 @@ def test_what_is_commanded_is_what_everybody_elses_mathematics_says(
 ) -> None:
     begin = inverse(ROBOT, start).position.tolist() if in_sliders else start
     path = Path(np.array([0.0, 0.4]), np.array([np.transpose([begin, *terms])]), in_sliders)
-    law = Path(np.array([0.0, 0.1, FOR_EVER]), np.zeros((2, 1, 6)))
+    law = Path(np.array([0.0, 0.1, LAST_PIECE_S]), np.zeros((2, 1, 6)))
     law.pieces[0, 0, :3] = 0.0, rate, change
     law.pieces[1, 0, :2] = 0.1 * rate + 0.01 * change, rate + 0.2 * change
     run = Run(LEGS, path, law, float(law.pieces[1, 0, 1]))
@@ -81,7 +83,7 @@ def test_what_is_commanded_is_what_everybody_elses_mathematics_says(
     schedule.replace_runs(deque([run]))
     measured = Measured(LEGS, PERIOD, STEP)
     measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
-    setpoints = Setpoints(LEGS, boundless(), measured, STEP)
+    setpoints = Setpoints(LEGS, boundless(), ANYWHERE, measured, STEP)
 
     assert schedule.begin_cycle() is run
     expected = run.state(0.0, start)
@@ -100,8 +102,8 @@ def test_what_is_commanded_is_what_everybody_elses_mathematics_says(
     assert bits(record["commanded_acceleration"]) == bits(solved.acceleration)
     assert bits(record["passive_position"]) == bits(solved.passive_position)
     assert bits([record["progress"], record["remaining"]]) == bits([run.progress, run.remaining])
-    assert bool(found) is (run.stands or (seam is not None and run.at.s >= seam))
-    assert schedule.end_cycle(run) == (seam is not None and run.at.s >= seam)
+    assert bool(found) is (run.at_rest or (seam is not None and run.law_state.s >= seam))
+    assert schedule.end_cycle(run) == (seam is not None and run.law_state.s >= seam)
 
 
 @pytest.mark.parametrize(
@@ -110,15 +112,15 @@ def test_what_is_commanded_is_what_everybody_elses_mathematics_says(
 )
 def test_a_motion_stands_on_its_way_where_its_law_does(rate: float, change: float, target: float, stands: bool) -> None:
     path = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
-    law = Path(np.array([0.0, FOR_EVER]), np.zeros((1, 1, 6)))
+    law = Path(np.array([0.0, LAST_PIECE_S]), np.zeros((1, 1, 6)))
     law.pieces[0, 0, :3] = 0.5, rate, change / 2.0
     run = Run(LEGS, path, law, target)
     schedule = Schedule(rest((0.0, 0.0, 0.0)), PERIOD)
     schedule.replace_runs(deque([run]))
-    setpoints = Setpoints(LEGS, boundless(), Measured(LEGS, PERIOD, STEP), STEP)
+    setpoints = Setpoints(LEGS, boundless(), ANYWHERE, Measured(LEGS, PERIOD, STEP), STEP)
     found = setpoints.solve(schedule, schedule.begin_cycle())
     assert setpoints.refusal(found) is None
-    assert run.stands is stands
+    assert run.at_rest is stands
     assert bool(found & STANDS) is stands
     assert not found & PASSED
 
@@ -130,7 +132,7 @@ def test_what_the_gate_refuses_leaves_the_setpoints_as_they_are(
     """A motion that begins with a velocity: a jerk that no limit allows."""
     assume(max(map(abs, terms)) > 0.01)
     bounds, measured = Bounds(CONFIG.limits, PERIOD), Measured(LEGS, PERIOD, STEP)
-    setpoints, schedule = Setpoints(LEGS, bounds, measured, STEP), Schedule(rest(start), PERIOD)
+    setpoints, schedule = Setpoints(LEGS, bounds, ANYWHERE, measured, STEP), Schedule(rest(start), PERIOD)
     a, b, c = inverse(ROBOT, start).position.tolist()
     measured.start(Feedback((a, b, c), ON, None))
     setpoints.start()
@@ -138,7 +140,7 @@ def test_what_the_gate_refuses_leaves_the_setpoints_as_they_are(
     rows = setpoints.rows
     pieces = np.zeros((1, 3, 6))
     pieces[0, :, 0], pieces[0, :, 1] = start, terms
-    law = Path(np.array([0.0, FOR_EVER]), np.array([[[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]]))
+    law = Path(np.array([0.0, LAST_PIECE_S]), np.array([[[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]]]))
     schedule.replace_runs(deque([Run(LEGS, Path(np.array([0.0, 1.0]), pieces), law, 1.0)]))
     refused = setpoints.refusal(setpoints.solve(schedule, schedule.begin_cycle()))
     assert refused is not None

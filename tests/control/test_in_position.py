@@ -9,13 +9,14 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import Rig, changed
-from control_rig import CONFIG
+from control_rig import CONFIG, expected_duration
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import Config, geometry
 from trirail.control.in_position import Settling, monitor
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import Notice
 from trirail.wire.packets import Accepted, Confirmed
@@ -105,7 +106,7 @@ def test_it_settles_at_once_where_the_drives_follow(rig: Rig) -> None:
     answer = rig.goal("g1", *TARGET)
     assert isinstance(answer, Accepted)
     taken = rig.until(rig.holds)
-    assert taken <= math.ceil(answer.duration / PERIOD) + round(WINDOWS.dwell / PERIOD) + 3
+    assert taken <= math.ceil(expected_duration(answer) / PERIOD) + round(WINDOWS.dwell / PERIOD) + 3
     assert ends(rig)[0].settle == pytest.approx(PERIOD)
 
 
@@ -204,7 +205,7 @@ def test_unsettled_says_where_the_robot_is_and_holds(robots: Callable[..., Rig])
 )
 def test_what_ends_it(late: Rig, what: str | ModeEvent, outcome: str, mode: Mode) -> None:
     if isinstance(what, ModeEvent):
-        late.control.modes.happen(what, "it happened")
+        late.control.modes.happen(what, coded("it happened", EventCode.OTHER))
     elif what == "fault":
         late.drives[0].fail(0x2310)
     else:
@@ -290,7 +291,7 @@ def test_a_trajectory_may_ask_not_to_settle(behind: Rig) -> None:
     points = (TrajectoryPoint(0.0, 0.0, 0.0, 0.0), TrajectoryPoint(1.0, *TARGET))
     answer = behind.send("g1", TrajectoryGoal(points, settle=False))
     assert isinstance(answer, Accepted)
-    assert behind.until(behind.holds) <= math.ceil(answer.duration / PERIOD) + 2
+    assert behind.until(behind.holds) <= math.ceil(expected_duration(answer) / PERIOD) + 2
     assert away(behind) > 10.0
     (said,) = ends(behind)
     assert (said.outcome, said.settle, said.residual, said.overshoot) == ("done", None, None, None)

@@ -362,7 +362,7 @@ class Crowd:
         for answer in rig.answers[answered:]:
             if isinstance(answer, Accepted):
                 self.seen["accepted"] += 1
-                assert free or self._sender[answer.id] == holder
+                assert free or self._sender[answer.reply.id] == holder
         self.seen["held"] += holder is not None
         assert free or all(goal.user == holder for goal in rig.control.ledger.goals)
 

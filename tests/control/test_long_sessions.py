@@ -111,7 +111,7 @@ class Progress:
         control, (goal, ends, best, since) = self._session.control, self._seen
         under_way, (now, _) = control.ledger.goal, control.schedule.progress
         runs = control.schedule.runs
-        end = runs[0].course.end if runs else 0.0  # another one where a goal is to blend with it, or is no more
+        end = runs[0].goal_span.end if runs else 0.0  # another one where a goal is to blend with it, or is no more
         waits = control.override == 0.0 or control.state.paused or len(runs) != 1 or now >= 1.0
         if waits or under_way is not goal or under_way is None or under_way.kind.renewed or end != ends:
             self._seen = under_way, end, now, cycle

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from refusals import refusal
 from trirail.config import Config, FramesTable
 from trirail.errors import RefusedError
-from trirail.motion.goal_planner import meant
+from trirail.motion.goal_planner import resolve_goal
 from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.packets import Accepted
@@ -53,7 +53,7 @@ def rig() -> ControlRig:
 def test_a_move_is_along_the_axes_of_its_frame_about_its_tool(
     place: Pose, step: Pose, frame: str, tool: str | tuple[float, float] | None
 ) -> None:
-    goal = meant(MoveGoal(*step, frame=frame, tool=tool, speed=0.5), NamedFrames(TABLE), lambda _: place)
+    goal = resolve_goal(MoveGoal(*step, frame=frame, tool=tool, speed=0.5), NamedFrames(TABLE), lambda _: place)
     assert isinstance(goal, PoseGoal)
     u, v = TABLE.tool["camera"] if tool == "camera" else tool if isinstance(tool, tuple) else (0.0, 0.0)
     begins = complex(place[0], place[1]) + turned(u, v, place[2])
@@ -66,7 +66,7 @@ def test_a_move_is_along_the_axes_of_its_frame_about_its_tool(
 
 @given(STEPS, TOOLS)
 def test_a_pose_in_a_work_frame_is_where_the_frame_is(pose: Pose, tool: str | tuple[float, float] | None) -> None:
-    goal = meant(PoseGoal(*pose, frame="part", tool=tool), NamedFrames(TABLE), lambda _: pose)
+    goal = resolve_goal(PoseGoal(*pose, frame="part", tool=tool), NamedFrames(TABLE), lambda _: pose)
     assert isinstance(goal, PoseGoal)
     assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(pose[0], pose[1], math.pi / 2.0))
     assert goal.phi == pytest.approx(math.pi / 2.0 + pose[2])
@@ -75,7 +75,7 @@ def test_a_pose_in_a_work_frame_is_where_the_frame_is(pose: Pose, tool: str | tu
 @pytest.mark.parametrize("angle", [-2.0, 0.0, 1e-9, 1.0, math.pi])
 def test_a_frame_may_be_turned_by_any_angle(angle: float) -> None:
     table = FramesTable(work={"part": (0.02, 0.01, angle)})
-    goal = meant(PoseGoal(0.03, -0.01, 0.1, frame="part"), NamedFrames(table), lambda _: (0.0, 0.0, 0.0))
+    goal = resolve_goal(PoseGoal(0.03, -0.01, 0.1, frame="part"), NamedFrames(table), lambda _: (0.0, 0.0, 0.0))
     assert isinstance(goal, PoseGoal)
     assert complex(goal.x, goal.y) == pytest.approx(complex(0.02, 0.01) + turned(0.03, -0.01, angle))
 
@@ -101,7 +101,7 @@ def test_a_name_that_there_is_not_is_refused_with_those_that_there_are(goal: Goa
 
 def test_without_tools_a_point_is_asked_for() -> None:
     with pytest.raises(RefusedError, match=r"give a point, \[u, v\]"):
-        meant(PoseGoal(0.0, 0.0, 0.0, tool="camera"), NamedFrames(FramesTable()), lambda _: (0.0, 0.0, 0.0))
+        resolve_goal(PoseGoal(0.0, 0.0, 0.0, tool="camera"), NamedFrames(FramesTable()), lambda _: (0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_a_move_that_waits_counts_from_where_the_goals_before_it_lead(rig: Contr
     rig.enable()
     rig.send("g1", PoseGoal(0.03, 0.0, 0.0, blend=0.005))
     assert isinstance(answer := rig.send("m1", MoveGoal(0.0, 0.01, 0.1, blend=0.005)), Accepted)
-    assert answer.queued
+    assert answer.reply.queued
     assert arrive(rig, "m2", MoveGoal(-0.01, 0.0, 0.0)) == pytest.approx((0.02, 0.01, 0.1), abs=1e-12)
     assert rig.outcomes() == [("g1", "done"), ("m1", "done"), ("m2", "done")]
 

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from control.test_control import assert_within_limits
 from control.test_stop import PROMPT, STEP, braking, confirmed_after, play
-from control_rig import CONFIG, ControlRig
+from control_rig import CONFIG, ControlRig, expected_duration
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from trirail.motion.feasibility import Sampled
+from trirail.control.goal_queue import MAX_PASSES
+from trirail.motion.feasibility import SampleResult
 from trirail.motion.motion_planner import MotionPlanner, revision
 from trirail.motion.paths import Path
-from trirail.motion.runs import nominal
+from trirail.motion.runs import nominal_motion
 from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, GoalRequest, PlannerLost, Refused
 from trirail.wire.plan_packets import (
-    MAX_PLANNING,
     Extended,
     PackedPath,
     PlanAnswer,
@@ -33,7 +33,7 @@ from trirail.wire.plan_packets import (
     decode_plan_request,
     encode,
 )
-from trirail.wire.sizes import MAX_PACKET, MAX_POINTS
+from trirail.wire.sizes import MAX_PART, MAX_POINTS, MAX_SHARED
 from trirail.wire.vocabulary import Command, Mode, Override, Stop
 
 PERIOD = CONFIG.period
@@ -221,7 +221,7 @@ def test_a_goal_that_comes_while_a_trajectory_dwells_is_planned_from_where_it_go
     rows = (0.0, 0.0), (0.3, 0.01), (0.5, 0.01), (0.8, 0.02)
     rig.send("g1", TrajectoryGoal(tuple(TrajectoryPoint(t, x, 0.0, 0.0, **still) for t, x in rows)))
     schedule = rig.control.schedule
-    rig.until(lambda: schedule.runs[0].at.s > 0.5 - 1.5 * PERIOD)
+    rig.until(lambda: schedule.runs[0].law_state.s > 0.5 - 1.5 * PERIOD)
     assert rig.control.commanded.at_rest
     meddler.asked.clear()
     meddler.delays = [2]
@@ -238,13 +238,18 @@ def test_a_goal_that_follows_another_waits_and_stops_nothing(rig: ControlRig) ->
     second = rig.send("g2", PoseGoal(0.0, 0.05, 0.0))
     assert isinstance(first, Accepted)
     assert isinstance(second, Accepted)
-    assert (first.queued, first.stops_first, second.queued, second.stops_first) == (False, False, True, False)
-    left = first.duration
-    assert left < second.duration
+    assert (first.reply.queued, first.reply.stops_first, second.reply.queued, second.reply.stops_first) == (
+        False,
+        False,
+        True,
+        False,
+    )
+    left = expected_duration(first)
+    assert left < expected_duration(second)
     begun = len(rig.rows)
     rig.until(rig.holds)
     dwell = CONFIG.limits.in_position.dwell
-    assert (len(rig.rows) - begun) * PERIOD == pytest.approx(second.duration + dwell, abs=0.01)
+    assert (len(rig.rows) - begun) * PERIOD == pytest.approx(expected_duration(second) + dwell, abs=0.01)
 
 
 def test_an_answer_that_comes_twice_is_taken_once(rig: ControlRig, meddler: Meddler) -> None:
@@ -461,8 +466,8 @@ def test_no_cycle_looks_at_more_of_the_longest_path_than_it_has_time_for(
     looked: list[int] = []
     sample = TimeScaling.sample
 
-    def counted(self: TimeScaling, path: Path, law: Path, first: float, until: float, pose: Any) -> Sampled:
-        begin, end = (nominal(law, time).pose[0] for time in (first, until))
+    def counted(self: TimeScaling, path: Path, law: Path, first: float, until: float, pose: Any) -> SampleResult:
+        begin, end = (nominal_motion(law, time).pose[0] for time in (first, until))
         looked.append(int(((path.knots > begin) & (path.knots < end)).sum()))
         return sample(self, path, law, first, until, pose)
 
@@ -500,7 +505,7 @@ def test_a_goal_waits_for_a_change_of_rate_for_a_dozen_cycles_and_no_longer(rig:
     rig.cycles(3)
     assert len(meddler.asked) == 1
     assert change is not None
-    assert not change.made
+    assert not change.applied
     rig.until(rig.holds)
     assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
     assert_within_limits(rig)
@@ -557,8 +562,35 @@ def test_the_largest_goal_on_the_longest_motion_fits_a_packet(rig: ControlRig, m
     rig.cycles(100)
     rig.post("g2", wave(MAX_POINTS, 3.0))
     answers = [encode(meddler.planner.plan(request)) for request in meddler.asked]
-    assert max(len(encode(request)) for request in meddler.asked) < MAX_PLANNING
-    assert max(map(len, answers)) < MAX_PACKET - 1000  # it goes to the recorder, in a ControlInput
+    assert max(len(encode(request)) for request in meddler.asked) < MAX_SHARED
+    assert max(map(len, answers)) < MAX_SHARED - 1000  # it goes to the recorder, in a ControlInput
+
+
+@pytest.mark.parametrize("points", [MAX_PART, MAX_POINTS])
+def test_a_goal_of_another_user_waits_for_no_planning_longer_than_that_of_one_message(
+    rig: ControlRig, meddler: Meddler, points: int
+) -> None:
+    meddler.delays = [300, 1]
+    rig.post("g1", wave(points, 3.0))
+    rig.cycle(GoalRequest(9001, "eve", "g2", PoseGoal(0.05, 0.0, 0.0), round(rig.now * 1e9)))
+    waited = rig.until(lambda: any(isinstance(answer, Accepted) and answer.reply.id == "g2" for answer in rig.answers))
+    assert waited >= 290 if points == MAX_PART else waited <= 5
+    rig.until(rig.holds)
+    assert rig.outcomes() == [("g1", "preempted" if points == MAX_PART else "rejected"), ("g2", "done")]
+
+
+def test_a_trajectory_that_is_long_is_planned_after_so_many_goals_of_others(rig: ControlRig, meddler: Meddler) -> None:
+    meddler.delays = [50]
+    out = PoseGoal(5.0, 0.0, 0.0)  # it is refused
+    rig.post("g1", wave(MAX_POINTS, 3.0))
+    for number in range(3 * MAX_PASSES):
+        rig.cycle(GoalRequest(9000 + number, "eve", f"f{number}", out, round(rig.now * 1e9)))
+        rig.cycles(30)
+    rig.until(lambda: rig.mode is Mode.MOVING)
+    begins = [request for request in meddler.asked if not isinstance(request.goal, PoseGoal)]
+    assert len(begins) == 1 + MAX_PASSES
+    rig.until(rig.holds)
+    assert ("g1", "done") in rig.outcomes()
 
 
 def test_an_override_that_never_ends_changing_keeps_no_goal_for_ever(rig: ControlRig, meddler: Meddler) -> None:
@@ -585,6 +617,6 @@ def test_every_answer_is_the_same_when_it_is_read_from_a_recording(steps: list[t
     rig.cycles(5)
     play(rig, steps)
     answers = [planner.planner.plan(request) for request in planner.asked]
-    assert any(isinstance(answer, Planned) and answer.duration is None for answer in answers)
+    assert any(isinstance(answer, Planned) and answer.reply.duration is None for answer in answers)
     for answer in answers:
         assert msgspec.json.decode(msgspec.json.encode(answer), type=PlanAnswer) == answer

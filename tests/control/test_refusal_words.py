@@ -9,7 +9,8 @@ from control_rig import CONFIG, ControlRig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from trirail.config import geometry
-from trirail.errors import KinematicsError
+from trirail.control.ledger import Ledger
+from trirail.errors import KinematicsError, RefusalCode, RefusedError
 from trirail.kinematics.robot import forward, inverse
 from trirail.wire.goals import (
     Goal,
@@ -22,7 +23,8 @@ from trirail.wire.goals import (
     TrajectoryPoint,
     VelocityGoal,
 )
-from trirail.wire.packets import Refused
+from trirail.wire.packets import CommandRequest, GoalRequest, Refused
+from trirail.wire.vocabulary import Command
 
 FAR = st.floats(-3.0, 3.0)
 """Metres or radians: most are out of reach."""
@@ -87,3 +89,13 @@ def test_so_have_the_words_of_the_kinematics(pose: tuple[float, float, float]) -
         except KinematicsError as error:
             said = str(error)
         assert not SI.search(said), said
+
+
+@pytest.mark.parametrize("code", list(RefusalCode))
+def test_every_refusal_is_told_to_all_with_its_code_and_values(code: RefusalCode) -> None:
+    """The page says it in its own language by these."""
+    ledger = Ledger()
+    refusal = RefusedError(code, "why", slider="B", value=2.0, limit=1.0)
+    ledger.refuse(GoalRequest(1, "ann", "g", PoseGoal(0.0, 0.0, 0.0), 0), refusal)
+    ledger.refuse(CommandRequest(2, "ann", Command.RESET), refusal)
+    assert [(said.code, said.slider, said.value, said.limit) for said in ledger.notices] == [(code, "B", 2.0, 1.0)] * 2

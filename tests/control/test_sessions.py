@@ -13,8 +13,9 @@ from trirail.config import corrected_geometry
 from trirail.control.modes import ModeEvent
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
-from trirail.motion.paths import constant
-from trirail.motion.time_scaling import SHARES, TimeScaling
+from trirail.motion.paths import constant_law
+from trirail.motion.time_scaling import CHANGE_SHARES, TimeScaling
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
 from trirail.wire.packets import CommandRequest
 from trirail.wire.vocabulary import Command, Mode, Stop
@@ -135,7 +136,7 @@ def test_a_queue_that_is_paused_and_then_stopped_has_no_goal_to_pass_on_to(then:
         session.order(Command.PAUSE)
         session.cycles(later)
         if then == "lost":
-            session.control.modes.happen(ModeEvent.GATEWAY_LOST, "gone")
+            session.control.modes.happen(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
         else:
             session.order(Command(then))
         session.until(lambda: session.mode in STANDS, 3000)  # noqa: B023 - called at once
@@ -149,7 +150,7 @@ def test_the_last_gate_refuses_a_time_along_the_path_that_falls() -> None:
     session.post("g", PATHS[0])
     session.cycles(30)
     (run,) = session.control.schedule.runs
-    run.law = constant(-1e-6, run.at.s)
+    run.law = constant_law(-1e-6, run.law_state.s)
     run.time = 0.0
     session.cycle()
     assert session.control.fault is not None
@@ -165,10 +166,13 @@ def quickest(session: Session) -> float:
     """The least time in which the motion under way can be stopped from now on by a law of one share, or ends [s]."""
     (run,) = session.control.schedule.runs
     scaling, pose = SCALING, session.control.commanded.pose
-    times = [run.ends - run.time]
+    times = [run.end_time - run.time]
     for share in 0.97 ** np.arange(100.0):
-        law = scaling.ramp(run.at, 0.0, float(share))
-        if law is not None and scaling.sample(run.path, law, 0.0, scaling.until(run, law, 0.0), pose).within_limits:
+        law = scaling.ramp(run.law_state, 0.0, float(share))
+        if law is None:
+            continue
+        until = scaling.last_new_time(run, law, 0.0)
+        if scaling.sample(run.path, law, 0.0, until, pose).within_limits:
             times.append(float(law.knots[-2]))
             break
     return min(times)
@@ -183,7 +187,7 @@ def test_a_stop_stands_nearly_as_soon_as_any_law_could(path: int, seed: int) -> 
     least = quickest(session)
     session.order(Command.STOP)
     took = session.until(lambda: stands(session), 2000)
-    assert took * session.config.period <= 1.2 * least + len(SHARES) * session.config.period
+    assert took * session.config.period <= 1.2 * least + len(CHANGE_SHARES) * session.config.period
 
 
 @pytest.mark.generated(*range(8))
@@ -211,4 +215,4 @@ def test_a_resume_takes_effect_at_the_latest_when_the_robot_stands(path: int, se
 
     until_standstill, from_rest = paused(None)
     waited, left = paused(min(delay, until_standstill))
-    assert waited + left <= until_standstill + from_rest + len(SHARES)
+    assert waited + left <= until_standstill + from_rest + len(CHANGE_SHARES)

@@ -115,9 +115,9 @@ def test_whatever_limits_the_sliders_have_planner_and_gate_keep_them(
             rows = np.zeros((4, 3))
             for share, passes in ((0.999, True), (1.002, False)):
                 rows[row, leg] = share * limit
-                violation = bounds.setpoint(rows)
+                violation = bounds.setpoint_violation(rows)
                 assert (violation is None) is passes
-                assert violation is None or (violation.what, violation.limit) == ("ABC"[leg], limit)
+                assert violation is None or (violation.axis, violation.limit) == ("ABC"[leg], limit)
 
 
 def read(**own: str) -> SliderLimits:
@@ -141,14 +141,17 @@ def test_a_limit_is_one_for_all_sliders_or_three() -> None:
     assert own.fastest == 0.03
 
 
-ONE, PAIR = "wanted one number for all sliders, or three: of A, B, C", "wanted a pair for all sliders, or three pairs"
+ONE, PAIR = (
+    "expected one number for all sliders, or three: of A, B, C",
+    "expected a pair for all sliders, or three pairs",
+)
 WRONG = {
     ("velocity", "[0.03, 0.02]"): f"limits.slider.velocity = [0.03, 0.02]: {ONE}",
     ("jerk", "[]"): f"limits.slider.jerk = []: {ONE}",
     ("acceleration", "{ A = 1.0 }"): f"limits.slider.acceleration = {{'A': 1.0}}: {ONE}",
     ("velocity", '"fast"'): f"limits.slider.velocity = 'fast': {ONE}",
     ("velocity", "true"): f"limits.slider.velocity = True: {ONE}",
-    ("velocity", "[0.03, 0.02, -1]"): "limits.slider.velocity[2] = -1: expected float >= 1e-05",
+    ("velocity", "[0.03, 0.02, -1]"): "limits.slider.velocity[2] = -1: expected number, 1e-05 to 100",
     ("velocity", "[0.03, nan, 0.1]"): "limits.slider.velocity[1] = nan: it must be a finite number",
     ("position", "[0.1]"): f"limits.slider.position = [0.1]: {PAIR}",
     ("position", "[-0.01, 0.01, 0.02]"): f"limits.slider.position = [-0.01, 0.01, 0.02]: {PAIR}",

@@ -9,6 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.config import Config
 from trirail.control.modes import ModeEvent
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override, Stop
@@ -101,7 +102,7 @@ def planned(rig: ControlRig, goal: PoseGoal, name: str) -> None:
 @pytest.mark.parametrize("event", [ModeEvent.GATEWAY_LOST, ModeEvent.LATE, ModeEvent.SHUTDOWN])
 def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: ControlRig, event: ModeEvent) -> None:
     planned(slow, FAR, "g1")
-    slow.control.modes.happen(event, "gone")
+    slow.control.modes.happen(event, coded("gone", EventCode.OTHER))
     slow.until(lambda: slow.mode in (Mode.HOLDING, Mode.DISABLED))
     pose = slow.control.commanded.pose
     slow.cycles(200)
@@ -111,7 +112,7 @@ def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: C
 
 def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: ControlRig) -> None:
     slow.post("g1", FAR)
-    slow.control.modes.happen(ModeEvent.GATEWAY_LOST, "gone")
+    slow.control.modes.happen(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
     slow.cycles(100)
     assert slow.mode is Mode.HOLDING
     assert slow.outcomes() == [("g1", "stopped")]
@@ -339,7 +340,7 @@ def test_the_first_reason_of_a_fault_stays_and_is_told_once(rig: ControlRig) -> 
     rig.enable()
     rig.command("quick_stop")
     told = len(rig.notices)
-    rig.control.modes.trip("what came of it", FaultCause.INTERNAL)
+    rig.control.modes.trip(coded("what came of it", EventCode.OTHER), FaultCause.INTERNAL)
     assert rig.control.fault == "quick_stop by ann"
     assert len(rig.notices) == told
 

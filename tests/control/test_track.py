@@ -133,12 +133,12 @@ def test_the_reply_says_how_far_it_is_behind(rig: ControlRig) -> None:
     rig.until(lambda: bool(rig.answers) and isinstance(rig.answers[-1], Accepted))
     first = rig.answers[-1]
     assert isinstance(first, Accepted)
-    assert first.lag == pytest.approx(0.05)
+    assert first.reply.lag == pytest.approx(0.05)
     assert rig.control.target == (0.05, 0.0, 0.0)
     track(rig, lambda _: ((0.05, 0.0, 0.0), STILL), regular(50.0, 1.0))
     last = rig.answers[-1]
     assert isinstance(last, Accepted)
-    assert last.lag == pytest.approx(0.0, abs=1e-9)
+    assert last.reply.lag == pytest.approx(0.0, abs=1e-9)
 
 
 # ---------------------------------------------------------------------- what cannot be followed

@@ -19,9 +19,9 @@ from trirail.config import SIM, Config, everything, load, overlap
 from trirail.config.explained import Place, leaves, repaired
 from trirail.config.impossible import rules
 from trirail.diagnosis import Check, diagnose, failed_checks, stops
-from trirail.diagnosis.configured import JUDGEMENTS
+from trirail.diagnosis.configured import CONFIG_CHECKS
 from trirail.errors import TrirailError
-from trirail_drivers.errors import LONGEST
+from trirail_drivers.errors import MAX_MESSAGE_LENGTH
 
 FILES = sorted(SIM.parent.rglob("*.toml"))
 FACTORS = (1000, 0.001, -1)
@@ -138,7 +138,7 @@ def test_what_is_told_of_nonsense_is_short(tmp_path: Path) -> None:
     file.write_text(REAL.replace("rate_hz", "k" * 100_000).replace("l0 = 0.3", f"l0 = {'1' * 400}"))
     found = wrong(file)
     assert {check.key.partition(".")[0] for check in found} >= {"loop", "geometry"}
-    assert all(len(check.found) <= LONGEST and len(check.key) <= LONGEST for check in found)
+    assert all(len(check.found) <= MAX_MESSAGE_LENGTH and len(check.key) <= MAX_MESSAGE_LENGTH for check in found)
 
 
 NOT_TOGETHER = (
@@ -172,7 +172,7 @@ def test_none_hides_another(names: set[str], tmp_path_factory: pytest.TempPathFa
     for name in sorted(names):
         for key, found in found_of([name]):
             depends = "robot.toml: " not in found and any(
-                overlap((key,), each.reads) and overlap(each.reads, impossible) for each in JUDGEMENTS
+                overlap((key,), each.reads) and overlap(each.reads, impossible) for each in CONFIG_CHECKS
             )
             assert depends or (key, found) in together, name
 
@@ -194,9 +194,9 @@ def test_every_check_names_what_it_reads(data: st.DataObject, name: str, factor:
     if mistakes:
         return
     base, key = load(SIM.parent / ("" if (SIM.parent / name).exists() else "drives") / name), key_of(place)
-    for judgement in JUDGEMENTS:
-        if not overlap(judgement.reads, [key]):
-            assert list(judgement.of(base)) == list(judgement.of(changed)), judgement
+    for check in CONFIG_CHECKS:
+        if not overlap(check.reads, [key]):
+            assert list(check.run(base)) == list(check.run(changed)), check
 
     def refused(config: Config) -> list[tuple[str, str]]:
         return [(rule.key, said(rule.check)) for rule in rules(config) if not overlap((rule.key, *rule.reads), [key])]

@@ -148,7 +148,7 @@ def test_rules_read_where_sliders_really_are(rig: Rig, lines: list[str], rules: 
 
 
 @pytest.mark.parametrize(
-    ("line", "counted"), [("B loose", 0.0), ("B slips 0.25", 0.75), ("B against", -1.0), ("B stuck", 1.0)]
+    ("line", "counted"), [("B loose", 0.0), ("B slips 0.25", 0.75), ("B against", 1.0), ("B stuck", 1.0)]
 )
 def test_an_encoder_counts_what_it_holds_on_to(rig: Rig, line: str, counted: float) -> None:
     rig.bus.faults.add(line)

@@ -17,12 +17,12 @@ ENABLED, READY, FAULT = b"\x37\x02", b"\x31\x02", b"\x18\x02"
 ERROR = bytes.fromhex("1043 08 0000000000")
 OVER = bytes(8)
 OPERATIONAL, PRE_OPERATIONAL, BOOT_UP = b"\x05", b"\x7f", b"\0"
-WANTED: canopen_frames.Wanted = P.OPERATION_ENABLED
-OFF: canopen_frames.Wanted = P.SWITCH_ON_DISABLED
+WANTED: canopen_frames.TargetState = P.OPERATION_ENABLED
+OFF: canopen_frames.TargetState = P.SWITCH_ON_DISABLED
 T = 50.0
 EACH = Drive(1, 1e6)
 UNHURRIED = Drives("cia402", EACH, EACH, EACH, heartbeat=100.0)
-COOL = "let it cool down; look at load and air"
+COOL = "let it cool down; check load and airflow"
 
 
 def made() -> Cia402Axis:
@@ -31,7 +31,7 @@ def made() -> Cia402Axis:
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(ENABLED, T)
     axis.on_position(canopen_frames.POSITION.pack(1000), T)
-    assert axis.fault(T, WANTED) is None
+    assert axis.find_fault(T, WANTED) is None
     return axis
 
 
@@ -41,21 +41,21 @@ def state_of(axis: Cia402Axis) -> PowerState:
 
 def test_statuswords_may_be_missing_for_three_of_their_periods() -> None:
     axis = made()
-    assert axis.fault(T + 0.299, WANTED) is None
-    fault = axis.fault(T + 0.301, WANTED)
+    assert axis.find_fault(T + 0.299, WANTED) is None
+    fault = axis.find_fault(T + 0.301, WANTED)
     assert fault == ("B", "silent", 0, "drive B: no statusword for 0.301 s")
 
 
 def test_a_fault_reset_has_the_time_of_two_statuswords() -> None:
     axis = made()
     axis.on_status(FAULT, T)
-    assert axis.fault(T, WANTED) == ("B", "fault", 0, "drive B: fault")
-    axis.forgive(T)
-    assert axis.fault(T + 0.199, WANTED) is None
-    assert axis.fault(T + 0.201, WANTED) == ("B", "fault", 0, "drive B: fault, still 0.2 s after a fault reset")
+    assert axis.find_fault(T, WANTED) == ("B", "fault", 0, "drive B: fault")
+    axis.clear_faults(T)
+    assert axis.find_fault(T + 0.199, WANTED) is None
+    assert axis.find_fault(T + 0.201, WANTED) == ("B", "fault", 0, "drive B: fault, still 0.2 s after a fault reset")
     axis.on_status(READY, T + 0.25)
     axis.on_status(FAULT, T + 0.26)  # a new one has no time
-    assert axis.fault(T + 0.26, OFF) == ("B", "fault", 0, "drive B: fault")
+    assert axis.find_fault(T + 0.26, OFF) == ("B", "fault", 0, "drive B: fault")
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -78,48 +78,48 @@ def test_a_quick_stop_ends_without_power_once_the_slider_has_stood_for_a_tenth_o
 
 @pytest.mark.parametrize("wanted", [OFF, WANTED, P.QUICK_STOP_ACTIVE])
 def test_a_fault_from_before_the_start_is_told_and_left_alone_until_it_is_to_be_reset(
-    wanted: canopen_frames.Wanted,
+    wanted: canopen_frames.TargetState,
 ) -> None:
     axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(FAULT, T)
-    assert axis.fault(T, wanted) == ("B", "fault", 0, "drive B: fault")
+    assert axis.find_fault(T, wanted) == ("B", "fault", 0, "drive B: fault")
     assert not axis.word(T, wanted) & canopen_frames.FAULT_RESET
-    axis.forgive(T)
+    axis.clear_faults(T)
     assert axis.word(T, wanted) == canopen_frames.FAULT_RESET
 
 
 def test_a_fault_has_the_code_of_its_emergency_until_it_is_over() -> None:
     axis = made()
     axis.on_emergency(ERROR, T)
-    assert axis.fault(T, WANTED) == (
+    assert axis.find_fault(T, WANTED) == (
         "B",
         "emcy",
         0x4310,
         f"drive B: emergency 0x4310 (drive too hot), error register 0x08; {COOL}",
     )
-    axis.forgive(T)  # its error register is asked for, and does not answer
+    axis.clear_faults(T)  # its error register is asked for, and does not answer
     assert axis.register_wanted
     axis.on_status(ENABLED, T + REGISTER_TIME)
     axis.heard = T + REGISTER_TIME
-    assert axis.fault(T + REGISTER_TIME - 0.01, OFF) is None
+    assert axis.find_fault(T + REGISTER_TIME - 0.01, OFF) is None
     said = ("B", "emcy", 0x4310, f"drive B: emergency 0x4310 (drive too hot) is still in force; {COOL}")
-    assert axis.fault(T + REGISTER_TIME, OFF) == said
+    assert axis.find_fault(T + REGISTER_TIME, OFF) == said
     axis.on_emergency(OVER, T)
-    assert axis.fault(T, WANTED) is None
+    assert axis.find_fault(T, WANTED) is None
 
 
 def test_a_drive_that_has_left_its_fault_has_no_code_of_it() -> None:
     axis = made()
     axis.on_status(FAULT, T)
     axis.on_emergency(ERROR, T)
-    axis.forgive(T)
-    assert axis.fault(T + 1.0, WANTED) == (
+    axis.clear_faults(T)
+    assert axis.find_fault(T + 1.0, WANTED) == (
         "B", "fault", 0x4310, f"drive B: fault, error 0x4310 (drive too hot), still 0.2 s after a fault reset; {COOL}",
     )  # fmt: skip
     axis.on_status(READY, T + 1.0)
     assert axis.error_code == 0
-    assert axis.fault(T + 1.0, OFF) is None
+    assert axis.find_fault(T + 1.0, OFF) is None
 
 
 @pytest.mark.parametrize("told_by", ["heartbeat", "position"])
@@ -127,40 +127,49 @@ def test_a_drive_that_was_operational_and_is_no_more_has_left_it(told_by: str) -
     axis = Cia402Axis("B", 2, Scale(1e6, 0.0), UNHURRIED)
     axis.on_status(ENABLED, T)
     axis.on_heartbeat(PRE_OPERATIONAL, T)  # from before it was started
-    assert axis.fault(T, WANTED) is None
+    assert axis.find_fault(T, WANTED) is None
     assert state_of(axis) is P.OPERATION_ENABLED
     if told_by == "heartbeat":
         axis.on_heartbeat(OPERATIONAL, T)
     else:
         axis.on_position(canopen_frames.POSITION.pack(0), T)
-    assert not axis.mute
+    assert not axis.pdo_silent
     axis.on_heartbeat(PRE_OPERATIONAL, T)
-    assert axis.fault(T, WANTED) == ("B", "state", 0, "drive B: left NMT operational: is pre-operational")
+    assert axis.find_fault(T, WANTED) == ("B", "state", 0, "drive B: left NMT operational: is pre-operational")
     assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON
-    assert axis.mute
+    assert axis.pdo_silent
     assert axis.left_operational
     axis.on_heartbeat(OPERATIONAL, T)
-    assert not axis.mute  # somebody else has started it: its statuswords come by themselves
+    assert not axis.pdo_silent  # somebody else has started it: its statuswords come by themselves
     axis.on_heartbeat(PRE_OPERATIONAL, T)
-    axis.forgive(T + 5.0)
+    axis.clear_faults(T + 5.0)
     assert not axis.left_operational  # it is started once
     axis.on_heartbeat(PRE_OPERATIONAL, T + 5.0)  # sent before it was
     assert not axis.left_operational
-    assert not axis.mute
-    assert axis.fault(T + 5.299, OFF) is None  # its statuswords have time anew
+    assert not axis.pdo_silent
+    assert axis.find_fault(T + 5.299, OFF) is None  # its statuswords have time anew
     axis.on_heartbeat(OPERATIONAL, T + 5.0)
-    assert not axis.mute
+    assert not axis.pdo_silent
 
 
-def test_a_restart_stays_whatever_is_forgiven() -> None:
+def test_a_restart_stays_until_the_drive_is_configured_again() -> None:
     axis = made()
     axis.on_emergency(ERROR, T)
     axis.on_heartbeat(BOOT_UP, T)
-    said = ("B", "state", 0, "drive B: has restarted and lost its set-up; restart the service")
-    assert axis.fault(T, WANTED) == said
+    said = (
+        "B",
+        "state",
+        0,
+        "drive B: has restarted and lost its set-up: wait until it is configured again, then send reset",
+    )
+    assert axis.find_fault(T, WANTED) == said
     assert state_of(axis) is P.NOT_READY_TO_SWITCH_ON
-    axis.forgive(T)
-    assert axis.fault(T, WANTED) == said
+    axis.clear_faults(T)
+    assert axis.find_fault(T, WANTED) == said
+    axis.rejoin(axis.exchange, axis.units, T, homed=True)
+    assert axis.find_fault(T, WANTED) == said
+    axis.clear_faults(T)
+    assert axis.find_fault(T, WANTED) != said
 
 
 def test_only_the_answer_about_the_statusword_is_one() -> None:
@@ -177,16 +186,18 @@ def test_only_the_answer_about_the_statusword_is_one() -> None:
 
 @pytest.mark.parametrize("state", P)
 @pytest.mark.parametrize("wanted", [P.SWITCH_ON_DISABLED, P.OPERATION_ENABLED, P.QUICK_STOP_ACTIVE])
-def test_only_a_drive_that_followed_setpoints_can_leave_that_unasked(state: P, wanted: canopen_frames.Wanted) -> None:
+def test_only_a_drive_that_followed_setpoints_can_leave_that_unasked(
+    state: P, wanted: canopen_frames.TargetState
+) -> None:
     axis = made()
     axis.state = state
-    fault = axis.fault(T, wanted)
+    fault = axis.find_fault(T, wanted)
     in_fault = state in (P.FAULT, P.FAULT_REACTION_ACTIVE)
     if not in_fault:
         left = wanted is P.OPERATION_ENABLED and state is not P.OPERATION_ENABLED
         assert (fault is not None) == left
         axis.powered_up = False
-        assert axis.fault(T, wanted) is None
+        assert axis.find_fault(T, wanted) is None
     else:
         assert isinstance(fault, DriveFault)
         assert fault.cause == "fault"
@@ -197,15 +208,15 @@ def test_a_drive_that_may_still_move_is_late_to_lose_its_power(state: P) -> None
     axis = made()
     axis.state = state
     without = (P.NOT_READY_TO_SWITCH_ON, P.SWITCH_ON_DISABLED, P.FAULT, P.FAULT_REACTION_ACTIVE)
-    late = axis.late_for("quick stop", 1.0)
-    said = ("B", "timeout", 0, f"drive B: is {state} 1 s after quick stop; switch on disabled was expected")
+    late = axis.stop_overdue_fault("quick stop", 1.0)
+    said = ("B", "timeout", 0, f"drive B: is {state} 1 s after quick stop; expected switch on disabled")
     assert late == (None if state in without else said)
 
 
 def test_what_is_no_state_of_cia_402_is_a_fault() -> None:
     axis = made()
     axis.on_status(b"\x2a\0", T)
-    assert axis.fault(T, WANTED) == ("B", "state", 0, "drive B: statusword 002A is that of no CiA 402 state")
+    assert axis.find_fault(T, WANTED) == ("B", "state", 0, "drive B: statusword 002A has no CiA 402 state")
     assert state_of(axis) is P.OPERATION_ENABLED
     assert axis.heard < math.inf
 
@@ -216,9 +227,9 @@ def test_as_many_positions_may_be_missed_as_the_configuration_says(most: int) ->
     axis.on_heartbeat(OPERATIONAL, T)
     axis.on_status(ENABLED, T)
     for cycle in range(most + 1):
-        assert axis.fault(T, WANTED) is None, cycle
+        assert axis.find_fault(T, WANTED) is None, cycle
         axis.sync_sent()
         if cycle == 0:
             axis.on_position(canopen_frames.POSITION.pack(1000), T)
         axis.read_over()
-    assert axis.fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")
+    assert axis.find_fault(T, WANTED) == ("B", "silent", 0, f"drive B: no position for {most} cycles in a row")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import string
 import struct
 from collections.abc import Callable, Iterable, Iterator
@@ -11,20 +12,22 @@ from pathlib import Path
 from typing import Any
 
 import can
+import canopen
 import pytest
+from canopen.objectdictionary import ODVariable
 from drivers.foreign import DISABLED, ENABLED, FITTED, QUICK_STOP, ForeignDrive, Habits, Truth, Wires, three
 from drivers.slow import Slowness, three_slow
 from edsfiles import MAKES, Row, eds, make_eds, rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace as replaced
+from msgspec.structs import replace as replacement_refusal
 from rigs import Bus, Clock, alike, frame, ideal_servo
 from trirail_drivers.cia402 import backup, parameter_file
-from trirail_drivers.cia402.backup import Restored
+from trirail_drivers.cia402.backup import RestoreResult
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.objects import USES, Key
-from trirail_drivers.cia402.parameter_file import Saved
-from trirail_drivers.cia402.parameters import named, of_kind
+from trirail_drivers.cia402.parameter_file import SavedParameters
+from trirail_drivers.cia402.parameters import named, parameter, variables
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.protocols import CIA402
@@ -54,12 +57,12 @@ class Kept:
     drives: Drives
     clock: Clock
 
-    def save(self) -> Saved:
+    def save(self) -> SavedParameters:
         found = backup.save(self.bus, self.drives, self.clock, ["A"])["A"]
-        assert isinstance(found, Saved), found
+        assert isinstance(found, SavedParameters), found
         return found
 
-    def restore(self, saved: Saved, **options: bool) -> Restored:
+    def restore(self, saved: SavedParameters, **options: bool) -> RestoreResult:
         return backup.restore(self.bus, self.drives, self.clock, "A", saved, **options)
 
 
@@ -68,7 +71,7 @@ class Line(Kept):
 
     def __init__(self, path: Path) -> None:
         a, b, c = alike()
-        self.drives = Drives("cia402", replaced(a, eds=str(path)), b, c, sdo_timeout=0.01)
+        self.drives = Drives("cia402", replacement_refusal(a, eds=str(path)), b, c, sdo_timeout=0.01)
         self.clock = Clock()
         devices = [
             SimulatedDrive(each.node, ideal_servo(a, 0), eds=Path(each.eds or SERVO)) for each in self.drives.each
@@ -97,7 +100,7 @@ def other(entry: ObjectEntry, chance: random.Random) -> None:
             entry.content = chance.randbytes(chance.randrange(1, 12))
 
 
-def own() -> Saved:
+def own() -> SavedParameters:
     """The parameters of the simulated drive's own dictionary."""
     with Line(SERVO) as line:
         return line.save()
@@ -115,7 +118,7 @@ def kept(facts: Iterable[Row]) -> list[Key]:
 @pytest.mark.generated(0, 1, 2)
 @pytest.mark.parametrize("make", MAKES)
 def test_what_was_altered_is_named_and_comes_back(make: str, seed: int, tmp_path: Path) -> None:
-    chance, path = random.Random(seed), tmp_path / "drive.toml"
+    chance, path = random.Random(seed), tmp_path / "drive.dcf"
     with Line(make_eds(tmp_path, make)) as line:
         alter_and_restore(make, line, chance, path)
 
@@ -134,7 +137,7 @@ def alter_and_restore(make: str, line: Line, chance: random.Random, path: Path) 
     done = line.restore(parameter_file.read(path))
     assert set(done.written) == {key for key in altered if not set_ups(key)}
     assert {each.different.key for each in done.left} == {key for key in altered if set_ups(key)}
-    assert all(each.meant for each in done.left)
+    assert all(each.intended for each in done.left)
     assert done.ok
     assert {each.key for each in parameter_file.compare(saved, line.save())} == {key for key in altered if set_ups(key)}
 
@@ -164,7 +167,7 @@ def test_a_dictionary_of_any_kind(
     folder = tmp_path_factory.mktemp("eds")
     (folder / "any.eds").write_text(eds([*BASE, *made(found)]))
     with Line(folder / "any.eds") as line:
-        alter_any(found, line, chance, data, folder / "a.toml")
+        alter_any(found, line, chance, data, folder / "a.dcf")
 
 
 def alter_any(
@@ -192,50 +195,165 @@ def alter_any(
     assert {key: line.objects[key].encode() for key in wanted} == before
 
 
-@given(st.text(string.printable, max_size=20), st.floats(), st.integers(0, 2**64 - 1), st.binary(max_size=9))
+@given(
+    st.text(string.printable, min_size=1, max_size=20),
+    st.floats(),
+    st.integers(0, 2**64 - 1),
+    st.integers(-(2**23), 2**23 - 1),
+    st.binary(min_size=1, max_size=9),
+)
 def test_a_file_has_every_value_to_the_last_bit(
-    tmp_path_factory: pytest.TempPathFactory, text: str, number: float, large: int, octets: bytes
+    tmp_path_factory: pytest.TempPathFactory, text: str, number: float, large: int, medium: int, octets: bytes
 ) -> None:
-    path = tmp_path_factory.mktemp("file") / "a.toml"
+    path = tmp_path_factory.mktemp("file") / "a.dcf"
     parameters = {
-        (0x2000, 0): of_kind("text", text.encode(), 'a "name"\n\x7f'),
-        (0x2001, 0): of_kind("f64", struct.pack("<d", number), ""),
-        (0x2002, 0): of_kind("u64", large.to_bytes(8, "little"), "é"),
-        (0x2003, 0): of_kind("text", octets, ""),
-        (0x2004, 0): of_kind("i32", octets, ""),
+        (0x2000, 0): parameter(TEXT, text.encode(), 'a "name"'),
+        (0x2001, 0): parameter(0x11, struct.pack("<d", number), "f64"),
+        (0x2002, 0): parameter(0x1B, large.to_bytes(8, "little"), "é"),
+        (0x2003, 0): parameter(0x10, medium.to_bytes(3, "little", signed=True), "i24"),
+        (0x2004, 0): parameter(TEXT, octets, "text"),
+        (0x2005, 0): parameter(0x04, octets, "i32"),
+        (0x2006, 0): parameter(0x0B, octets, "unicode"),
     }
-    origin = parameter_file.Origin("A", 1, 402, "now", "a.eds", serial=0xFFFF_FFFF)
-    saved = Saved(origin, parameters, {(0x2005, 0): "for a “reason”"})
-    parameter_file.write(path, saved)
+    objects = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
+    for (index, _), each in parameters.items():
+        variable = ODVariable(each.name, index)
+        variable.data_type = each.data_type
+        objects.add_object(variable)
+    saved = SavedParameters(parameter_file.Origin(1, serial=0xFFFF_FFFF), parameters, {}, objects)
+    parameter_file.write(path, saved, 1_000_000)
     assert parameter_file.read(path) == saved
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("[drive]", "[other]", "other"),
-        ('axis = "A"', 'axis = "D"', "drive.axis"),
-        ('"6065:00"', '"6065"', '"6065" is no object'),
-        ('type = "u32", value = 4294967295', 'type = "u16", value = 4294967295', "4294967295 is no u16"),
-        ('type = "u32"', 'type = "u33"', 'type "u33" is unknown'),
-        ("value = 4294967295", "value = 1.5", "1.5 is no u32"),
-        ("[parameters]", "[parameters", "Expected"),
+        ("NodeID=1", "NodeID=128", "node"),
+        ("NodeID=1", "NodeID=first", "first"),
+        ("[6065]", "[6065", "already exists"),
+        ("[6065]", "[6066]", "section '6066' already exists"),
+        ("ParameterValue=4294967295", "ParameterValue=4294967296", "object 6065:00: 4294967296 is no value"),
+        ("ParameterValue=4294967295", "ParameterValue=-1", "object 6065:00: -1 is no value"),
+        ("ParameterValue=4294967295", "ParameterValue=1.5", "object 6065:00: '1.5' is no value"),
+        ("ParameterValue=4294967295", "ParameterValue=9\nLowLimit=10\nHighLimit=0x14", "9 is not within its limits"),
+        ("ParameterValue=", "Parameter=", "no object has a ParameterValue"),
+        ("[6065]", "[606x]", "a ParameterValue belongs to no object"),
     ],
 )
 def test_what_is_no_file_of_parameters_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
-    path = tmp_path / "a.toml"
+    path = tmp_path / "a.dcf"
     parameter_file.write(path, own())
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
-    with pytest.raises(DriveError, match=f"(?s)a.toml is no file of a drive's parameters.*{said}"):
+    with pytest.raises(DriveError, match=f"(?s)a.dcf is no file of a drive's parameters.*{said}"):
         parameter_file.read(path)
 
 
 def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(FileError):
-        parameter_file.write(tmp_path / "nowhere" / "a.toml", own())
+        parameter_file.write(tmp_path / "nowhere" / "a.dcf", own())
     assert not list(tmp_path.iterdir())
+
+
+OLD = """# The parameters of one drive, as trirail drives save has read them; for compare and restore.
+
+[drive]
+axis = "A"
+node = 1
+device_type = 0x00020192
+saved = "2025-11-25T16:16:51+00:00"
+dictionary = "servo.eds, the built-in one"
+vendor = 0x00000000
+product = 0x33505250
+revision = 0x00010000
+serial = 0x00000001
+
+[parameters]
+"1017:00" = { type = "u16", value = 100, name = "Producer heartbeat time" }
+"6065:00" = { type = "u32", value = 1000, name = "Following error window" }
+"6066:00" = { type = "u16", value = 77, name = "Following error time out" }
+"607D:01" = { type = "i32", value = -5, name = "Software position limit.Min" }
+"607D:02" = { type = "bytes", value = "05 00 00 00", name = "Software position limit.Max" }
+
+[unread]
+"6067:00" = "no answer within 0.5 s"
+"""
+"""A file of an earlier version."""
+
+
+def test_a_file_of_an_earlier_version_is_restored(tmp_path: Path) -> None:
+    path = tmp_path / "drive-A.toml"
+    path.write_text(OLD)
+    saved = parameter_file.read(path)
+    assert saved.origin == parameter_file.Origin(1, 0x2_0192, None, 0x3350_5250, 0x1_0000, 1)
+    with Line(make_eds(tmp_path, "elmo_gold")) as line:
+        done = line.restore(replace(saved, origin=line.save().origin))
+        held = {key: line.objects[key].value for key in ((0x6066, 0), (0x607D, 1), (0x607D, 2))}
+    assert set(done.written) == set(held)
+    assert list(held.values()) == [77, -5, 5]
+    assert {each.different.key for each in done.left} == {(0x1017, 0), (0x6065, 0)}, "they are the set-up's own"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("[drive]", "[other]", "drive"),
+        ("node = 1", "node = 128", "node"),
+        ('"6065:00"', '"6065"', "not enough values"),
+        ('type = "u32", value = 1000', 'type = "u8", value = 1000', "6065:00: 1000 is no value"),
+        ('type = "u32"', 'type = "u33"', "u33"),
+        ("value = 1000", "value = 1.5", "1.5 is no value"),
+        ("[parameters]", "[parameters", "Expected"),
+    ],
+)
+def test_a_damaged_file_of_an_earlier_version_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "a.toml"
+    assert old in OLD
+    path.write_text(OLD.replace(old, new))
+    with pytest.raises(DriveError, match=f"(?s)a.toml is no file of a drive's parameters.*{re.escape(said)}"):
+        parameter_file.read(path)
+
+
+def test_our_files_open_in_another_program(tmp_path: Path) -> None:
+    with Line(make_eds(tmp_path, "elmo_gold")) as line:
+        line.objects[0x607D, 1].value = -100
+        line.objects[0x1018, 4].value = 1
+        saved = line.save()
+    parameter_file.write(tmp_path / "a.dcf", saved, 500_000)
+    opened = canopen.import_od(str(tmp_path / "a.dcf"))
+    assert (opened.node_id, opened.bitrate) == (1, 500_000)
+    values = {key: each.encode_raw(each.value) for key, each in variables(opened) if each.value is not None}
+    identity = {key for name, key in parameter_file.IDENTITY.items() if getattr(saved.origin, name) is not None}
+    assert {key: data for key, data in values.items() if key not in identity} == {
+        key: each.data for key, each in saved.parameters.items()
+    }
+    assert set(values) == {*identity, *saved.parameters}
+    assert (values[0x1018, 4], values[0x607D, 1]) == (b"\1\0\0\0", struct.pack("<i", -100))
+
+
+@pytest.mark.generated(0, 1)
+@pytest.mark.parametrize("make", MAKES)
+def test_of_a_file_by_another_program_only_parameters_are_written(make: str, seed: int, tmp_path: Path) -> None:
+    chance, eds_file, path = random.Random(seed), make_eds(tmp_path, make), tmp_path / "other.dcf"
+    objects = canopen.import_od(str(eds_file), 1)
+    wanted = {}
+    for key, each in variables(objects):
+        if each.writable and each.fixed_size and key[0] not in (0x1000, 0x1018):
+            # A number that is not negative in any type, and another than the drive holds.
+            each.value = wanted[key] = chance.randrange(1, 2 if each.data_type == 1 else 128)
+    with Line(eds_file) as line:
+        before = {key: line.objects[key].encode() for key, _ in variables(objects)}
+        objects.node_id = 1
+        canopen.export_od(objects, str(path), "dcf")
+        due = {key for key in kept(rows(make)) if key in wanted and not set_ups(key)}
+        done = line.restore(parameter_file.read(path, 1), replace=True)
+        now = {key: line.objects[key].encode() for key, _ in variables(objects)}
+    changed = {key for key in before if now[key] != before[key]}
+    assert changed <= due
+    assert set(done.written) == changed
+    assert {each.different.key for each in done.left if not each.intended} == set()
+    assert due <= changed | {key for key in due if int.from_bytes(before[key], "little") == wanted[key]}
 
 
 # ---------------------------------------------------------------------- drives that others made
@@ -282,7 +400,7 @@ def test_the_parameters_of_a_foreign_drive(make: str, tmp_path: Path) -> None:
     rig.a.local.data_store[index] = {subindex: bytes(b ^ 1 for b in saved.parameters[chosen].data)}
     assert [each.key for each in parameter_file.compare(saved, rig.save())] == [chosen]
     done = rig.restore(saved)
-    assert done == Restored((chosen,), (), False, "")
+    assert done == RestoreResult((chosen,), (), False, "")
     assert rig.a.written == [(index, subindex, saved.parameters[chosen].data)]
     rig.wires.shutdown()
 
@@ -293,7 +411,7 @@ def test_nothing_is_written_to_a_drive_with_power(state: int, tmp_path: Path) ->
     saved = rig.save()
     rig.a.put(0x6081, 5)
     rig.a.state = state
-    with pytest.raises(DriveError, match="drive A: parameters are restored without power only; its state is"):
+    with pytest.raises(DriveError, match="drive A: parameters are only restored without power; its state is"):
         rig.restore(saved)
     assert not rig.a.written
     rig.wires.shutdown()
@@ -372,17 +490,19 @@ def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "refused", "replaceable"),
     [
-        ({"product": 9}, "product is 00000002h, the file's 00000009h: another product", False),
-        ({"vendor": None}, "vendor is 00000001h, the file's not told: another product", False),
-        ({"device_type": 401}, "device_type is .*: another product", False),
+        ({"product": 9}, "product is 00000002h, the file's 00000009h; use a file of the same product", False),
+        ({"vendor": 9}, "vendor is 00000001h, the file's 00000009h; use a file of the same product", False),
+        ({"vendor": None}, r"drive A has vendor 00000001h \(the file's unknown\).*--replace", True),
+        ({"device_type": 401}, "device_type is .*; use a file of the same product", False),
         ({"serial": 9}, r"drive A has serial 00000004h \(the file's 00000009h\).*--replace", True),
-        ({"revision": None}, r"drive A has revision 00000003h \(the file's not told\).*--replace", True),
+        ({"revision": 9}, r"drive A has revision 00000003h \(the file's 00000009h\).*--replace", True),
+        ({"node": 2}, r"drive A has node 00000001h \(the file's 00000002h\).*--replace", True),
     ],
 )
 def test_a_file_of_another_drive(changes: dict[str, int], refused: str, replaceable: bool, tmp_path: Path) -> None:
     rig = Foreign(tmp_path)
     saved = rig.save()
-    saved = replace(saved, origin=replaced(saved.origin, **changes))
+    saved = replace(saved, origin=replacement_refusal(saved.origin, **changes))
     rig.a.put(0x6081, 5)
     with pytest.raises(DriveError, match=refused):
         rig.restore(saved)
@@ -406,7 +526,7 @@ def test_what_is_in_the_way_of_another_is_written_first(tmp_path: Path) -> None:
         LOW: lambda value: value >= rig.a.value(*HIGH),
         HIGH: lambda value: value <= rig.a.value(*LOW),
     }
-    assert rig.restore(saved) == Restored((HIGH, LOW), (), False, "")
+    assert rig.restore(saved) == RestoreResult((HIGH, LOW), (), False, "")
     rig.wires.shutdown()
 
 
@@ -437,7 +557,7 @@ def test_what_differs_still_is_told_and_not_stored(store: bool, kept_back: bool,
         rig.a.habits.refuses = {SPEED: lambda _value: True}
     done = rig.restore(saved, store=store)
     assert ([each.different.key for each in done.left] == [SPEED]) is kept_back
-    assert all("(SDO abort 06090030)" in each.why and not each.meant for each in done.left)
+    assert all("(SDO abort 06090030)" in each.why and not each.intended for each in done.left)
     assert done.stored is (store and not kept_back)
     assert ((0x1010, 1, b"save") in rig.a.written) is done.stored
     assert done.ok is not kept_back
@@ -450,9 +570,203 @@ def test_node_id_and_bitrate_are_left_as_they_are(tmp_path: Path) -> None:
     saved = rig.save()
     rig.a.put(0x2000, 5)
     done = rig.restore(saved)
-    assert [(each.different.key, each.meant) for each in done.left] == [(NODE_ID, True)]
+    assert [(each.different.key, each.intended) for each in done.left] == [(NODE_ID, True)]
     assert (done.written, done.ok) == ((), True)
     rig.wires.shutdown()
+
+
+FOREIGN = """; as an editor of another company writes it
+[FileInfo]
+FileName=axis_1.dcf
+CreatedBy=somebody
+[DeviceInfo]
+VendorName=
+VendorNumber=0xFB
+ProductNumber=
+RevisionNumber=0x00000000
+NrOfRxPDO=4
+[DeviceCommissioning]
+NodeId=0x01
+NodeName=axis
+Baudrate=1000
+LSS_SerialNumber=4
+[DummyUsage]
+Dummy0002=1
+[Comments]
+Line1=without the number of lines
+[MandatoryObjects]
+SupportedObjects=1
+1=0x1018
+[1018]
+ParameterName=Identity
+ObjectType=0x9
+SubNumber=2
+[1018Sub2]
+ParameterName=Product code
+DataType=0x0007
+AccessType=ro
+DefaultValue=0x00000002
+[1010]
+ParameterName=Store
+ObjectType=0x8
+SubNumber=2
+[1010sub1]
+ParameterName=Save all
+DataType=0x0007
+AccessType=rw
+ParameterValue=0x65766173
+[1017]
+ParameterName=Heartbeat
+DataType=0x0006
+AccessType=rw
+ParameterValue=100
+[1400]
+ParameterName=RPDO
+ObjectType=0x9
+SubNumber=2
+[1400sub1]
+ParameterName=COB-ID
+DataType=0x0007
+AccessType=RW
+DefaultValue=$NodeID + 0x200
+ParameterValue=$NODEID+0x200
+[1a00]
+ParameterName=TPDO mapping
+ObjectType=0x9
+SubNumber=1
+[1a00sub0]
+ParameterName=Number
+DataType=0x0005
+AccessType=rw
+ParameterValue=0
+[1201]
+ParameterName=Second SDO
+ObjectType=0x9
+SubNumber=2
+[1201sub1]
+ParameterName=COB-ID
+DataType=0x0007
+AccessType=rw
+ParameterValue=$NODEID+0x680
+[2000]
+ParameterName=Adresse
+DataType=0x0005
+AccessType=rw
+ParameterValue=77
+[6040]
+ParameterName=Controlword
+ObjectType=0x7
+DataType=0x0006
+AccessType=rww
+ParameterValue=0x000F
+[607A]
+ParameterName=Target
+DataType=0x0004
+AccessType=rww
+ParameterValue=5
+[607d]
+ParameterName=Limits
+ObjectType=0x8
+DataType=0x0004
+AccessType=rw
+CompactSubObj=2
+[607dValue]
+NrOfEntries=2
+1=0xFFFFFF9C
+2=100
+[6081]
+ParameterName=Profile velocity
+ObjectType=0x7
+DataType=0x0007
+AccessType=rw
+LowLimit=1
+HighLimit=25000
+ParameterValue= 0x1388 ; counts/s
+ObjFlags=0x0
+[6083]
+ParameterName=Profile acceleration
+DataType=0x0007
+AccessType=rw
+DefaultValue=10000
+ParameterValue=
+"""
+
+
+class TestFileOfAnotherProgram:
+    """What others write: other spellings, entries without a value, values of arrays in a section of their own."""
+
+    held: SavedParameters
+    """What the drive held before."""
+
+    def restore(self, tmp_path: Path, text: str, **options: bool) -> tuple[Foreign, RestoreResult | DriveError]:
+        """Restore a file; the drive holds other values, and has node id and bitrate in objects of its own."""
+        more = ((0x2000, 0, 5, "rw", 1, False), (0x1201, 1, 7, "rw", 0, False))
+        rig = Foreign(tmp_path, habits=Habits(values={(0x1018, 1): 0xFB, (0x1018, 2): 2}, more=more))
+        rig.a.put(0x607D, -7, 1)
+        rig.a.put(0x6081, 7)
+        self.held = rig.save()
+        path = tmp_path / "axis_1.DCF"
+        path.write_text(text)
+        try:
+            return rig, rig.restore(parameter_file.read(path, 1), **options)
+        except DriveError as error:
+            return rig, error
+        finally:
+            rig.wires.shutdown()
+
+    def test_is_restored_without_commands_targets_and_addresses(self, tmp_path: Path) -> None:
+        rig, done = self.restore(tmp_path, FOREIGN)
+        assert isinstance(done, RestoreResult), done
+        assert set(done.written) == {SPEED, LOW, HIGH, (0x1201, 1)}
+        assert {(index, sub) for index, sub, _ in rig.a.written} == set(done.written)
+        values = [rig.a.value(*key) for key in (SPEED, LOW, HIGH, (0x1201, 1))]
+        assert values == [5000, -100, 100, 0x681]
+        assert NODE_ID in {each.different.key for each in done.left}
+        assert all(each.intended for each in done.left)
+
+    def test_is_compared_where_it_has_values(self, tmp_path: Path) -> None:
+        _rig, done = self.restore(tmp_path, FOREIGN)
+        assert isinstance(done, RestoreResult), done
+        saved = parameter_file.read(tmp_path / "axis_1.DCF", 1)
+        assert saved.origin == parameter_file.Origin(1, None, 0xFB, 2, None, 4)
+        assert saved.unread == dict.fromkeys(((0x607D, 0), (0x6083, 0)), "the file has no value")
+        assert set(parameter_file.comparable(saved, self.held)) == set(saved.parameters)
+        differing = {each.key for each in parameter_file.compare(saved, self.held)}
+        assert differing == {SPEED, LOW, HIGH, NODE_ID, (0x1017, 0), (0x1201, 1), (0x1A00, 0)}
+
+    @pytest.mark.parametrize(
+        ("old", "new", "said"),
+        [
+            ("NodeId=0x01", "NodeId=0x02", "--replace"),
+            ("NodeId=0x01", "NodeId=200", "no file of a drive's parameters"),
+            ("VendorNumber=0xFB", "VendorNumber=0x7", "same product"),
+            ("DefaultValue=0x00000002", "DefaultValue=0x00000003", "same product"),
+            ("DefaultValue=0x00000002", "ParameterValue=3", "same product"),
+            ("ProductNumber=", "ProductNumber=8", "same product"),
+            ("VendorNumber=0xFB", "VendorNumber=0", r"vendor .* unknown.*--replace"),
+            ("LSS_SerialNumber=4", "LSS_SerialNumber=5", "--replace"),
+            ("RevisionNumber=0x00000000", "RevisionNumber=9", "--replace"),
+            ("0x1388 ; counts/s", "25001", "6081:00: 25001 is not within its limits, 1 to 25000"),
+            ("0x1388 ; counts/s", "0x1FFFFFFFF", "6081:00"),
+            ("0x1388 ; counts/s", "fast", "6081:00: 'fast' is no value"),
+            ("2=100", "2=0x1FFFFFFFF", "607D:02"),
+            ("[6083]", "[6081]", "already exists"),
+            ("[6081]", "[6081SUB1]", "belongs to no object"),
+            ("LowLimit=1", "DataType=0x0006", "already exists"),
+            ("DataType=0x0007\nAccessType=rw\nLowLimit=1", "DataType=0x0006\nAccessType=rw", "has 4 bytes, the file 2"),
+        ],
+    )
+    def test_is_refused_whole_where_anything_is_wrong(self, old: str, new: str, said: str, tmp_path: Path) -> None:
+        assert FOREIGN.count(old) == 1
+        rig, refused = self.restore(tmp_path, FOREIGN.replace(old, new))
+        assert isinstance(refused, DriveError), refused
+        assert re.search(said, str(refused))
+        assert not rig.a.written
+
+    def test_of_another_node_has_no_identifiers_for_this_one(self, tmp_path: Path) -> None:
+        _, done = self.restore(tmp_path, FOREIGN.replace("NodeId=0x01", "NodeId=0x02"), replace=True)
+        assert isinstance(done, RestoreResult), done
+        assert set(done.written) == {SPEED, LOW, HIGH}
 
 
 @pytest.mark.parametrize(("effect", "held"), [(0.03, True), (60.0, False)])
@@ -461,7 +775,7 @@ def test_what_is_written_has_a_time_to_be_held(effect: float, held: bool, tmp_pa
     wires, clock = three_slow(make, Truth(), lambda _node: Slowness(answer=lambda: 0.01, effect=lambda: effect))
     config = drives(make_eds(tmp_path, make, FITTED[make]))
     saved = backup.save(wires, config, clock, ["A"])["A"]
-    assert isinstance(saved, Saved)
+    assert isinstance(saved, SavedParameters)
     wires.nodes[0].put(0x6081, 5)
     done = backup.restore(wires, config, clock, "A", saved)
     assert [each.why.partition(",")[0] for each in done.left] == ([] if held else ["it keeps another value"])
@@ -482,9 +796,9 @@ def test_a_drive_that_falls_silent(answers: int, tmp_path: Path) -> None:
     vars(rig.a.local.sdo).update(on_request=served)
     ends = backup.save(rig.wires, rig.drives, rig.clock)
     assert isinstance(ends["A"], DriveError)
-    assert "no answer about object" in str(ends["A"])
-    assert isinstance(ends["B"], Saved)
-    assert isinstance(ends["C"], Saved)
+    assert "no answer for object" in str(ends["A"])
+    assert isinstance(ends["B"], SavedParameters)
+    assert isinstance(ends["C"], SavedParameters)
     rig.wires.shutdown()
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from rigs import ENABLED, OFF, STANDSTILL, START, STEP, DriverRig
-from trirail_drivers.errors import BusError, DriveTimeout
+from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 
 from drivers import test_cia402, test_odrive
 
@@ -25,9 +25,10 @@ def new(request: pytest.FixtureRequest) -> Iterator[AnyRig]:
 # ---------------------------------------------------------------------- set-up
 
 
-def test_a_dead_bus_cannot_be_set_up(new: AnyRig) -> None:
+def test_a_bus_that_takes_no_frame_is_one_on_which_no_drive_answers(new: AnyRig) -> None:
+    """Its queue is full, for nobody acknowledges while all drives are off."""
     new.bus.broken = True
-    with pytest.raises(BusError, match="cannot send"):
+    with pytest.raises(DriveError, match=r"no answer .* is it powered and on this bus"):
         new.drives.configure(STEP)
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import can
 import msgspec
 import pytest
+from control_rig import CONFIG
+from drivers.test_odrive import odrives
 from rigs import alike
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.config import Can, Drive, Drives
@@ -106,14 +108,55 @@ def test_what_cannot_be_opened_is_one_line_with_the_remedy(
     assert all(each in text for each in said)
 
 
-@pytest.mark.parametrize("up", [True, False])
-def test_can_interface_that_is_down(up: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("up", "carrier"), [(True, "1"), (True, "0"), (False, "0")])
+def test_can_interface_that_is_down(up: bool, carrier: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "can0").mkdir()
     (tmp_path / "can0" / "flags").write_text("0x40081\n" if up else "0x40080\n")
+    (tmp_path / "can0" / "carrier").write_text(f"{carrier}\n")
     monkeypatch.setattr(opening, "NETWORK_INTERFACES", tmp_path)
     monkeypatch.setattr(can, "Bus", lambda **kwargs: StandInBus())
     section = Can(interface="socketcan", channel="can0")
-    if up:
+    if up and carrier == "1":
         opening.open_bus(section, DRIVES).shutdown()
+    elif up:
+        assert "is in bus-off; check cable" in refusal(section)
     else:
         assert '"can0" is down; bring it up with: ip link set can0 up' in refusal(section)
+
+
+@pytest.mark.parametrize("config", [DRIVES, odrives(CONFIG).drives], ids=["cia402", "odrive"])
+@pytest.mark.parametrize(
+    ("error", "section", "waits"),
+    [
+        (OSError(errno.ENODEV, "No such device"), Can("socketcan", channel="can0"), True),
+        (OSError(errno.EAFNOSUPPORT, "not supported"), Can("socketcan", channel="can0"), True),
+        (BOUND, Can("socketcan", channel="vcan0"), True),
+        (can.CanInitializationError("no adapter"), Can("vector", channel="1"), True),
+        (can.CanOperationError("unplugged"), Can("vector", channel="1"), True),
+        (can.CanInterfaceNotImplementedError("no module"), Can("vector", channel="1"), False),
+        (TypeError("unexpected option"), Can("vector", channel="1"), False),
+        (NameError("canlib"), Can("kvaser", channel="0"), False),
+        (None, Can("socketcn", channel="can0"), False),
+    ],
+)
+def test_a_start_waits_for_a_bus_that_may_appear_and_for_no_other(
+    error: Exception | None, section: Can, waits: bool, config: Drives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(**kwargs: object) -> can.BusABC:
+        assert error is not None
+        raise error
+
+    monkeypatch.setattr(can, "Bus", fail)
+    reason = refusal(section)
+    if not waits:
+        with pytest.raises(BusError):
+            opening.connect(section, config, awaits=True)
+        return
+    drives = opening.connect(section, config, awaits=True)
+    try:
+        drives.configure(0.001, awaits=True)
+        fault = drives.read().fault
+        assert fault is not None
+        assert fault.message == f"CAN bus {section.channel} is down: {reason}"
+    finally:
+        drives.close()

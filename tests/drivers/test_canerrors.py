@@ -7,39 +7,39 @@ import re
 
 import can
 import pytest
-from trirail_drivers.bus.canerrors import Gravity, cannot_send, error_number, queue_is_full, report
+from trirail_drivers.bus.canerrors import Severity, decode_error_frame, error_number, explain, queue_is_full
 
 
 @pytest.mark.parametrize(
-    ("kind", "data", "gravity", "said"),
+    ("kind", "data", "severity", "said"),
     [
-        (0x001, (), Gravity.WARNING, "a frame was not sent in time"),
-        (0x002, (5,), Gravity.ROUTINE, "arbitration lost"),
-        (0x004, (0, 0x01), Gravity.WARNING, "receive buffer overflow"),
-        (0x004, (0, 0x08), Gravity.WARNING, "error-warning: 96 transmit errors"),
-        (0x204, (0, 0x10), Gravity.WARNING, "error-passive: 128 receive errors"),
-        (0x204, (0, 0x30), Gravity.WARNING, "128 receive errors.*; error-passive: 128 transmit errors"),
-        (0x204, (0, 0x40), Gravity.ROUTINE, "error-active again"),
-        (0x004, (), Gravity.WARNING, "controller problem"),
-        (0x088, (0, 0, 0x84, 0x0A), Gravity.WARNING, "bit stuffing error in sending at the data"),
-        (0x008, (0, 0, 0x00, 0x19), Gravity.WARNING, "protocol violation at the acknowledgement slot"),
-        (0x010, (0, 0, 0, 0, 0x70), Gravity.WARNING, "transceiver: CANL shorted to ground"),
-        (0x020, (), Gravity.WARNING, "no acknowledgement: no other node hears us"),
-        (0x040, (), Gravity.FAULT, r"bus-off: .*ip link set DEV down, ip link set DEV up"),
-        (0x244, (0, 0x20), Gravity.FAULT, "bus-off.*error-passive"),
-        (0x100, (), Gravity.WARNING, "restarted after bus-off"),
+        (0x001, (), Severity.WARNING, "a frame was not sent in time"),
+        (0x002, (5,), Severity.ROUTINE, "arbitration lost"),
+        (0x004, (0, 0x01), Severity.WARNING, "receive buffer overflow"),
+        (0x004, (0, 0x08), Severity.WARNING, "error-warning: 96 transmit errors"),
+        (0x204, (0, 0x10), Severity.WARNING, "error-passive: 128 receive errors"),
+        (0x204, (0, 0x30), Severity.WARNING, "128 receive errors.*; error-passive: 128 transmit errors"),
+        (0x204, (0, 0x40), Severity.ROUTINE, "error-active again"),
+        (0x004, (), Severity.WARNING, "controller problem"),
+        (0x088, (0, 0, 0x84, 0x0A), Severity.WARNING, "bit stuffing error in sending at the data"),
+        (0x008, (0, 0, 0x00, 0x19), Severity.WARNING, "protocol violation at the acknowledgement slot"),
+        (0x010, (0, 0, 0, 0, 0x70), Severity.WARNING, "transceiver: CANL shorted to ground"),
+        (0x020, (), Severity.WARNING, "no acknowledgement: no other node hears us"),
+        (0x040, (), Severity.FAULT, r"bus-off: .*ip link set DEV down, ip link set DEV up"),
+        (0x244, (0, 0x20), Severity.FAULT, "bus-off.*error-passive"),
+        (0x100, (), Severity.WARNING, "restarted after bus-off"),
     ],
 )
-def test_error_frames_in_words(kind: int, data: tuple[int, ...], gravity: Gravity, said: str) -> None:
-    told = report(kind, bytes(data).ljust(8, b"\0"))
-    assert told.gravity is gravity
+def test_error_frames_in_words(kind: int, data: tuple[int, ...], severity: Severity, said: str) -> None:
+    told = decode_error_frame(kind, bytes(data).ljust(8, b"\0"))
+    assert told.severity is severity
     assert "\n" not in told.text
     assert re.search(said, told.text)
 
 
 def test_an_error_frame_of_another_interface_is_not_read_as_socketcans() -> None:
-    told = report(0x040, bytes(4))
-    assert told.gravity is Gravity.WARNING
+    told = decode_error_frame(0x040, bytes(4))
+    assert told.severity is Severity.WARNING
     assert "own coding" in told.text
 
 
@@ -56,19 +56,19 @@ def caused(number: int) -> can.CanOperationError:
 @pytest.mark.parametrize(
     ("error", "full", "remedy"),
     [
-        (refused(errno.ENOBUFS), True, "nobody acknowledges.*txqueuelen"),
+        (refused(errno.ENOBUFS), True, "no node acknowledges.*txqueuelen"),
         (can.CanOperationError("Transmit buffer full"), True, "txqueuelen"),
         (caused(errno.EAGAIN), True, "txqueuelen"),
         (OSError(errno.ENOBUFS, "No buffer space available"), True, "txqueuelen"),
         (refused(errno.ENETDOWN), False, "is down; bring it up: ip link set DEV up"),
         (refused(errno.ENODEV), False, "is gone; is the adapter"),
-        (caused(errno.EPIPE), False, "the end of the bus that listens is gone"),
+        (caused(errno.EPIPE), False, "the listening end of the bus is gone"),
         (caused(errno.EIO), False, "^cannot send$"),
     ],
 )
 def test_why_a_frame_could_not_be_sent(error: Exception, full: bool, remedy: str) -> None:
     assert queue_is_full(error) is full
-    assert re.search(remedy, cannot_send(error))
+    assert re.search(remedy, explain(error))
 
 
 def test_the_systems_number_is_found_behind_what_it_caused() -> None:

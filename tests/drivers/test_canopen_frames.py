@@ -56,5 +56,5 @@ def test_stopping_asks_the_same_of_every_state(state: PowerState) -> None:
 
 @pytest.mark.parametrize("state", list(PowerState))
 @pytest.mark.parametrize("wanted", [P.OPERATION_ENABLED, P.QUICK_STOP_ACTIVE, P.SWITCH_ON_DISABLED])
-def test_no_transition_resets_a_fault(state: PowerState, wanted: canopen_frames.Wanted) -> None:
+def test_no_transition_resets_a_fault(state: PowerState, wanted: canopen_frames.TargetState) -> None:
     assert not canopen_frames.controlword(state, wanted) & canopen_frames.FAULT_RESET

@@ -48,7 +48,7 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
     off = canopen_frames.DISABLE_VOLTAGE
     positions = "tpdo2"
     first_asked = r"object 1000:00 \(Device type\)"
-    keeps_power = "is operation enabled 1 s after {}; switch on disabled was expected"
+    keeps_power = "is operation enabled 1 s after {}; expected switch on disabled"
 
     def __init__(self, config: Drives = CONFIG) -> None:
         super().__init__(config, Cia402)
@@ -131,7 +131,7 @@ class TestConfigure:
 
     def test_wrong_device_type(self, new: Rig) -> None:
         new.devices[2].objects[0x1000, 0].value = 401
-        with pytest.raises(DriveError, match=r"drive C: .*profile 401; wanted a drive, profile 402"):
+        with pytest.raises(DriveError, match=r"drive C: .*profile 401; expected a drive, profile 402"):
             new.drives.configure(PERIOD)
 
     def test_refused_write_tells_the_drives_reason(self, new: Rig) -> None:
@@ -201,7 +201,9 @@ class TestConfigure:
     )
     def test_eds_that_is_none(self, tmp_path: Path, content: bytes) -> None:
         (tmp_path / "x.eds").write_bytes(content)
-        with pytest.raises(DriveError, match=r"^drive A: \S*x\.eds is not an EDS as CiA 306 has it: .+") as refused:
+        with pytest.raises(
+            DriveError, match=r"^drive A: \S*x\.eds(?: is not an EDS as CiA 306 has it)?: .+"
+        ) as refused:
             Rig(changed("A", eds=str(tmp_path / "x.eds"))).drives.configure(PERIOD)
         assert "\n" not in str(refused.value)
 
@@ -238,7 +240,7 @@ class TestConfigure:
         ("keys", "said"),
         [
             ({"B": CONFIG.A}, "must differ, but are drives.A.node = 1, drives.B.node = 1"),
-            ({"A": Drive(0, 1e6)}, "drives.A.node = 0: that is all nodes' on CANopen"),
+            ({"A": Drive(0, 1e6)}, "drives.A.node = 0: on CANopen that addresses all nodes"),
             ({"heartbeat": 0.0001}, "highest rate that fits"),
             ({"heartbeat": 30.0}, r"heartbeat .*0\.001 to 21\.845"),
         ],

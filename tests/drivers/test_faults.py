@@ -197,27 +197,27 @@ STOP = [
     Case("A dlc 8 tpdo2", 1, r"drive A: frame 281 has wrong length 8"),
     Case("A dlc 1 tpdo1", 110, r"drive A: frame 181 has wrong length 1"),
     Case("A dlc 0 heartbeat", 110, r"drive A: frame 701 has wrong length 0"),
-    Case("B dlc 7 rpdo2", 2, r"drive B: emergency 0x8210 .*, error register 0x11; look for another node"),
-    Case("B dlc 1 sync", 1, r"drive B: emergency 0x8240 .*, error register 0x11; look for another node"),
+    Case("B dlc 7 rpdo2", 2, r"drive B: emergency 0x8210 .*, error register 0x11; find the other node"),
+    Case("B dlc 1 sync", 1, r"drive B: emergency 0x8240 .*, error register 0x11; find the other node"),
     # drives
     Case("C silent", 3, r"drive C: no position for 3 cycles in a row"),
     Case("all silent", 3, r"drive A: no position for 3 cycles in a row"),
     Case("B emcy 4310 for 5", 1, r"drive B: emergency 0x4310 \(drive too hot\), error register 0x09; let it cool"),
-    Case("B fault 2310 for 5", 1, r"drive B: emergency 0x2310 .*, error register 0x03; look at motor"),
+    Case("B fault 2310 for 5", 1, r"drive B: emergency 0x2310 .*, error register 0x03; check motor"),
     Case("A stuck", 60, r"slider A: following error", IN_MOTION, lasts=False),
     Case("A lag 0.1", 100, r"slider A: following error", IN_MOTION, lasts=False),
     Case("C runaway 0.1", 100, r"slider C: following error", stands=1100, lasts=False),
     Case("C runaway -0.1", 100, r"slider C: following error", stands=1100, lasts=False),
-    Case("B reboot", 1, r"drive B: has restarted and lost its set-up; restart the service", curable=False),
+    Case("B reboot", 1, r"drive B: has restarted and lost its set-up: wait until it is configured again", lasts=False),
     # the bus
-    Case("bus-off", 1, r"CAN bus: bus-off"),
+    Case("bus-off", 1, r"CAN bus .* is down: bus-off"),
     Case("babble 001", 3, r"drive A: no position for 3 cycles in a row"),
 ]
 STOP_HOMING = [
     Case("A stuck", 5500, r"drive A: homing: home was not attained within 5 s", lasts=False),
     Case("A runaway 0.001", 5500, r"drive A: homing: home was not attained within 5 s", stands=1100, lasts=False),
-    Case("A drop 0x581", 2000, r"drive A: homing: no answer about object 60\w\w:00", lasts=False),
-    Case("A drop 0x601", 2000, r"drive A: homing: no answer about object 60\w\w:00", lasts=False),
+    Case("A drop 0x581", 2000, r"drive A: homing: no answer for object 60\w\w:00", lasts=False),
+    Case("A drop 0x601", 2000, r"drive A: homing: no answer for object 60\w\w:00", lasts=False),
     Case("A corrupt tpdo2", 2000, r"slider A: following error", lasts=False),
 ]
 """Faults of the drive that is being homed."""
@@ -284,6 +284,7 @@ def assert_stops_until_reset(rig: FaultRig, case: Case, begun: Begin) -> None:
         assert rig.faulty()
     rig.mend()
     rig.cycles(LONG)
+    rig.until(lambda: not rig.control.measured.unready)
     assert isinstance(rig.command("reset"), Confirmed) is case.curable
     assert rig.stands()
     if case.curable:

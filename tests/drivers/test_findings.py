@@ -15,7 +15,7 @@ MASTER = 126
 def test_a_drive_that_takes_8_ms_only_is_refused_with_the_rate_that_it_has(closing: Closing) -> None:
     refuses = {(0x60C2, 1): lambda value: value != 8, (0x60C2, 2): lambda exponent: exponent != -3}
     rig = closing(Rig("elmo_gold", Habits(values={(0x60C2, 1): 8, (0x60C2, 2): -3}, refuses=refuses)))
-    with pytest.raises(DriveError, match=r"60C2:0\d .*; it holds 8 ms: say loop\.rate_hz = 125") as refused:
+    with pytest.raises(DriveError, match=r"60C2:0\d .*; it holds 8 ms: set loop\.rate_hz = 125") as refused:
         rig.drives.configure(PERIOD)
     assert str(refused.value).endswith("; drive B: the same; drive C: the same")
     rig.drives.configure(0.008)
@@ -40,7 +40,7 @@ def test_an_emcy_that_is_switched_off_is_not_told_as_the_predefined_one(closing:
     rig = closing(Rig("elmo_gold", Habits(values={(0x1014, 0): 0x8000_0081}, access={(0x1014, 0): "ro"})))
     rig.ready()
     (said,) = [line for line in rig.warnings if "1014" in line and "drive A" in line]
-    assert "its EMCY is switched off" in said
+    assert "its EMCY is off" in said
     assert "predefined" not in said
     rig.nodes[0].habits.tells_error_reset = False
     rig.enable()
@@ -59,7 +59,7 @@ def test_an_event_timer_that_is_read_only_keeps_the_statuswords_pdo(closing: Clo
         assert node.value(0x1800, 1) & 0x8000_07FF == 0x180 + node.node
         assert (node.value(0x1A00, 0), node.value(0x1A00, 1)) == (1, 0x6041_0010)
     assert any("1800:05" in line and "cannot be set" in line for line in rig.warnings)
-    assert any("also asked for by SDO" in line for line in rig.warnings)
+    assert any("also requested by SDO" in line for line in rig.warnings)
     rig.enable()
     rig.go(0.05, 200)
 

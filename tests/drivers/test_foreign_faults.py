@@ -9,7 +9,7 @@ import pytest
 from drivers.foreign import DISABLED, ENABLED, OPERATIONAL, PRE_OPERATIONAL, QUICK_STOP, STOPPED, ForeignDrive, Habits
 from drivers.test_foreign import MAKES, PERIOD, Rig
 from rigs import OFF, Closing, frame
-from trirail_drivers.cia402.codes import words
+from trirail_drivers.cia402.codes import describe_error
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import PowerState
 
@@ -114,7 +114,7 @@ def test_nmt_by_a_stranger_stops_all_in_the_same_cycle(rig: Rig, command: int, n
     ],
 )
 def test_two_masters_are_noticed(rig: Rig, identifier: int | None, data: bytes, said: str) -> None:
-    way = rig.drives._axes[1].way
+    way = rig.drives._axes[1].exchange
     with stranger(rig) as bus:
         if identifier is None:
             identifier, data = way.setpoints.identifier, bytes(way.setpoints.size)
@@ -126,7 +126,7 @@ def test_two_masters_are_noticed(rig: Rig, identifier: int | None, data: bytes, 
 @pytest.mark.parametrize("apart", [1, -40, 16_000_000])
 def test_a_second_node_with_the_same_id_is_noticed(rig: Rig, apart: int) -> None:
     """Its slider may be anywhere: also beside this one [counts], as of a drive that was copied and not moved."""
-    node, way = rig.nodes[2], rig.drives._axes[2].way
+    node, way = rig.nodes[2], rig.drives._axes[2].exchange
     pdo = next(index for index in node._pdos(0x1800) if node.value(index, 1) & 0x7FF == way.feedback.identifier)
     with stranger(rig) as bus:
         for _ in range(200):
@@ -169,7 +169,7 @@ def test_a_second_node_that_is_plugged_in_is_named(rig: Rig, data: bytes, after:
 
 @pytest.mark.parametrize("in_flight", [False, True])
 def test_a_drive_that_has_left_operational_is_no_second_one(rig: Rig, in_flight: bool) -> None:
-    node, way = rig.nodes[1], rig.drives._axes[1].way
+    node, way = rig.nodes[1], rig.drives._axes[1].exchange
     pdo = next(index for index in node._pdos(0x1800) if node.value(index, 1) & 0x7FF == way.feedback.identifier)
     position = frame(way.feedback.identifier, node._packed(pdo))
     deaf(node, PRE_OPERATIONAL)
@@ -209,7 +209,7 @@ def test_an_emcy_that_is_still_in_force_does(rig: Rig) -> None:
     rig.nodes[0].emergency(0x8130)
     stopped_within(rig, 2)
     rig.drives.reset()
-    assert rig.last_fault(round(0.6 / PERIOD)) == f"drive A: emergency {words(0x8130, ' is still in force')}"
+    assert rig.last_fault(round(0.6 / PERIOD)) == f"drive A: emergency {describe_error(0x8130, ' is still in force')}"
 
 
 def test_setpoints_that_are_not_followed_are_noticed(rig: Rig) -> None:
@@ -271,7 +271,7 @@ def test_a_drive_that_never_follows_is_not_enabled(closing: Closing) -> None:
         feedback = rig.cycle(rig.feedback.position)
         assert PowerState.OPERATION_ENABLED not in feedback.state
     assert feedback.fault is not None
-    assert feedback.fault.message.endswith('if it never sets that, say accept_without = ["6041"]')
+    assert feedback.fault.message.endswith('if it never sets that bit, set accept_without = ["6041"]')
     rig = closing(Rig("elmo_gold", Habits(has_bit_12=False), accept_without=("6041",)))
     rig.ready()
     rig.enable()
@@ -283,7 +283,7 @@ def test_each_way_is_what_its_name_says(closing: Closing) -> None:
     for make, habits in WAYS.values():
         rig = closing(Rig(make, habits()))
         rig.ready()
-        names.append(rig.drives._axes[0].way.name)
+        names.append(rig.drives._axes[0].exchange.name)
     assert names == [
         "cyclic synchronous position with velocity offset, statusword event-driven, heartbeat",
         "cyclic synchronous position with velocity offset, statusword with the position, heartbeat",

@@ -17,7 +17,7 @@ def test_no_pdo_is_on_but_those_that_are_used_and_none_of_them_waits(closing: Cl
     rig = closing(Rig(name))
     rig.ready()
     for node, axis in zip(rig.nodes, rig.drives._axes, strict=True):
-        way = axis.way
+        way = axis.exchange
         used = {way.setpoints.identifier, way.controlword, way.feedback.identifier, way.status} - {None}
         on = [index for base in (0x1400, 0x1800) for index in node._pdos(base)]
         assert {node.value(index, 1) & 0x7FF for index in on} == used
@@ -28,8 +28,8 @@ def test_a_statusword_that_may_be_held_back_is_taken_from_beside_the_position(cl
     rig = closing(Rig("elmo_gold", Habits(values={(0x1800, 3): 1000}, access={(0x1800, 3): "ro"})))
     rig.ready()
     for axis in rig.drives._axes:
-        assert axis.way.feedback.has_status
-        assert axis.way.status is None
+        assert axis.exchange.feedback.has_status
+        assert axis.exchange.status is None
     assert any("object 1800:03 (Inhibit time)" in warning for warning in rig.warnings)
     rig.enable()
 

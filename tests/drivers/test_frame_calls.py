@@ -42,8 +42,11 @@ class Fake:
             raise found
         return found
 
-    def hear(self, identifiers: Collection[int]) -> None:
+    def set_identifiers(self, identifiers: Collection[int]) -> None:
         """Hear all."""
+
+    def reopen(self) -> None:
+        """Do nothing."""
 
 
 def called(address: int, frames: PackedFrames, number: int) -> int:
@@ -55,16 +58,22 @@ def called(address: int, frames: PackedFrames, number: int) -> int:
 frames_of_any_length = st.tuples(st.integers(0, 0x7FF), st.binary(max_size=64).map(bytearray))
 
 
-@given(arriving=st.lists(frames_of_any_length, max_size=2 * ROOM), handed_in=st.integers(0, ROOM))
-def test_what_is_handed_in_is_received_once_more_in_its_order(arriving: list[Received], handed_in: int) -> None:
+@given(
+    arriving=st.lists(frames_of_any_length, max_size=2 * ROOM),
+    handled=st.integers(0, ROOM),
+    handed_in=st.integers(0, ROOM),
+)
+def test_what_is_handed_in_is_received_once_more_in_its_order(
+    arriving: list[Received], handled: int, handed_in: int
+) -> None:
     """Frames of CAN FD too, which are longer than there is room for."""
     frames, room = FrameCalls(Fake(arriving)), PackedFrames(ROOM)
     number = called(frames.access.receive, room, ROOM)
     assert number == min(len(arriving), ROOM)
     for row, (identifier, data) in zip(room.frames[:number], arriving, strict=False):
         assert row.tobytes() == CAN_FRAME.pack(identifier, len(data), data)
-    frames.hand_in(room, handed_in, 0)
-    left = [*arriving[:number][:handed_in], *arriving[number:]]
+    frames.hand_in(room, handled, handed_in, 0)
+    left = [*arriving[:number][handled:handed_in], *arriving[number:]]
     assert [frames.receive() for _ in range(len(left) + 1)] == [*left, None]
 
 
@@ -75,7 +84,7 @@ def test_an_error_is_raised_behind_the_frames_before_it_and_once(before: int, er
     last: Received = 0x7FF, bytearray(b"last")
     frames, room = FrameCalls(Fake([*first, error, last])), PackedFrames(ROOM)
     assert called(frames.access.receive, room, ROOM) == ~before
-    frames.hand_in(room, before, 0)
+    frames.hand_in(room, 0, before, 0)
     assert [frames.receive() for _ in range(before)] == first
     with pytest.raises(type(error)):
         frames.receive()
@@ -91,7 +100,7 @@ def test_a_refused_frame_is_refused_again_and_not_tried_twice(refused: int, erro
     taken = called(frames.access.send, sent, 4)
     assert taken == min(refused, 4)
     for number in range(taken, 4):
-        frame = Frame.of(sent.frames[number].tobytes())
+        frame = Frame.from_packed(sent.frames[number].tobytes())
         if number == refused:
             with pytest.raises(type(error)):
                 frames.send(frame)

@@ -99,7 +99,7 @@ def test_a_capture_has_every_frame_with_its_time(kind: str, way: str) -> None:
     capture = Capture()
     began = time.time()
     with over(kind, way, capture) as (frames, far):
-        frames.hear([0x281])
+        frames.set_identifiers([0x281])
         frames.send(Frame(0x201, b"\x06\x00"))
         far.receive()
         for identifier, data in KINDS:
@@ -254,7 +254,7 @@ class EchoingBus(can.BusABC):
 def test_what_this_end_has_sent_has_not_arrived(marked: bool) -> None:
     """But what another has sent has, though it be the same frame; one of ours that is lost hides none of theirs."""
     with EchoingBus(marked=marked) as bus:
-        frames = PythonCanFrames(bus, heard_by_itself=not marked)
+        frames = PythonCanFrames(bus, receives_own_frames=not marked)
         bus.arrived.append(frame(0x181, b"\1"))
         for identifier in (0x201, 0x080, 0x202):
             frames.send(Frame(identifier))

@@ -19,6 +19,7 @@ from refusals import refusal
 from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import config
@@ -275,7 +276,7 @@ def test_a_stop_halts_it_and_it_can_begin_again(robots: Robots, event: str | Mod
     rig.enable()
     begin(rig, when)
     if isinstance(event, ModeEvent):
-        rig.control.modes.happen(event, "it happened")
+        rig.control.modes.happen(event, coded("it happened", EventCode.OTHER))
         rig.until(lambda: rig.mode is end, 400)
     else:
         assert isinstance(rig.command(event), Confirmed)
@@ -404,6 +405,7 @@ def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, w
     rig.cycles(400)  # one that does not hear has stopped by its own watch on SYNC
     rig.drives[2].silent = False
     rig.cycles(150)  # it tells its state from time to time
+    rig.until(lambda: not rig.control.measured.unready)  # and is configured again, where it was silent
     assert not any(drive.state is PowerState.OPERATION_ENABLED for drive in rig.drives)
     assert not any(drive.servo.velocity for drive in rig.drives)
     assert isinstance(rig.command("reset"), Confirmed)
@@ -448,19 +450,19 @@ def test_an_object_that_is_not_answered_about_is_waited_for_until_its_time_is_ov
         assert a.sdo_asked == (0x6060).to_bytes(2, "little")
     fault = homing.step(10.0 + drives.sdo_timeout)
     assert fault is not None
-    assert "drive A: homing: no answer about object 6060:00" in fault.message
+    assert "drive A: homing: no answer for object 6060:00" in fault.message
     assert a.sdo_asked is None
     assert len(sent) == 1
     assert not homing.under_way
 
 
-def test_homes_outside_the_limits_are_said(robots: Robots) -> None:
+def test_homes_outside_the_limits_are_warned_of(robots: Robots) -> None:
     outside = inverse(geometry(CONFIG.geometry), np.array([0.2, 0.0, 0.0])).position.tolist()
     rig = robots(changed(incremental(homes=outside), start=[value + 0.002 for value in outside]))
     rig.enable()
     begin(rig)
-    rig.until(lambda: rig.mode is Mode.FAULT)
-    assert "all drives are homed, but the robot stands outside its limits" in (rig.control.fault or "")
+    rig.until(lambda: rig.mode is Mode.HOLDING)
+    assert any("the robot stands outside its limits, only motion back" in said.message for said in rig.notices)
 
 
 # ---------------------------------------------------------------------- what is refused

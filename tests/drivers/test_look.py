@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import canopen
 import pytest
+from canopen import SdoAbortedError
 from canopen.objectdictionary import ODVariable
 from edsfiles import Row, eds
 from rigs import STEP, Closing, ideal_servo
@@ -18,7 +19,6 @@ from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.simulated import SimulatedDrive
-from trirail_drivers.simulated.dictionary import SdoAbort
 from trirail_drivers.simulated.sdo_server import SdoServer
 
 from drivers import test_cia402
@@ -151,13 +151,13 @@ def test_what_is_refused_is_named(
 def test_a_drive_is_asked_by_a_look_alone_and_not_by_the_service(
     closing: Closing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin, asked = SdoServer._start_download, []
+    begin, asked = SdoServer.init_download, []
 
     def listening(server: SdoServer, data: bytes) -> None:
         asked.append(not data[0] & 2)  # not expedited: only the length comes with it
         begin(server, data)
 
-    monkeypatch.setattr(SdoServer, "_start_download", listening)
+    monkeypatch.setattr(SdoServer, "init_download", listening)
     rig = closing(Rig(tmp_path, eds(OWN)))
     assert rig.look() == ""
     assert asked
@@ -190,15 +190,15 @@ def test_a_drive_that_knows_no_segments_is_set_up_all_the_same(
     closing: Closing, code: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It refuses each download that is not expedited, or does not answer it: that says nothing of the object."""
-    begin = SdoServer._start_download
+    begin = SdoServer.init_download
 
     def expedited(server: SdoServer, data: bytes) -> None:
         if data[0] & 2:
             begin(server, data)
         elif code is not None:
-            server._start(data)
-            raise SdoAbort(code)
+            server._name(data)
+            raise SdoAbortedError(code)
 
-    monkeypatch.setattr(SdoServer, "_start_download", expedited)
+    monkeypatch.setattr(SdoServer, "init_download", expedited)
     rig = closing(Rig(tmp_path, eds(OWN)))
     assert (rig.look(), rig.set_up()) == ("", "")

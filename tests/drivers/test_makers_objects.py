@@ -63,7 +63,7 @@ def test_it_is_shown_with_its_reason(closing: Closing) -> None:
         (
             Habits(more=((0x208E, 0, 7, "rw", 0, False),)),
             BRAKE,
-            r'drives\.A\.write: object 208E:00 has 32 bits, and type = "u16"',
+            r'drives\.A\.write: object 208E:00 has 32 bits in the drive, but type = "u16"',
         ),
         (Habits(more=((0x208E, 0, 6, "ro", 0, False),)), BRAKE, r"drive A: cannot write 256 to object 208E:00"),
         (
@@ -133,7 +133,9 @@ def test_what_the_set_up_owns_and_what_stores_is_refused(tmp_path: Path, index: 
         f'object = 0x{index}\nvalue = 1\ntype = "u8"\n{WHY}'
         + "\nsub = 5" * (index[0] == "1" and index[:2] in ("14", "18")),
     )
-    with pytest.raises(ConfigError, match=rf"drives\.B\.write: object {index}:0\d (is the set-up's own|would|changes)"):
+    with pytest.raises(
+        ConfigError, match=rf"drives\.B\.write: object {index}:0\d (is written by the set-up|would|changes)"
+    ):
         load(path)
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+from canopen import SdoAbortedError
 from edsfiles import MAKES, eds, make_eds, rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigs import DeviceRig
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import Mechanics, Servo, SimulatedDrive
-from trirail_drivers.simulated.dictionary import SdoAbort
 
 NODE = 5
 PERIOD = 0.001
@@ -203,7 +203,7 @@ def test_nanotecs_interpolation_is_in_milliseconds(exponent: int, taken: bool, t
     if taken:
         rig.put(0x60C2, exponent, 2)
     else:
-        with pytest.raises(SdoAbort):
+        with pytest.raises(SdoAbortedError):
             rig.put(0x60C2, exponent, 2)
         assert rig.get(0x60C2, 2) == -3
 

@@ -20,10 +20,10 @@ from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
-from trirail_drivers.odrive.codes import words
+from trirail_drivers.odrive.codes import describe_errors
 from trirail_drivers.odrive.drives import Odrive
 from trirail_drivers.odrive.flat_endpoints import Version
-from trirail_drivers.odrive.setpoints import SETTLING
+from trirail_drivers.odrive.setpoints import SETTLE_TIME_S
 from trirail_drivers.simulated import SimulatedOdrive
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
@@ -48,7 +48,7 @@ class Rig(DriverRig[SimulatedOdrive, Odrive]):
     off = cansimple.SET_AXIS_STATE, AxisState.IDLE
     positions = "get_encoder_estimates"
     first_asked = "Get_Version"
-    keeps_power = "is in closed loop control 1 s after {}; idle was expected"
+    keeps_power = "is in closed loop control 1 s after {}; expected idle"
 
     def __init__(self, config: Drives = CONFIG, watchdog: float = 0.02) -> None:
         self._watchdog = watchdog
@@ -110,7 +110,7 @@ class TestConfigure:
         new.devices[1].axis_state = AxisState.CLOSED_LOOP_CONTROL
         monkeypatch.setattr(new.devices[1], "fail", lambda errors: None)
         new.keep_power(1)
-        with pytest.raises(DriveError, match=r"drive B: keeps its power on .*closed loop control"):
+        with pytest.raises(DriveError, match=r"drive B: does not take its power off: .*closed loop control"):
             new.drives.configure(PERIOD)
 
     def test_drive_without_heartbeat(self, new: Rig) -> None:
@@ -120,7 +120,7 @@ class TestConfigure:
 
     def test_firmware_of_another_layout(self, new: Rig) -> None:
         new.devices[0].version = Version((3, 6, 56), (0, 5, 6))
-        with pytest.raises(DriveError, match=r"drive A: it has firmware 0\.5\.6 on .*; wanted firmware 0\.6\.0"):
+        with pytest.raises(DriveError, match=r"drive A: firmware 0\.5\.6 on .* is too old; update to 0\.6\.0"):
             new.drives.configure(PERIOD)
 
     def test_drive_that_does_not_know_where_it_is(self, new: Rig) -> None:
@@ -223,7 +223,7 @@ class TestStop:
         enabled.devices[1].fail(Error.DRV_FAULT)
         enabled.bus.sent.clear()
         feedback = enabled.move(40)
-        assert feedback.fault == ("B", "fault", 0x20, f"drive B: error {words(Error.DRV_FAULT)}")
+        assert feedback.fault == ("B", "fault", 0x20, f"drive B: error {describe_errors(Error.DRV_FAULT)}")
         _, slower = np.abs(enabled.setpoints()[:, -2:, 1]).T
         assert slower == pytest.approx(np.abs(SPEED) - 10.0 * PERIOD, abs=1e-4)
         assert enabled.cycles(200).state == (P.SWITCH_ON_DISABLED, P.FAULT, P.SWITCH_ON_DISABLED)
@@ -250,7 +250,7 @@ class TestStop:
 
     def test_holds_until_the_servos_have_settled(self, enabled: Rig) -> None:
         enabled.drives.quick_stop()
-        enabled.cycles(round(SETTLING / PERIOD) - 1)
+        enabled.cycles(round(SETTLE_TIME_S / PERIOD) - 1)
         assert enabled.commands() == [[], [], []]
         enabled.cycles(3)
         assert enabled.commands() == [[IDLE]] * 3
@@ -446,7 +446,7 @@ class TestClose:
         enabled.drives.close()
         assert {device.axis_state for device in enabled.devices} == {AxisState.IDLE}
         assert {device.disarm_reason for device in enabled.devices} == {Error(0)}
-        assert 0.5 / 10.0 + SETTLING <= enabled.clock.now - before < 0.5
+        assert 0.5 / 10.0 + SETTLE_TIME_S <= enabled.clock.now - before < 0.5
         assert np.abs(np.diff(enabled.setpoints()[:, :, 1])).max() <= 10.0 * PERIOD + 1e-4
         assert enabled.bus.shutdowns == 1
 

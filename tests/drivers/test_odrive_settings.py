@@ -19,7 +19,7 @@ from trirail.errors import ConfigError
 from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES
 from trirail_drivers.odrive import cansimple, flat_endpoints
-from trirail_drivers.odrive.flat_endpoints import KNOWN, Version
+from trirail_drivers.odrive.flat_endpoints import KNOWN_TABLES, Version
 from trirail_drivers.odrive.protections import CYCLIC, HEARTBEAT, PROTECTIONS, SCALE, WATCHDOG, WATCHDOG_TIMEOUT
 
 S1 = Version((5, 2, 0), (0, 6, 10))
@@ -106,8 +106,8 @@ def test_a_setting_that_is_not_as_it_must_be_is_refused_or_accepted_and_told(
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        (WATCHDOG, False, "enable_watchdog, its stop when it hears nobody: axis0.config.enable_watchdog is False"),
-        (WATCHDOG_TIMEOUT, 5.0, "axis0.config.watchdog_timeout is 5 s, wanted 0.3 at most"),
+        (WATCHDOG, False, "enable_watchdog, its stop when the host is silent: axis0.config.enable_watchdog is False"),
+        (WATCHDOG_TIMEOUT, 5.0, "axis0.config.watchdog_timeout is 5 s, wanted <= 0.3 s"),
         (SCALE, 100, "axis0.config.can.input_vel_scale is 100, wanted 1000"),
         (HEARTBEAT, 50, "axis0.config.can.heartbeat_msg_rate_ms is 50, wanted 100, drives.heartbeat"),
         (CYCLIC[1], 10, "axis0.config.can.encoder_msg_rate_ms is 10, wanted 0"),
@@ -123,6 +123,15 @@ def test_each_is_said_with_what_is_wanted_and_how_to_accept_it(
     assert str(refused.value).startswith("drive B lacks protections: ")
     assert said in str(refused.value)
     assert f'drives.B.accept_without = ["{OF[path]}"]' in str(refused.value)
+
+
+def test_wrong_settings_end_the_start_also_where_another_drive_is_awaited(closing: Closing) -> None:
+    rig = closing(Rig())
+    rig.devices[0].silent = True
+    rig.devices[2].settings[HEARTBEAT] = 10
+    with pytest.raises(DriveError, match=r"^drive C lacks protections: heartbeat_msg_rate_ms") as refused:
+        rig.drives.configure(PERIOD, awaits=True)
+    assert "drive A" not in str(refused.value)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.0005, 2.9 * PERIOD])
@@ -162,7 +171,7 @@ def test_a_development_version_is_none_that_is_known(closing: Closing) -> None:
 
 def table(version: Version, numbers: dict[str, int], types: dict[str, str] | None = None) -> str:
     """A flat_endpoints.json, with what else such a file has."""
-    (known,) = [each for each in KNOWN if each.is_of(S1)]
+    (known,) = [each for each in KNOWN_TABLES if each.matches(S1)]
     each = {
         path: {"id": numbers.get(path, endpoint.id), "type": (types or {}).get(path, endpoint.type)}
         for path, endpoint in known.endpoints.items()
@@ -187,7 +196,7 @@ def test_a_users_own_table_makes_a_firmware_known(
 ) -> None:
     (tmp_path / "flat_endpoints.json").write_text(table(UNKNOWN, {WATCHDOG: 999}))
     own = flat_endpoints.read("A", tmp_path / "flat_endpoints.json")
-    monkeypatch.setattr("trirail_drivers.simulated.odrive.KNOWN", (own,))  # such a drive numbers them so
+    monkeypatch.setattr("trirail_drivers.simulated.odrive.KNOWN_TABLES", (own,))  # such a drive numbers them so
     rig = closing(Rig(with_file(tmp_path / "flat_endpoints.json")))
     for device in rig.devices:
         device.version = UNKNOWN
@@ -200,8 +209,8 @@ def test_a_users_own_table_makes_a_firmware_known(
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (table(S1, {}), r"is for firmware 0\.6\.10 on hardware 5\.2\.0, and the drive has firmware 0\.6\.99 on"),
-        (table(UNKNOWN, {WATCHDOG: -1}), r"it has no axis0\.config\.enable_watchdog"),
+        (table(S1, {}), r"is for firmware 0\.6\.10 on hardware 5\.2\.0, but the drive has firmware 0\.6\.99 on"),
+        (table(UNKNOWN, {WATCHDOG: -1}), r"it lacks axis0\.config\.enable_watchdog"),
         (table(UNKNOWN, {SCALE: 70_000}), r"is endpoint 70000 of type 'uint32', which no message holds"),
         (table(UNKNOWN, {}, {SCALE: "uint64"}), r"of type 'uint64', which no message holds"),
         ("{}", r"is no flat_endpoints\.json \(Object missing"),
@@ -229,7 +238,7 @@ def test_a_table_that_is_not_there_is_told_by_the_doctor_and_refused_of_other_dr
     (found,) = everything(tmp_path / "odrive_s1.toml").mistakes
     assert found.key == "drives.B.endpoints"
     assert f"{tmp_path}/no.json: No such file" in found.text
-    with pytest.raises(ConfigError, match="ODrives alone have endpoints"):
+    with pytest.raises(ConfigError, match="only ODrives have endpoints"):
         load(tmp_path / "elmo_gold.toml")
 
 
@@ -249,13 +258,13 @@ def test_an_answer_that_is_lost_is_asked_for_again(closing: Closing, lost: int) 
     if lost < 3:
         rig.drives.configure(PERIOD)
     else:
-        with pytest.raises(DriveTimeout, match=r"drive B: no answer to RxSdo about axis0\.config\.enable_watchdog"):
+        with pytest.raises(DriveTimeout, match=r"drive B: no answer to RxSdo of axis0\.config\.enable_watchdog"):
             rig.drives.configure(PERIOD)
 
 
 def test_the_tables_are_the_makers() -> None:
     """Of each firmware at hand: version, hardware, and some numbers of its flat_endpoints.json, by hand."""
-    found = {(each.fw_version, each.hw_version): each.endpoints for each in KNOWN}
+    found = {(each.fw_version, each.hw_version): each.endpoints for each in KNOWN_TABLES}
     assert set(found) == {("0.6.8", "5.2.0"), ("0.6.10", "5.2.0"), ("0.6.10", "4.4.58")}
     assert found["0.6.8", "5.2.0"][WATCHDOG].id == 201
     assert found["0.6.10", "5.2.0"][WATCHDOG].id == 214
@@ -273,6 +282,6 @@ def test_the_guide_has_every_protection() -> None:
     rows = {row[0]: row for row in (line.strip("| ").split(" | ") for line in section.splitlines() if line[:1] == "|")}
     for name, (purpose, without) in PROTECTIONS.items():
         assert rows[name][2:] == [purpose, without]
-    for each in KNOWN:
+    for each in KNOWN_TABLES:
         assert each.fw_version in section
         assert each.hw_version in section

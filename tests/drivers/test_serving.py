@@ -174,7 +174,7 @@ def test_drives_have_moved_on_while_they_were_stalled(served: Served) -> None:
 
 
 def test_a_master_that_does_not_read_loses_frames_and_no_more(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unixbus, "MOST_WAITING", 1)
+    monkeypatch.setattr(unixbus, "SEND_BUFFER_BYTES", 1)
     with master(served) as line:
         for _ in range(500):
             line.send(CAN_FRAME.pack(0x602, 8, DEVICE_TYPE))

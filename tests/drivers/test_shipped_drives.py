@@ -9,7 +9,7 @@ import pytest
 import rigs
 from edsfiles import make_eds
 from trirail.config import SIM, Config, load
-from trirail_drivers.bus.load import HIGH
+from trirail_drivers.bus.load import HIGH_LOAD
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import DriveGroup, Feedback, PowerState
 from trirail_drivers.protocols import PROTOCOLS
@@ -119,7 +119,7 @@ def test_what_an_example_says_of_its_drives_it_needs_to_say(name: str, tmp_path:
 def test_an_example_leaves_room_on_its_bus_and_names_what_its_drives_can_answer(path: Path) -> None:
     config = load(path)
     protocol = PROTOCOLS[config.drives.protocol]
-    assert protocol.traffic.bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat) <= HIGH
+    assert protocol.traffic.bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat) <= HIGH_LOAD
     assert ("trirail drives FILE" in path.read_text(encoding="utf-8")) == (protocol.inspect is not None)
 
 

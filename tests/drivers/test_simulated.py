@@ -247,7 +247,7 @@ def test_segmented_transfer_protocol_errors(rig: Rig) -> None:
     assert rig.sdo(0x20, 0x7A, 0x60, 0)[0] == 0x60
     assert abort_code(rig.sdo(0x01 | 5 << 1, 1, 2), 0x607A, 0) == 0x06070013
     assert abort_code(rig.sdo(0x00, 1), 0, 0) == abort_code(rig.sdo(0x60), 0, 0) == 0x05040001
-    assert abort_code(rig.sdo(0xE0, 0x7A, 0x60, 0), 0x607A, 0) == 0x05040001
+    assert abort_code(rig.sdo(0xE0, 0x7A, 0x60, 0), 0, 0) == 0x05040001
     assert not rig.send(0x605, b"\x80\x7a\x60\x00\x00\x00\x00\x08")
     assert not rig.send(0x605, b"\x40\x7a\x60\x00")
 

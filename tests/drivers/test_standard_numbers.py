@@ -62,7 +62,10 @@ CANOPEN: dict[str, dict[str, object]] = {
         "ERROR_REGISTER_UPLOADED": bytes.fromhex("4f011000"),
     },
     "CiA 301, 7.2.8 node guarding: bits 0 to 6 are the state": {"NMT_STATE_BITS": 0x7F},
-    "CiA 402-2, modes 7 and 8: controlword bit 4, statusword bit 12": {"INTERPOLATE": 0x0010, "FOLLOWS": 0x1000},
+    "CiA 402-2, modes 7 and 8: controlword bit 4, statusword bit 12": {
+        "INTERPOLATE": 0x0010,
+        "FOLLOWS_SETPOINTS": 0x1000,
+    },
     "CiA 402-2, controlword 6040h: coding of commands, and bits 4 and 8": {
         "CONTROLWORD": "<H",
         "DISABLE_VOLTAGE": 0b0000_0000,
@@ -97,6 +100,7 @@ CANSIMPLE: dict[str, dict[str, object]] = {
             "float": "<f",
         },
     },
+    "Address: command id, and bytes 1 to 6 for the serial number": {"ADDRESS": 0x06, "SERIAL_AT": slice(1, 7)},
     "units, and node ids of six bits without 3Fh": {
         "VELOCITY_SCALE": 1000,
         "VELOCITY_STEP": 0.001,
@@ -312,10 +316,12 @@ def test_the_odrive_driver_by_its_bytes() -> None:
     said = sent(rig.bus)
     # Drive B is node 7: E0h and the command.
     assert [frame for frame in said if frame[:2] in ("0E", "0F")] == [
-        "0E7#0100000000000000", "0E0#", "0E3#", "0E9#",
+        # Its identity: Get_Version and, by the manual of Address, the serial number.
+        "0E7#0100000000000000", "0E0#", "0E6#",
         # RxSdo reads: watchdog, its timeout, input_vel_scale, heartbeats, what is cyclic: E0h, DFh, 106h, FEh, FDh …
         "0E4#00E00000", "0E4#00DF0000", "0E4#00060100", "0E4#00FE0000", "0E4#00FD0000", "0E4#00FF0000",
         *(f"0E4#00{low:02X}0100" for low in range(6)),
+        "0E3#", "0E9#",
     ]  # fmt: skip
     rig.enable()
     said = sent(rig.bus)

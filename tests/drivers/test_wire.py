@@ -61,7 +61,7 @@ class Rig:
             self.far.receive()
 
     def cycle(self, *, full: bool = False) -> None:
-        self.wire.begin()
+        self.wire.begin(0.0)
         self.fill() if full else self.drain()
         self.wire.send(Frame(0x080))
 
@@ -118,7 +118,7 @@ def test_a_queue_that_was_full_before_the_first_cycle_counts_as_one_cycle(rig: R
 def test_frames_are_taken_in_up_to_a_number_and_then_the_cycle_goes_on(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(wires, "MOST_FRAMES", 10)
+    monkeypatch.setattr(wires, "MAX_FRAMES", 10)
     for _ in range(15):
         rig.far.send(0x281, bytes(4))
     rig.wire.receive(1.0)

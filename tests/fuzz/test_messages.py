@@ -18,18 +18,29 @@ from conftest import Rig
 from control_rig import CONFIG
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from trirail.client.outgoing import goal_messages
 from trirail.errors import RefusedError
-from trirail.processes.gateway import Gateway
-from trirail.processes.incoming import Incoming, Kind
+from trirail.processes.gateway import ROUTES, Gateway
+from trirail.processes.incoming import Incoming
+from trirail.processes.memory_budget import OVERHEAD
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, links, packets, records, text, zenoh_session
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
 from trirail.wire.goals import TrajectoryPoint as Point
 from trirail.wire.links import Port, TooLarge
-from trirail.wire.messages import CommandReply, Event
-from trirail.wire.packets import Accepted, GoalRequest, Happened, RefusedRequest
+from trirail.wire.messages import CommandReply, Event, Notice
+from trirail.wire.packets import Accepted, Announcement, GoalRequest, Happened
 from trirail.wire.records import DTYPE, SIZE
-from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_PACKET, MAX_POINTS
+from trirail.wire.sizes import (
+    MAX_BESIDE,
+    MAX_MESSAGE,
+    MAX_NAME,
+    MAX_PACKET,
+    MAX_PART,
+    MAX_POINTS,
+    MAX_SHARED,
+    MAX_UNREAD_OF_ONE,
+)
 from trirail.wire.state import Info, State
 from trirail.wire.vocabulary import Mode, Override, Stop
 
@@ -185,13 +196,13 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Gateway,
 
 
 @given(
-    kind=st.sampled_from(("goal", "cmd", "info", "role", "poses", "teach", "forget", "alignment")),
+    kind=st.sampled_from(sorted(ROUTES)),
     key=keys,
     payload=payloads,
     encoding=st.sampled_from(ENCODINGS),
 )
 def test_the_gateway_takes_any_message(
-    gateway: tuple[Gateway, FakeLink], kind: Kind, key: str, payload: bytes, encoding: str
+    gateway: tuple[Gateway, FakeLink], kind: str, key: str, payload: bytes, encoding: str
 ) -> None:
     served, link = gateway
     served._refusals._told_since = -math.inf
@@ -199,10 +210,11 @@ def test_the_gateway_takes_any_message(
     served._handle(Incoming(kind, key, len(payload), payload, encoding, None, time.monotonic_ns()))
     for packet in link.sent:
         request = packets.decode_request(packet[1:])
-        assert text.is_name(request.user) or request.user == ""
-        if isinstance(request, RefusedRequest):
-            assert shown(request.message)
-            assert "internal error" not in request.message
+        said = request.notice if isinstance(request, Announcement) else request
+        assert said.user == "" or text.is_name(str(said.user))
+        if isinstance(said, Notice):
+            assert shown(said.message)
+            assert "internal error" not in said.message
 
 
 @given(packet=st.binary(min_size=1, max_size=300) | st.builds(bytes.__add__, st.sampled_from((b"\1", b"\2")), payloads))
@@ -214,9 +226,9 @@ def test_the_gateway_outlives_any_packet(gateway: tuple[Gateway, FakeLink], pack
 # ---------------------------------------------------------------------- what goes between the processes
 
 
-def test_the_largest_goal_fits_into_a_packet() -> None:
+def test_the_largest_message_of_a_goal_fits_into_a_packet() -> None:
     triple = (-0.12345678901234567,) * 3
-    points = tuple(Point(n + 0.1, *triple, velocity=triple, acceleration=triple) for n in range(MAX_POINTS))
+    points = tuple(Point(n + 0.1, *triple, velocity=triple, acceleration=triple) for n in range(MAX_PART))
     goal = TrajectoryGoal(points, id="\U0001f916" * MAX_NAME, stretch=True, valid_for=1234.5678)
     request = GoalRequest(2**63, "u" * MAX_NAME, "\U0001f916" * MAX_NAME, goal, 2**63, withdrawn="w" * 512)
     assert len(packets.message(request)) <= MAX_PACKET
@@ -224,17 +236,26 @@ def test_the_largest_goal_fits_into_a_packet() -> None:
     assert len(json.dumps(msgspec.to_builtins(goal), indent=2)) <= MAX_MESSAGE
 
 
-def test_a_packet_that_would_be_cut_is_refused_by_its_sender(tmp_path: Path) -> None:
+def test_the_longest_trajectory_of_a_client_fits_into_its_users_memory() -> None:
+    """Zenoh has a query's payload as well as the gateway."""
+    triple = (-0.12345678901234567,) * 3
+    points = tuple(Point(1e4 + n + 0.1, *triple, velocity=triple, acceleration=triple) for n in range(MAX_POINTS))
+    sent = goal_messages(TrajectoryGoal(points, stretch=True, valid_for=1234.5678), "\U0001f916" * MAX_NAME)
+    assert sum(2 * len(part) + OVERHEAD + MAX_BESIDE for part in sent) < MAX_UNREAD_OF_ONE
+
+
+def test_a_packet_of_any_size_arrives_whole_or_is_refused_by_its_sender(tmp_path: Path) -> None:
     port = Port(links.listen(tmp_path / "port"))
     link = links.connect(tmp_path / "port")
     port.accept()
-    with pytest.raises(TooLarge, match=f"at most {MAX_PACKET}"):
-        link.send(bytes(MAX_PACKET + 1))
-    assert not port.send(bytes(MAX_PACKET + 1))
+    with pytest.raises(TooLarge, match=f"at most {MAX_SHARED}"):
+        link.send(bytes(MAX_SHARED + 1))
+    assert not port.send(bytes(MAX_SHARED + 1))
     assert port.dropped == 1
     assert port.connected
-    assert port.send(bytes(MAX_PACKET))
-    assert link.receive() == bytes(MAX_PACKET)
+    sent = [bytes(size) for size in (MAX_PACKET, MAX_PACKET + 1, 1, MAX_SHARED)]
+    assert all(map(port.send, sent))
+    assert [link.receive() for _ in sent] == sent
     link.close()
     port.close()
 

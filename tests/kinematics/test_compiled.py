@@ -136,8 +136,8 @@ def test_who_compiles_is_told_of_each_function_once(room: Path, tmp_path: Path) 
         "    return inlined(x)\n"
     )
     code = (
-        "from trirail.kinematics.compiled import FUNCTIONS, tell_of_compiling\n"
-        "tell_of_compiling(print)\n"
+        "from trirail.kinematics.compiled import FUNCTIONS, on_compile\n"
+        "on_compile(print)\n"
         "import trirail.kinematics.closure\n"
         "print(FUNCTIONS)"
     )

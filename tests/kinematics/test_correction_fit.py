@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.kinematics.correction import Correction
-from trirail.kinematics.correction_fit import FEWEST, fit
+from trirail.kinematics.correction_fit import MIN_POSES, fit
 from trirail.kinematics.geometry import Geometry, Room
 from trirail.kinematics.robot import inverse
 
@@ -58,8 +58,8 @@ def test_what_it_foretells_is_no_less_than_what_it_leaves(seed: int) -> None:
     poses, random = reached(150, seed), np.random.default_rng(seed)
     sliders = inverse(robot(seed), poses).position
     found = fit(PLAIN, poses + random.normal(0.0, 1e-5, poses.shape), sliders, ROOM, (4, 4, 4))
-    assert (found.foretold.std(axis=0) >= 0.8e-5).all()  # of 150 poses, the noise of 1e-5 itself spreads by 6 %
-    assert (found.foretold.std(axis=0) >= found.residuals.std(axis=0)).all()
+    assert (found.predicted.std(axis=0) >= 0.8e-5).all()  # of 150 poses, the noise of 1e-5 itself spreads by 6 %
+    assert (found.predicted.std(axis=0) >= found.residuals.std(axis=0)).all()
 
 
 def table(path: Path, poses: Array, sliders: Array) -> Path:
@@ -84,7 +84,7 @@ def test_what_makes_no_map_is_said_in_a_line(tmp_path: Path, capsys: pytest.Capt
     def said(poses: Array, sliders: Array) -> str:
         return complaint(path, poses, sliders, capsys)
 
-    assert f"{FEWEST - 1} poses are too few for a map" in said(poses[: FEWEST - 1], sliders[: FEWEST - 1])
+    assert f"{MIN_POSES - 1} poses are too few for a map" in said(poses[: MIN_POSES - 1], sliders[: MIN_POSES - 1])
     inside = np.abs(poses[:, 0]) < 0.08
     assert re.search(
         r"x was measured from -0\.0\d+ to 0\.0\d+, and the robot goes from", said(poses[inside], sliders[inside])

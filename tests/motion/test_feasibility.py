@@ -17,7 +17,7 @@ from trirail.motion import feasibility
 from trirail.motion.feasibility import Checker, parts
 from trirail.motion.limits import Bounds
 from trirail.motion.path_sampling import survey
-from trirail.motion.paths import FOR_EVER, Path, constant
+from trirail.motion.paths import LAST_PIECE_S, Path, constant_law
 from trirail.motion.runs import stretched
 
 PERIOD = CONFIG.period
@@ -37,7 +37,7 @@ def straight() -> Path:
 
 def slower(by: float, within: float, edge: float) -> Path:
     """Return the law that takes so much off a rate of one; its change begins and ends at zero, in so short an edge."""
-    knots = np.array([0.0, edge, within - edge, within, FOR_EVER])
+    knots = np.array([0.0, edge, within - edge, within, LAST_PIECE_S])
     most = -by / (within - edge)
     s, rate, change = 0.0, 1.0, 0.0
     pieces = np.zeros((4, 1, 6))
@@ -54,9 +54,9 @@ def test_a_look_along_a_path_gives_signs_of_life_between_its_parts(knots: int, s
     beats: list[None] = []
     checker = Checker(geometry(CONFIG.geometry), LIMITS, Bounds(LIMITS, PERIOD), PERIOD, lambda: beats.append(None))
     path = Path(np.linspace(0.0, seconds, knots), np.zeros((knots - 1, 3, 6)))
-    checker.whole(path, (0.0, 0.0, 0.0))
-    assert len(beats) == len(parts(path, constant(1.0), 0.0, seconds, feasibility.KNOTS_A_PART))
-    assert len(beats) >= (knots - 2) // feasibility.KNOTS_A_PART
+    checker.worst_shares(path, (0.0, 0.0, 0.0))
+    assert len(beats) == len(parts(path, constant_law(1.0), 0.0, seconds, feasibility.KNOTS_PER_PART))
+    assert len(beats) >= (knots - 2) // feasibility.KNOTS_PER_PART
 
 
 @pytest.mark.parametrize(("share", "within_limits"), [(0.9, True), (1.5, False)])
@@ -68,11 +68,11 @@ def test_a_change_of_rate_counts_with_what_the_velocities_tell(share: float, wit
 
 
 @pytest.mark.parametrize("first", [0.0, 0.3])
-def test_a_path_that_begins_out_of_reach_leaves_it_at_once(first: float) -> None:
+def test_a_path_that_begins_out_of_reach_and_leads_farther_out_leaves_it_at_once(first: float) -> None:
     pieces = np.zeros((1, 3, 6))
     pieces[0, 0, :2] = 2.0 * LIMITS.platform.x[1], SPEED
-    found = CHECKER.sample(Path(np.array([0.0, 1.0]), pieces), constant(1.0), first, 0.9, (0.0, 0.0, 0.0))
-    assert found.leaves_at == pytest.approx(first, abs=1e-9)
+    found = CHECKER.sample(Path(np.array([0.0, 1.0]), pieces), constant_law(1.0), first, 0.9, (0.0, 0.0, 0.0))
+    assert found.leaves_at == pytest.approx(first, abs=1e-6)
     assert not found.fits
     assert not found.within_limits
 
@@ -81,7 +81,7 @@ def test_a_path_that_begins_out_of_reach_leaves_it_at_once(first: float) -> None
 def test_where_a_path_leaves_the_workspace_is_said_to_the_moment(share: float) -> None:
     pieces = np.zeros((1, 3, 6))
     pieces[0, 0, :2] = LIMITS.platform.x[1] - share * SPEED, SPEED
-    found = CHECKER.sample(Path(np.array([0.0, 1.0]), pieces), constant(1.0), 0.0, 1.0, (0.0, 0.0, 0.0))
+    found = CHECKER.sample(Path(np.array([0.0, 1.0]), pieces), constant_law(1.0), 0.0, 1.0, (0.0, 0.0, 0.0))
     assert found.leaves_at == pytest.approx(share, abs=1e-4)
 
 
@@ -98,7 +98,7 @@ def test_how_often_a_path_is_looked_at(monkeypatch: pytest.MonkeyPatch, seconds:
 
     monkeypatch.setattr(feasibility, "survey", noted)
     path = stretched(straight(), seconds)
-    found = CHECKER.sample(path, constant(1.0), 0.0, seconds, (-SPEED / 2.0, 0.0, 0.0))
+    found = CHECKER.sample(path, constant_law(1.0), 0.0, seconds, (-SPEED / 2.0, 0.0, 0.0))
     assert math.isnan(found.leaves_at)
     assert asked == [moments]
 
@@ -119,7 +119,7 @@ def test_what_a_motion_may_use_of_each_limit_while_its_rate_changes(row: int, qu
     for share, borne in ((1.0 - 1e-5, True), (1.0 + 1e-5, False)):
         worst = np.zeros((6, 3))
         worst[row, quantity] = share * CHANGES[row, quantity] / PLANS[row, quantity]
-        assert CHECKER.bears(worst) is borne
+        assert CHECKER.keeps_limits(worst) is borne
 
 
 def test_what_plans_may_use_of_the_sliders_limits() -> None:
@@ -148,7 +148,7 @@ def test_the_parts_of_a_path_follow_each_other_and_have_so_many_knots(
 ) -> None:
     path = Path(np.linspace(0.0, 1.0, pieces + 1), np.zeros((pieces, 3, 6)))
     first, until = begin / rate, end / rate
-    found = parts(path, constant(rate), first, until, knots)
+    found = parts(path, constant_law(rate), first, until, knots)
     times = [first, *(end_of_part for _, end_of_part in found)]
     assert found == list(pairwise(times))
     assert times[-1] == until

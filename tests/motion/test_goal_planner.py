@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits
-from control_rig import CONFIG, ControlRig
+from control_rig import CONFIG, ControlRig, expected_duration
 from motion.test_motion import only_from_rest
 from trirail.kinematics.geometry import Geometry
 from trirail.motion.feasibility import Checker
@@ -40,7 +40,7 @@ def test_from_a_path_that_runs_slower_than_a_twentieth_the_robot_stops_first(
     rig.command("override", override)
     accepted(rig, "g1", PoseGoal(0.1, 0.0, 0.0))
     rig.cycles(1000)
-    assert accepted(rig, "g2", PoseGoal(0.0, 0.02, 0.0)).stops_first is stops
+    assert accepted(rig, "g2", PoseGoal(0.0, 0.02, 0.0)).reply.stops_first is stops
     rig.command("override", 1.0)
     rig.until(rig.holds, 20_000)
     assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
@@ -54,7 +54,7 @@ def test_a_goal_that_stops_the_robot_first_stops_it_within_a_share_of_the_path_b
     accepted(rig, "g1", PoseGoal(0.08, 0.02, 0.3))
     rig.cycles(400)
     answer = accepted(rig, "g2", PoseGoal(-0.05, 0.05, -0.3))
-    assert answer.stops_first
+    assert answer.reply.stops_first
     begun = len(rig.rows)
     schedule = rig.control.schedule
     rig.until(lambda: len(schedule.runs) == 1)
@@ -62,7 +62,7 @@ def test_a_goal_that_stops_the_robot_first_stops_it_within_a_share_of_the_path_b
     assert 0.0 < stood[0] < 0.075
     assert stood[1] / stood[0] == pytest.approx(0.25, abs=1e-6)
     rig.until(rig.holds)
-    assert (len(rig.rows) - begun) * PERIOD == pytest.approx(answer.duration, abs=0.03)
+    assert (len(rig.rows) - begun) * PERIOD == pytest.approx(expected_duration(answer), abs=0.03)
     assert_within_limits(rig)
 
 
@@ -71,16 +71,16 @@ def test_a_robot_that_stops_first_beyond_a_waiting_goals_seam_is_still_on_its_wa
     monkeypatch: pytest.MonkeyPatch, before: int
 ) -> None:
     """It passes where the goal that waited would have begun: that ends nothing, for the goal it stops for has begun."""
-    monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest)
+    monkeypatch.setattr(GoalPlanner, "_plan_from_motion", only_from_rest)
     rig = ControlRig()
     rig.enable()
     accepted(rig, "q0", PoseGoal(0.05, 0.0, 0.0, blend=0.03))
     accepted(rig, "q1", PoseGoal(0.1, 0.05, 0.0))
     run = rig.control.schedule.runs[0]
     seam = run.seams[0].s
-    rig.until(lambda: run.at.s > seam - before * PERIOD)
-    assert accepted(rig, "g2", PoseGoal(0.0, -0.05, 0.2)).stops_first
-    rig.until(lambda: rig.control.schedule.runs[0].at.s > seam)
+    rig.until(lambda: run.law_state.s > seam - before * PERIOD)
+    assert accepted(rig, "g2", PoseGoal(0.0, -0.05, 0.2)).reply.stops_first
+    rig.until(lambda: rig.control.schedule.runs[0].law_state.s > seam)
     rig.cycles(2)
     assert rig.control.ledger.goal is not None
     assert rig.control.ledger.goal.id == "g2"
@@ -105,7 +105,7 @@ def test_a_goal_follows_from_where_the_path_comes_near_its_end_and_is_ahead(blen
     assert left <= blend + 1e-9
     if extension.s > soonest + 1e-9:
         assert left == pytest.approx(blend, abs=1e-6)
-    assert extension.slowed == 1.0
+    assert extension.reply.slowed == 1.0
 
 
 def test_behind_a_goal_at_override_zero_another_one_is_planned_at_full_speed() -> None:
@@ -114,7 +114,7 @@ def test_behind_a_goal_at_override_zero_another_one_is_planned_at_full_speed() -
     run = goals.plan(PoseGoal(0.05, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 0.0, 3).run
     assert run.target == 0.0
     behind = goals.append(PoseGoal(0.0, 0.0, 0.0), run, 0.0, 3)
-    assert behind.slowed == 1.0
+    assert behind.reply.slowed == 1.0
     assert (behind.s, behind.path.duration) == pytest.approx((run.path.duration,) * 2, abs=1e-4)
 
 
@@ -141,7 +141,7 @@ def test_where_ruckig_changes_its_profile_the_way_takes_no_more_jerk_and_hardly_
     motion = goals.plan(PoseGoal(distance, 0.0, 0.0), Schedule(rest((0.0, 0.0, 0.0)), PERIOD), 1.0, 3)
     assert np.abs(6.0 * motion.run.path.pieces[:, 0, 3]).max() == pytest.approx(JERK, rel=2e-6)
     assert motion.duration == pytest.approx(4.0 * ACCELERATION / JERK, rel=1e-3)
-    assert motion.slowed == 1.0
+    assert motion.reply.slowed == 1.0
 
 
 @pytest.mark.parametrize("far", range(3))
@@ -156,4 +156,4 @@ def test_how_near_a_pose_is_counts_the_edge_that_is_farthest_from_the_centre(far
     checker = Checker(robot, limits, bounds, PERIOD)
     planner = PathPlanner(robot, limits.platform, limits.slider, bounds, checker, PERIOD)
     reach = max(math.hypot(*leg.edge_point) for leg in robot.legs)
-    assert planner.nearness((0.03, 0.04, 0.2), (0.0, 0.0, 0.1)) == pytest.approx(0.05 + 0.1 * reach)
+    assert planner.distance((0.03, 0.04, 0.2), (0.0, 0.0, 0.1)) == pytest.approx(0.05 + 0.1 * reach)

@@ -12,6 +12,7 @@ from trirail.motion.goal_motion import GoalMotion
 from trirail.motion.goal_planner import MOTIONS
 from trirail.wire.goal_kind import GoalKind
 from trirail.wire.goals import KINDS
+from trirail.wire.packed_trajectory import PackedTrajectory
 
 GUIDE = Path(__file__).parents[2] / "service/talking.md"
 every_kind = pytest.mark.parametrize("kind", KINDS)
@@ -26,7 +27,7 @@ def tag(kind: type[GoalKind]) -> object:
 
 
 def test_the_motion_knows_every_kind_and_no_other() -> None:
-    assert set(MOTIONS) == set(KINDS)
+    assert set(MOTIONS) == {*KINDS, PackedTrajectory}
 
 
 @every_kind
@@ -49,7 +50,7 @@ def test_every_kind_can_be_named_and_can_expire_and_what_is_renewed_has_a_time_o
 def test_a_kind_is_planned_or_said_in_other_words_and_never_both(kind: type[GoalKind]) -> None:
     motion = MOTIONS[kind]
     planned = motion.plan is not GoalMotion.plan
-    other = inspect.signature(motion.meant, eval_str=True).return_annotation not in (kind, GoalKind)
+    other = inspect.signature(motion.resolve, eval_str=True).return_annotation not in (kind, GoalKind)
     assert planned != other
     assert all(type(example) is kind for example in motion.examples)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Rig, changed
 from control.test_control import GOAL, PERIOD, ROBOT, assert_within_limits
-from control_rig import CONFIG, ControlRig
+from control_rig import CONFIG, ControlRig, expected_duration
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -200,7 +200,8 @@ HAIR = 1e-6
 def at_the_gate(now: Rows, before: Rows, motion: Rows = STANDS, motion_before: Rows = STANDS) -> Violation | None:
     """Hold rows of sliders and platform against the limits, and against those of the cycle before."""
     sliders, sliders_before, platform, platform_before = map(np.array, (now, before, motion, motion_before))
-    return BOUNDS.violation(gate(BOUNDS.packed, sliders, sliders_before, platform, platform_before, BOUNDS.found))
+    code = gate(BOUNDS.packed, sliders, sliders_before, platform, platform_before, BOUNDS.last_violation)
+    return BOUNDS.violation(code)
 
 
 def rows(leg: int, **values: float) -> list[list[float]]:
@@ -226,11 +227,11 @@ def test_the_gates_slack(
 ) -> None:
     edge = sign * limit if isinstance(limit, float) else limit[sign > 0.0]
     inside, beyond = edge + sign * slack * (1.0 - HAIR), edge + sign * slack * (1.0 + HAIR)
-    assert BOUNDS.setpoint(rows(leg, **{quantity: inside})) is None
-    violation = BOUNDS.setpoint(rows(leg, **{quantity: beyond}))
+    assert BOUNDS.setpoint_violation(rows(leg, **{quantity: inside})) is None
+    violation = BOUNDS.setpoint_violation(rows(leg, **{quantity: beyond}))
     assert violation is not None
-    assert (violation.what, violation.value, violation.limit) == ("ABC"[leg], beyond, edge)
-    assert BOUNDS.setpoint(rows(leg, **{quantity: math.nan})) is not None
+    assert (violation.axis, violation.value, violation.limit) == ("ABC"[leg], beyond, edge)
+    assert BOUNDS.setpoint_violation(rows(leg, **{quantity: math.nan})) is not None
 
 
 @pytest.mark.parametrize("n", range(3))
@@ -238,14 +239,14 @@ def test_the_gates_slack(
 def test_a_limit_itself_is_within(n: int, end: int) -> None:
     exact = Bounds(LIMITS, PERIOD, 0.0)
     for name, limits in (("position", SLIDER.positions[n]), ("passive", SLIDER.passive)):
-        assert exact.setpoint(rows(n, **{name: limits[end]})) is None
-        assert exact.setpoint(rows(n, **{name: np.nextafter(limits[end], (-1.0, 1.0)[end])})) is not None
+        assert exact.setpoint_violation(rows(n, **{name: limits[end]})) is None
+        assert exact.setpoint_violation(rows(n, **{name: np.nextafter(limits[end], (-1.0, 1.0)[end])})) is not None
     pose = np.zeros(3)
     limits = (LIMITS.platform.x, LIMITS.platform.y, LIMITS.platform.phi)[n]
     pose[n] = limits[end]
-    assert exact.pose(pose) is None
+    assert exact.pose_violation(pose) is None
     pose[n] = np.nextafter(limits[end], math.copysign(9.0, end - 0.5))
-    assert exact.pose(pose) is not None
+    assert exact.pose_violation(pose) is not None
 
 
 @pytest.mark.parametrize("coordinate", range(3))
@@ -256,7 +257,7 @@ def test_the_controls_own_gate_has_the_slack_of_rounding(rig: ControlRig, coordi
     for share, refused in ((0.99, False), (1.01, True)):
         pose = np.zeros(3)
         pose[coordinate] = limits[coordinate][end] + (-1.0, 1.0)[end] * share * EDGE
-        assert (gate_of_control.pose(pose) is not None) is refused
+        assert (gate_of_control.pose_violation(pose) is not None) is refused
 
 
 @pytest.mark.parametrize("leg", range(3))
@@ -266,7 +267,7 @@ def test_the_gate_knows_how_far_a_slider_goes_in_a_cycle(leg: int) -> None:
     assert at_the_gate(rows(leg, velocity=velocity, position=velocity * PERIOD), before) is None
     violation = at_the_gate(rows(leg, velocity=velocity, position=most * (1.0 + HAIR)), before)
     assert violation is not None
-    assert (violation.what, violation.quantity) == ("ABC"[leg], "step in one cycle")
+    assert (violation.axis, violation.quantity) == ("ABC"[leg], "step in one cycle")
 
 
 @pytest.mark.parametrize("leg", range(3))
@@ -284,7 +285,7 @@ def test_the_gate_knows_jerk_by_what_each_row_tells(leg: int, sign: float) -> No
             violation = at_the_gate(now, STANDS)
             assert (violation is not None) is refused
             if violation is not None:
-                assert (violation.what, violation.quantity, violation.limit) == ("ABC"[leg], "jerk", SLIDER.jerk)
+                assert (violation.axis, violation.quantity, violation.limit) == ("ABC"[leg], "jerk", SLIDER.jerk)
     assert at_the_gate(rows(leg, acceleration=math.nan), STANDS) is not None
 
 
@@ -306,7 +307,7 @@ def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sig
             violation = at_the_gate(STANDS, STANDS, now, before)
             assert (violation is not None) is refused, (quantity, violation)
             if violation is not None:
-                assert (violation.what, violation.quantity) == (("x", "y", "phi")[n], quantity)
+                assert (violation.axis, violation.quantity) == (("x", "y", "phi")[n], quantity)
                 assert abs(violation.limit) == PLATFORM[row, n]
 
 
@@ -315,12 +316,13 @@ def test_the_gate_knows_the_platforms_velocity_acceleration_and_jerk(n: int, sig
 def test_the_gate_knows_where_the_platform_may_be(n: int, end: int) -> None:
     limit, outward = (LIMITS.platform.x, LIMITS.platform.y, LIMITS.platform.phi)[n][end], (-1.0, 1.0)[end]
     for share, refused in ((0.99, False), (1.01, True)):
-        motion = [[0.0] * 3 for _ in range(3)]
+        motion, before = ([[0.0] * 3 for _ in range(3)] for _ in range(2))
         motion[0][n] = limit + outward * share * EDGE
-        violation = at_the_gate(STANDS, STANDS, motion, motion)
+        before[0][n] = limit + outward * 0.98 * EDGE
+        violation = at_the_gate(STANDS, STANDS, motion, before)
         assert (violation is not None) is refused
         if violation is not None:
-            assert (violation.what, violation.quantity, violation.limit) == (("x", "y", "phi")[n], "position", limit)
+            assert (violation.axis, violation.quantity, violation.limit) == (("x", "y", "phi")[n], "position", limit)
 
 
 @pytest.mark.parametrize(
@@ -483,7 +485,7 @@ def test_at_override_zero_a_goal_has_no_expected_end(rig: ControlRig, goal: Goal
         blended = goal if isinstance(goal, SlidersGoal) else PoseGoal(0.05, 0.01 * number, 0.0, blend=0.01)
         answer = rig.send(f"g{number}", blended)
         assert isinstance(answer, Accepted)
-        assert answer.duration == math.inf
+        assert expected_duration(answer) == math.inf
 
 
 @pytest.mark.long
@@ -500,9 +502,9 @@ def test_a_goal_that_preempts_at_an_override_goes_on_as_the_robot_moves(
     rig.cycles(wait)
     answer = rig.goal("g2", 0.03, 0.06, 0.2)
     assert isinstance(answer, Accepted)
-    assert not answer.stops_first
+    assert not answer.reply.stops_first
     taken = rig.until(rig.holds) * PERIOD - LIMITS.in_position.dwell
-    assert taken == pytest.approx(answer.duration, rel=0.1)
+    assert taken == pytest.approx(expected_duration(answer), rel=0.1)
     assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
     assert (rig.used() <= 1.0 + BETWEEN).all()
     assert_within_limits(rig)
@@ -525,16 +527,15 @@ def test_how_far_a_trajectory_may_begin_from_where_the_robot_stands(rig: Control
     assert_within_limits(rig)
 
 
-def test_a_slider_beyond_its_travel_is_not_enabled() -> None:
+def test_a_slider_beyond_its_travel_by_more_than_can_be_measured_is_enabled_with_a_warning() -> None:
     """The pose is inside the platform's limits: it is the slider that is not."""
     low, high = 0.0, LIMITS.platform.phi[0]
     for _ in range(50):
         middle = (low + high) / 2.0
-        inside = min(sliders_at(0.0, 0.0, middle)) >= LIMITS.slider.positions[0][0] - 1e-4
+        inside = min(sliders_at(0.0, 0.0, middle)) >= LIMITS.slider.positions[0][0] - 2e-4
         low, high = (middle, high) if inside else (low, middle)
     assert abs(high) < abs(LIMITS.platform.phi[0])
     rig = ControlRig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
-    answer = refusal(rig.command("enable"))
-    assert answer.code == "out_of_workspace"
-    assert "the robot stands outside its limits: slider A: position" in answer.message
-    assert rig.mode is Mode.DISABLED
+    rig.enable()
+    (warning,) = (said.message for said in rig.notices if said.level == "warning")
+    assert "the robot stands outside its limits, only motion back is accepted: slider A: position" in warning

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import Rig
 from control.test_control import PERIOD, ROBOT, SLOW, assert_within_limits, slower
-from control_rig import CONFIG, ControlRig
+from control_rig import CONFIG, ControlRig, expected_duration
 from numpy.typing import NDArray
 from refusals import refusal
 from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
@@ -102,7 +102,7 @@ def rig() -> ControlRig:
 def test_no_later_than_ruckig_itself(rig: ControlRig, end: tuple[float, float, float]) -> None:
     rig.enable()
     answer = accepted(rig.goal("g1", *end))
-    assert answer.slowed == 1.0
+    assert answer.reply.slowed == 1.0
     taken = 1 + rig.until(rig.holds)
     dwell = CONFIG.limits.in_position.dwell
     assert taken <= math.ceil((bare((0.0, 0.0, 0.0), end) + dwell) / PERIOD) + 2
@@ -193,10 +193,12 @@ def test_slowed_is_said(rig: ControlRig) -> None:
     rig.goal("g1", 0.0, 0.0, 0.84)
     rig.until(rig.holds)
     answer = accepted(rig.goal("g2", 0.03, 0.03, 0.84))
-    assert answer.slowed > 1.05
-    assert answer.duration == pytest.approx(answer.slowed * bare((0.0, 0.0, 0.84), (0.03, 0.03, 0.84)), rel=1e-3)
+    assert answer.reply.slowed > 1.05
+    assert expected_duration(answer) == pytest.approx(
+        answer.reply.slowed * bare((0.0, 0.0, 0.84), (0.03, 0.03, 0.84)), rel=1e-3
+    )
     half = accepted(rig.goal("g3", 0.0, 0.0, 0.84, speed=0.1))
-    assert half.slowed == 1.0  # slow enough as it is
+    assert half.reply.slowed == 1.0  # slow enough as it is
 
 
 # ---------------------------------------------------------------------- a goal's own limits
@@ -311,7 +313,7 @@ def test_without_blend_the_next_goal_preempts(rig: ControlRig) -> None:
     rig.enable()
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0))
     rig.cycles(50)
-    assert not accepted(rig.send("g2", PoseGoal(0.0, 0.05, 0.0))).queued
+    assert not accepted(rig.send("g2", PoseGoal(0.0, 0.05, 0.0))).reply.queued
     assert rig.outcomes() == [("g1", "preempted")]
 
 
@@ -320,7 +322,7 @@ def test_the_queue_has_an_end(rig: ControlRig) -> None:
     depth = CONFIG.motion.queue
     for number in range(depth + 1):
         answer = accepted(rig.send(f"g{number}", PoseGoal(0.001, 0.0, 0.1 * (1 + number % 3), blend=0.0)))
-        assert answer.queued == (number > 0)
+        assert answer.reply.queued == (number > 0)
     refused = refusal(rig.send("more", PoseGoal(0.0, 0.0, 0.0)))
     assert (refused.code, refused.limit) == ("queue_full", depth)
     rig.until(rig.holds, 20_000)
@@ -479,7 +481,7 @@ def test_what_is_being_planned_does_not_begin_after_a_stop(name: str) -> None:
         assert rig.control.commanded.pose == moved
 
 
-PLAIN_SET_OUT = GoalPlanner._set_out
+PLAIN_SET_OUT = GoalPlanner._plan_from_motion
 
 
 def only_from_rest(goals: GoalPlanner, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
@@ -502,14 +504,14 @@ def test_of_two_ways_the_sooner_is_taken(
     monkeypatch: pytest.MonkeyPatch, config: Config, first: tuple[float, ...], second: tuple[float, ...]
 ) -> None:
     """From the same motion, with lower limits or after a stop: each where the other is not to be had, and then both."""
-    plain_stop_first = GoalPlanner._stop_first
+    plain_stop_first = GoalPlanner._plan_after_stop
 
     def no_stop(goals: GoalPlanner, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
         raise TOO_FAST_IN_MOTION
 
     def asked(wait: int, way: str) -> tuple[ControlRig, Answer]:
-        monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest if way == "stop" else PLAIN_SET_OUT)
-        monkeypatch.setattr(GoalPlanner, "_stop_first", no_stop if way == "lower" else plain_stop_first)
+        monkeypatch.setattr(GoalPlanner, "_plan_from_motion", only_from_rest if way == "stop" else PLAIN_SET_OUT)
+        monkeypatch.setattr(GoalPlanner, "_plan_after_stop", no_stop if way == "lower" else plain_stop_first)
         rig = ControlRig(config)
         rig.enable()
         rig.goal("g1", *first)
@@ -523,15 +525,15 @@ def test_of_two_ways_the_sooner_is_taken(
         for way in ("lower", "stop"):
             rig, answer = asked(wait, way)
             if isinstance(answer, Accepted):
-                durations[way == "stop"] = answer.duration
+                durations[way == "stop"] = expected_duration(answer)
         rig, free = asked(wait, "either")
         began = len(rig.rows)
         answer = accepted(free)
-        assert answer.duration == pytest.approx(durations[answer.stops_first], abs=thought)
-        assert answer.duration < min(durations.values()) + thought
+        assert expected_duration(answer) == pytest.approx(durations[answer.reply.stops_first], abs=thought)
+        assert expected_duration(answer) < min(durations.values()) + thought
         differing += min(durations.values()) + thought < max(durations.values())
         rig.until(rig.holds)
-        assert (len(rig.rows) - began) * PERIOD == pytest.approx(answer.duration, abs=0.03)
+        assert (len(rig.rows) - began) * PERIOD == pytest.approx(expected_duration(answer), abs=0.03)
         assert rig.outcomes() == [("g1", "preempted"), ("g2", "done")]
         assert_within_limits(rig)
     assert differing >= 3
@@ -542,14 +544,14 @@ def test_a_stop_is_kept_though_the_rate_of_the_goal_to_come_is_thought_about(
     monkeypatch: pytest.MonkeyPatch, later: int
 ) -> None:
     """The robot stops for a goal that is then to run at an override; it is told to stop as that is being looked at."""
-    monkeypatch.setattr(GoalPlanner, "_set_out", only_from_rest)
+    monkeypatch.setattr(GoalPlanner, "_plan_from_motion", only_from_rest)
     rig = ControlRig(SLOW)
     rig.enable()
     rig.goal("g1", 0.08, 0.02, 0.3)
     rig.cycles(400)
     rig.command("override", 0.7)
     rig.cycles(100)
-    assert accepted(rig.goal("g2", -0.05, 0.05, -0.3)).stops_first
+    assert accepted(rig.goal("g2", -0.05, 0.05, -0.3)).reply.stops_first
     rig.order("override", 1.5)
     schedule = rig.control.schedule
     rig.cycles(later)
@@ -596,7 +598,7 @@ def test_a_goal_that_waits_for_its_turn_is_not_done_where_another_would_have_beg
         rig.send("q0", PoseGoal(0.05, 0.02, 0.3, blend=0.01))
         rig.send("q1", PoseGoal(-0.05, 0.05, -0.3))
         run = rig.control.schedule.runs[0]
-        while run.at.s <= run.seams[0].s - before * PERIOD:
+        while run.law_state.s <= run.seams[0].s - before * PERIOD:
             rig.cycle()
         answer = accepted(rig.goal("g2", 0.0, -0.05, 0.4))
         rig.until(rig.holds)
@@ -604,4 +606,4 @@ def test_a_goal_that_waits_for_its_turn_is_not_done_where_another_would_have_beg
         assert Counter(rig.outcomes()).most_common(1)[0][1] == 1
         assert {goal_id for goal_id, _ in rig.outcomes()} == {"q0", "q1", "g2"}
         assert rig.control.commanded.pose == pytest.approx((0.0, -0.05, 0.4), abs=1e-9)
-        assert answer.duration > 0.0
+        assert expected_duration(answer) > 0.0

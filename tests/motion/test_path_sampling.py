@@ -14,9 +14,9 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 from trirail.kinematics.robot import inverse
 from trirail.motion.path_sampling import survey
-from trirail.motion.paths import Path, constant
+from trirail.motion.paths import Path, constant_law
 from trirail.motion.quintic import Point, quintic
-from trirail.motion.runs import joined, tools_of
+from trirail.motion.runs import joined, repeat_tool
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
@@ -79,10 +79,12 @@ def looked_at(path: Path, rate: float, number: int) -> Dense:
 
 def surveyed(path: Path, rate: float, box: Array = ANYWHERE, even: int = 16) -> tuple[float, Array]:
     """Return when a path is first out of reach, and the greatest rates."""
-    worst, law = np.zeros((6, 3)), constant(rate)
+    worst, law = np.zeros((6, 3)), constant_law(rate)
     start = rows_at(path, np.zeros(1))[0, 0]
     until = path.duration / rate
-    leaves_at = survey(LEGS, *path, law.knots, law.pieces, 0.0, until, even, STEP, start, box, np.ones((3, 3)), worst)
+    leaves_at = survey(
+        LEGS, *path, law.knots, law.pieces, 0.0, until, even, STEP, start, box, np.zeros(9), np.ones((3, 3)), worst
+    )
     return leaves_at, worst
 
 
@@ -91,7 +93,7 @@ def there_and_back(begin: Pose, middle: Pose, tool: tuple[float, float]) -> Path
     velocity = 0.4 * np.subtract(middle, begin)
     points = [Point(0.0, begin), Point(1.0, middle, velocity.tolist()), Point(2.0, begin)]
     path = quintic(points, begin)
-    return path._replace(tools=tools_of(tool, len(path.pieces)))
+    return path._replace(tools=repeat_tool(tool, len(path.pieces)))
 
 
 @given(POSES, POSES, POSES, TOOLS, RATES)
@@ -101,7 +103,7 @@ def test_the_greatest_rates_are_those_of_a_closer_look(
     """Of the fastest slider, the path's own point and the centre: velocity, acceleration, and jerk over a cycle."""
     assume(min(math.dist(begin, middle), math.dist(middle, end)) > 1e-3)
     path = joined([way(middle, begin), way(end, middle)])
-    path = path._replace(tools=tools_of(tool, len(path.pieces)))
+    path = path._replace(tools=repeat_tool(tool, len(path.pieces)))
     steps = math.ceil(path.duration / rate / STEP)
     expected = looked_at(path, rate, 4 * steps + 1).worst
     leaves_at, worst = surveyed(path, rate, even=64)

@@ -9,7 +9,7 @@ import pytest
 from control_rig import CONFIG
 from motion.test_runs import HERE, run_of, way
 from motion.test_time_scaling import SCALING
-from trirail.motion.feasibility import PLATFORM_PLANNED
+from trirail.motion.feasibility import PLATFORM_PLAN_SHARES
 from trirail.motion.paths import Path
 from trirail.motion.quintic import Point, quintic
 from trirail.motion.rate_change import RateChange
@@ -20,7 +20,7 @@ PERIOD = CONFIG.period
 FAR = (0.1, 0.0, 0.0)
 
 
-PLANNED = stretched(way(FAR), PLATFORM_PLANNED[2] ** (-1.0 / 3.0))
+PLANNED = stretched(way(FAR), PLATFORM_PLAN_SHARES[2] ** (-1.0 / 3.0))
 """A path that takes of the platform's limits what plans do, and no less."""
 
 
@@ -43,7 +43,7 @@ def begun(*runs: Run, cycles: int = 0) -> Schedule:
 def until_made(schedule: Schedule, change: RateChange) -> int:
     """Go on cycle by cycle until the motion has been told of its rate; return how many it took."""
     for number in range(60):
-        if change.made:
+        if change.applied:
             return number
         schedule.advance()
         change.step()
@@ -57,7 +57,7 @@ def test_a_law_that_was_not_looked_at_in_time_is_proposed_anew() -> None:
     change = RateChange(SCALING, schedule, 0.5, PERIOD)
     schedule.advance()
     change.step()
-    assert not change.made  # it takes more than a cycle to look at it
+    assert not change.applied  # it takes more than a cycle to look at it
     for _ in range(60):
         schedule.advance()
     assert until_made(schedule, change) > 0
@@ -70,7 +70,7 @@ def test_a_motion_that_has_not_begun_begins_at_the_new_rate(rate: float) -> None
     schedule = begun(first, second, cycles=50)
     change = RateChange(SCALING, schedule, rate, PERIOD)
     assert change.step()
-    assert (second.at.rate, second.target, second.at.change) == (rate, rate, 0.0)
+    assert (second.law_state.rate, second.target, second.law_state.change) == (rate, rate, 0.0)
     assert first.target == 1.0  # it stops where it is to
 
 
@@ -97,7 +97,7 @@ def test_a_stop_that_is_asked_for_again_and_again_is_no_later() -> None:
         schedule = begun(run_of(way(FAR)), cycles=250)
         change = RateChange(SCALING, schedule, 0.0, PERIOD)
         for number in range(1000):
-            if schedule.runs[0].stands:
+            if schedule.runs[0].at_rest:
                 taken.append(number)
                 break
             schedule.advance()

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 from trirail.config import geometry
 from trirail.kinematics.robot import forward, inverse
-from trirail.motion.paths import Path, constant, value
-from trirail.motion.runs import STILL, MotionState, Run, cut, from_ruckig, joined, law_from_ruckig, rest, stretched
+from trirail.motion.paths import Path, constant_law, evaluate
+from trirail.motion.runs import ZERO_RATES, MotionState, Run, cut, from_ruckig, joined, law_from_ruckig, rest, stretched
 from trirail.motion.schedule import Schedule
 
 PERIOD = CONFIG.period
@@ -55,18 +55,18 @@ def ramp(rate: float, target: float, s: float = 0.0) -> Trajectory:
 def at(path: Path, time: float) -> NDArray[np.float64]:
     """Return value, velocity and acceleration (3, d)."""
     out = np.zeros((3, path.pieces.shape[1]))
-    value(path.knots, path.pieces, time, out)
+    evaluate(path.knots, path.pieces, time, out)
     return out
 
 
 def run_of(path: Path, rate: float = 1.0) -> Run:
-    return Run(ROBOT.packed(), path, constant(rate), rate)
+    return Run(ROBOT.packed(), path, constant_law(rate), rate)
 
 
 def until_it_stands(run: Run) -> float:
     """Advance a run as a schedule does, from shortly before its end; return when it stands, in time of its law [s]."""
-    run.time = max(run.time, run.ends - 50 * PERIOD)
-    while not run.stands:
+    run.time = max(run.time, run.end_time - 50 * PERIOD)
+    while not run.at_rest:
         run.time += PERIOD
         assert run.time < 60.0
     return run.time
@@ -75,7 +75,7 @@ def until_it_stands(run: Run) -> float:
 # ---------------------------------------------------------------------- paths
 
 
-@example(HERE, STILL, STILL, HERE, 1.0)
+@example(HERE, ZERO_RATES, ZERO_RATES, HERE, 1.0)
 @given(PLACE, MOTION, MOTION, PLACE, SHARE)
 def test_a_path_is_ruckigs_trajectory(
     pose: tuple[float, float, float],
@@ -89,7 +89,7 @@ def test_a_path_is_ruckigs_trajectory(
     assert path.duration == pytest.approx(max(trajectory.duration, 1e-9))
     time = share * trajectory.duration
     assert at(path, time) == pytest.approx(np.array(trajectory.at_time(time)), abs=1e-6)
-    assert at(path, path.duration + 1.0) == pytest.approx(np.array([end, STILL, STILL]), abs=1e-7)
+    assert at(path, path.duration + 1.0) == pytest.approx(np.array([end, ZERO_RATES, ZERO_RATES]), abs=1e-7)
 
 
 @given(st.floats(0.0, 2.0), st.sampled_from([0.0, 0.3, 1.0, 2.0]), st.floats(0.0, 3.0), SHARE, st.floats(0.0, 100.0))
@@ -147,21 +147,21 @@ def test_what_a_run_tells_of_its_end_is_what_happens(
     path = way(end)
     run = run_of(path, rate)
     run.time = share * path.duration / rate
-    assert run.at == pytest.approx((share * path.duration, rate, 0.0))
+    assert run.law_state == pytest.approx((share * path.duration, rate, 0.0))
     assert run.progress == pytest.approx(share, abs=1e-9)
     assert run.remaining == pytest.approx((1.0 - share) * path.duration / rate, abs=1e-6)
     assert run.destination(HERE) == pytest.approx(end, abs=1e-7)
     pose, velocity, acceleration = run.state(0.0, HERE)
-    expected = at(path, run.at.s)
+    expected = at(path, run.law_state.s)
     assert pose == pytest.approx(expected[0], abs=1e-9)
     assert velocity == pytest.approx(rate * expected[1], abs=1e-9)
     assert acceleration == pytest.approx(rate**2 * expected[2], abs=1e-9)
-    ends = run.ends
+    ends = run.end_time
     assert until_it_stands(run) == pytest.approx(ends, abs=PERIOD)
     assert run.arrived
     assert run.progress == 1.0
     assert run.remaining == pytest.approx(0.0, abs=1e-9)
-    assert run.state(0.0, HERE).velocity == pytest.approx(STILL, abs=1e-6)
+    assert run.state(0.0, HERE).velocity == pytest.approx(ZERO_RATES, abs=1e-6)
     run.time += 7.5 * PERIOD
     assert (run.progress, run.remaining) == (1.0, 0.0)
 
@@ -173,27 +173,27 @@ def test_a_change_of_rate_ends_where_and_when_it_is_told_to(
     path = way(end)
     run = run_of(path)
     run.time = share * path.duration
-    change = law_from_ruckig(ramp(1.0, target, run.at.s), target)
+    change = law_from_ruckig(ramp(1.0, target, run.law_state.s), target)
     before = run.state(0.0, HERE)
     run.change_law(change, target)
     assert (run.time, run.target) == (0.0, target)
     assert run.state(0.0, HERE).velocity == pytest.approx(before.velocity, abs=1e-9)
     stops_at = float(at(change, 1e6)[0, 0]) if target == 0.0 else math.inf
-    for s in np.linspace(run.at.s + 1e-6, path.duration, 5).tolist():
-        when = run.reaches(s)
+    for s in np.linspace(run.law_state.s + 1e-6, path.duration, 5).tolist():
+        when = run.arrival_at(s)
         assert math.isinf(when) is (s > stops_at)
         if math.isfinite(when):
             assert at(change, when)[0, 0] == pytest.approx(s, abs=1e-9)
             assert at(change, when - 1e-4)[0, 0] <= s
     left = run.remaining
     if target == 0.0:
-        assert left == pytest.approx(path.duration - run.at.s)  # at full speed, when it goes on
+        assert left == pytest.approx(path.duration - run.law_state.s)  # at full speed, when it goes on
     else:
-        assert left == pytest.approx(run.reaches(path.duration))
-    ends = run.ends
+        assert left == pytest.approx(run.arrival_at(path.duration))
+    ends = run.end_time
     assert until_it_stands(run) == pytest.approx(ends, abs=2.0 * PERIOD)
     assert run.arrived is (stops_at >= path.duration)
-    assert run.state(0.0, HERE).velocity == pytest.approx(STILL, abs=1e-9)
+    assert run.state(0.0, HERE).velocity == pytest.approx(ZERO_RATES, abs=1e-9)
 
 
 @given(PLACE)
@@ -201,9 +201,9 @@ def test_a_run_in_slider_space_tells_the_platforms_motion(end: tuple[float, floa
     begin, sliders = inverse(ROBOT, np.array(HERE)).position, inverse(ROBOT, np.array(end)).position
     run = run_of(way(sliders.tolist(), begin.tolist(), in_sliders=True))
     near: Sequence[float] = HERE
-    while not run.stands:
+    while not run.at_rest:
         state = run.state(0.0, near)
-        expected = at(run.path, run.at.s)
+        expected = at(run.path, run.law_state.s)
         motion = inverse(ROBOT, np.array(state.pose), np.array(state.velocity), np.array(state.acceleration))
         assert motion.position == pytest.approx(expected[0], abs=1e-9)
         assert motion.velocity == pytest.approx(expected[1], abs=1e-8)
@@ -246,7 +246,7 @@ def test_goals_behind_each_other_are_told_one_after_the_other() -> None:
             assert run.destination(HERE) == pytest.approx(LINE[number], abs=1e-7)
             assert run.progress == pytest.approx(share)
             assert run.remaining == pytest.approx((1.0 - share) * (end - begin), abs=1e-6)
-            assert run.ends == pytest.approx(ends[-1])
+            assert run.end_time == pytest.approx(ends[-1])
     assert not run.seams
 
 
@@ -265,7 +265,7 @@ def test_goals_that_are_dropped_leave_those_before_them(left: int) -> None:
     assert len(run.seams) == left
     assert len(other.seams) == 2  # a copy is a run of its own
     end = at(run.path, run.path.duration)
-    assert end == pytest.approx(np.array([LINE[left], STILL, STILL]), abs=1e-7)
+    assert end == pytest.approx(np.array([LINE[left], ZERO_RATES, ZERO_RATES]), abs=1e-7)
     for time in np.linspace(0.0, [*seams][left] - 1e-9, 7):
         assert at(run.path, time) == pytest.approx(at(other.path, time), abs=1e-9)
 
@@ -280,8 +280,8 @@ def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
     first, second = run_of(way(LINE[0])), run_of(way(LINE[1], LINE[0]), 0.5)
     schedule.replace_runs(deque([first, second]))
     assert schedule.last is second
-    assert schedule.remaining == pytest.approx(first.ends + second.ends)
-    first_ends = math.ceil(first.ends / PERIOD)
+    assert schedule.remaining == pytest.approx(first.end_time + second.end_time)
+    first_ends = math.ceil(first.end_time / PERIOD)
     for cycle in range(first_ends):
         left = schedule.remaining
         assert len(schedule.runs) == 2, cycle
@@ -289,8 +289,8 @@ def test_a_schedule_goes_from_run_to_run_and_tells_how_long_it_takes() -> None:
         assert left - schedule.remaining == pytest.approx(PERIOD, abs=PERIOD)
     assert list(schedule.runs) == [second]
     assert schedule.commanded.pose == pytest.approx(LINE[0], abs=1e-6)
-    for _ in range(math.ceil(second.ends / PERIOD)):
-        assert not second.stands
+    for _ in range(math.ceil(second.end_time / PERIOD)):
+        assert not second.at_rest
         schedule.advance()
     assert list(schedule.runs) == [second]  # the last one stays, and stands
     assert schedule.commanded.pose == pytest.approx(LINE[1], abs=1e-7)
@@ -317,7 +317,7 @@ def test_a_motion_that_was_looked_ahead_for_takes_over_where_it_begins(wait: int
     later = run_of(way(LINE[2], state.pose))
     schedule.replace_runs(deque([later]))
     assert schedule.last is later
-    assert schedule.remaining == pytest.approx(later.ends)
+    assert schedule.remaining == pytest.approx(later.end_time)
     looked = schedule.ahead(50)
     for _ in range(50):
         schedule.advance()
@@ -341,7 +341,7 @@ def test_whatever_changes_the_motion_under_way_makes_it_another_version() -> Non
     for _ in range(20):
         schedule.advance()
     assert not another()
-    schedule.change_law(under_way, constant(0.5, under_way.at.s), 0.5)
+    schedule.change_law(under_way, constant_law(0.5, under_way.law_state.s), 0.5)
     assert another()
     schedule.append(schedule.runs[-1].path.duration, way(LINE[2]))
     assert another()
@@ -356,5 +356,5 @@ def test_a_schedule_tells_of_each_goal_that_ends_on_the_way() -> None:
     schedule = Schedule(rest(HERE), PERIOD)
     run, seams = chain()
     schedule.replace_runs(deque([run]))
-    passed = [cycle for cycle in range(round(run.ends / PERIOD)) if schedule.advance()]
+    passed = [cycle for cycle in range(round(run.end_time / PERIOD)) if schedule.advance()]
     assert passed == pytest.approx([seam / PERIOD for seam in seams], abs=1.0)

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from trirail.config import geometry
 from trirail.errors import RefusedError
 from trirail.kinematics.robot import forward, inverse
-from trirail.motion.feasibility import PLANNED, Checker
+from trirail.motion.feasibility import SLIDER_PLAN_SHARES, Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.path_planner import PathPlanner, Plan
-from trirail.motion.paths import Path, value
+from trirail.motion.paths import Path, evaluate
 from trirail.motion.ruckig_call import Kinodynamic
 from trirail.motion.runs import MotionState, rest
 
@@ -66,16 +66,16 @@ def to_pose(
     sliders: Sequence[float], start: Triple, target: Triple, speed: float = 1.0, own: Kinodynamic | None = None
 ) -> Pair:
     planner = planner_of(sliders)
-    plan = planner.to_pose(rest(start), target, speed, own)
+    plan = planner.plan_to_pose(rest(start), target, speed, own)
     with patch("trirail.motion.path_planner.time_optimal", return_value=None):
-        return Pair(plan, planner.to_pose(rest(start), target, speed, own))
+        return Pair(plan, planner.plan_to_pose(rest(start), target, speed, own))
 
 
 def to_sliders(sliders: Sequence[float], start: Triple, target: Triple) -> Pair:
     planner = planner_of(sliders)
-    plan = planner.to_sliders(rest(start), target)
+    plan = planner.plan_to_sliders(rest(start), target)
     with patch("trirail.motion.path_planner.time_optimal", return_value=None):
-        return Pair(plan, planner.to_sliders(rest(start), target))
+        return Pair(plan, planner.plan_to_sliders(rest(start), target))
 
 
 def positions(path: Path) -> NDArray[np.float64]:
@@ -143,13 +143,13 @@ def assert_better(pair: Pair, start: Sequence[float], end: Sequence[float]) -> N
     """The plan is the one slowed as a whole, to the last bit, or sooner there, and straight."""
     plan, uniform = pair
     if plan.path.duration == uniform.path.duration:
-        assert plan.slowed == uniform.slowed
+        assert plan.reply.slowed == uniform.reply.slowed
         assert np.array_equal(plan.path.pieces, uniform.path.pieces)
         return
     assert plan.path.duration < uniform.path.duration
-    asked = uniform.path.duration / uniform.slowed
+    asked = uniform.path.duration / uniform.reply.slowed
     assert plan.path.duration >= asked * (1.0 - 1e-9)
-    assert plan.slowed == pytest.approx(plan.path.duration / asked)
+    assert plan.reply.slowed == pytest.approx(plan.path.duration / asked)
     assert_straight(plan.path)
     assert_joined(plan.path, start, end)
 
@@ -159,7 +159,7 @@ def assert_better(pair: Pair, start: Sequence[float], end: Sequence[float]) -> N
 def test_any_sliders(start: Triple, end: Triple, sliders: Triple, speed: float) -> None:
     pair = to_pose(sliders, start, end, speed)
     assert_better(pair, start, end)
-    assert pair.plan.slowed >= 1.0 - 1e-12
+    assert pair.plan.reply.slowed >= 1.0 - 1e-12
     if pair.plan.path.duration < pair.uniform.path.duration:
         assert_within(pair.plan.path, sliders)
 
@@ -195,15 +195,15 @@ def test_a_way_comes_close_to_the_limit_that_is_nearest(sliders: Triple, end: Tr
     plan, uniform = to_pose(sliders, (0.0, 0.0, 0.0), end)
     assert plan.path.duration < uniform.path.duration
     of_sliders, _ = greatest(plan.path)
-    assert (of_sliders / sliders).max() > 0.995 * PLANNED[0]
+    assert (of_sliders / sliders).max() > 0.995 * SLIDER_PLAN_SHARES[0]
 
 
 def test_what_fits_stays_ruckigs() -> None:
     """To the last bit, whatever the way by which others are made sooner."""
     start, end = (0.0, 0.0, 0.0), (0.03, -0.02, 0.1)
     with patch("trirail.motion.path_planner.time_optimal", side_effect=AssertionError):
-        plan = planner_of((1.0, 15.0, 400.0)).to_pose(rest(start), end)
-    assert plan.slowed == 1.0
+        plan = planner_of((1.0, 15.0, 400.0)).plan_to_pose(rest(start), end)
+    assert plan.reply.slowed == 1.0
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-12, 1e-8, 1e-6, 1e-4, 1e-2])
@@ -233,15 +233,15 @@ def test_a_goals_own_limits_are_kept(share: float) -> None:
 def test_another_goal_on_the_way(start: Triple, end: Triple, then: Triple, share: float) -> None:
     """What begins in motion begins with that motion, or is refused: then the robot stops first."""
     planner = planner_of(WEAK)
-    path = planner.to_pose(rest(start), end).path
+    path = planner.plan_to_pose(rest(start), end).path
     out = np.zeros((3, 3))
-    value(path.knots, path.pieces, share * path.duration, out)
+    evaluate(path.knots, path.pieces, share * path.duration, out)
     state = MotionState(*out.tolist())
     try:
-        plan = planner.to_pose(state, then)
+        plan = planner.plan_to_pose(state, then)
     except RefusedError:
         return
-    value(plan.path.knots, plan.path.pieces, 0.0, out)
+    evaluate(plan.path.knots, plan.path.pieces, 0.0, out)
     assert out == pytest.approx(np.array(state), abs=1e-9)
     assert plan.path.end == pytest.approx(then, abs=1e-7)
 

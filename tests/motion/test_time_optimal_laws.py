@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Trajectory
-from trirail.motion.time_optimal import minimise_time, spline_states, too_fast
+from trirail.motion.time_optimal import limit_excess, minimise_time, spline_states
 
 Array = NDArray[np.float64]
 Limits = tuple[float, float, float]
@@ -60,10 +60,10 @@ def smooth() -> Array:
 def fastest(coordinates: list[Array], limits: list[Limits]) -> tuple[float, Array, Array]:
     """Return how long the fastest law takes [s], its coefficients, and the samples of the line (65, m, 2)."""
     samples, rows, law = np.stack(coordinates, axis=1), np.array(limits), smooth()
-    step = 1.01 * too_fast(samples, rows, law, 1.0 / INTERVALS) / INTERVALS
+    step = 1.01 * limit_excess(samples, rows, law, 1.0 / INTERVALS) / INTERVALS
     step = minimise_time(samples, rows, law, step)
-    assert too_fast(samples, rows, law, step) == pytest.approx(1.0, abs=1e-3)
-    assert too_fast(samples, rows, law, step) < 1.0
+    assert limit_excess(samples, rows, law, step) == pytest.approx(1.0, abs=1e-3)
+    assert limit_excess(samples, rows, law, step) < 1.0
     return step * INTERVALS, law, samples
 
 
@@ -151,4 +151,4 @@ def test_how_many_times_too_fast_a_law_is_by_polynomials(
         for order, limit in enumerate(limits, start=1):
             values = x.deriv(order)(np.array([0.0, h / 2.0, h]))
             most = max(most, float(np.abs(values).max() / limit) ** (1.0 / order))
-    assert too_fast(samples, np.array([limits]), c, h) == pytest.approx(most, rel=1e-6)
+    assert limit_excess(samples, np.array([limits]), c, h) == pytest.approx(most, rel=1e-6)

@@ -12,16 +12,16 @@ from control_rig import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from motion.test_runs import FAR, HERE, ROBOT, at, run_of, way
-from trirail.motion.feasibility import PLATFORM_LAWS, PLATFORM_PLANNED, Checker
+from trirail.motion.feasibility import PLATFORM_LAW_SHARES, PLATFORM_PLAN_SHARES, Checker
 from trirail.motion.limits import Bounds
-from trirail.motion.paths import Path, constant, falls
-from trirail.motion.runs import Rate, stretched
-from trirail.motion.time_scaling import SHARES, TimeScaling
+from trirail.motion.paths import Path, constant_law, law_falls
+from trirail.motion.runs import LawState, stretched
+from trirail.motion.time_scaling import CHANGE_SHARES, TimeScaling
 
 PERIOD = CONFIG.period
 LIMITS = CONFIG.limits
 SCALING = TimeScaling(ROBOT, Checker(ROBOT, LIMITS, Bounds(LIMITS, PERIOD), PERIOD), PERIOD)
-OF_VELOCITY, OF_ACCELERATION, OF_JERK = PLATFORM_LAWS
+OF_VELOCITY, OF_ACCELERATION, OF_JERK = PLATFORM_LAW_SHARES
 CHANGE = (
     OF_ACCELERATION
     / OF_VELOCITY
@@ -40,7 +40,7 @@ def braking(by: float, most: float, jerk: float) -> float:
 
 @given(RATE, RATE, SHARE)
 def test_a_rate_changes_as_quickly_as_a_motion_at_full_speed_may(rate: float, target: float, share: float) -> None:
-    law = SCALING.ramp(Rate(0.3, rate, 0.0), target, share)
+    law = SCALING.ramp(LawState(0.3, rate, 0.0), target, share)
     assert law is not None
     ends = float(law.knots[-2])
     assert ends == pytest.approx(braking(abs(target - rate), share * CHANGE, share * JERK), abs=1e-6)
@@ -55,8 +55,8 @@ def test_to_raise_a_rate_takes_as_long_as_to_lower_it(by: float, changing: float
     """Also where it is changing already, faster than this share would have it: if it does not fall to zero by that."""
     change = changing * CHANGE
     assume(1.0 + by / 2.0 - change**2 / (2.0 * share * JERK) > 0.0)
-    up = SCALING.ramp(Rate(0.0, 1.0 - by / 2.0, change), 1.0 + by / 2.0, share)
-    down = SCALING.ramp(Rate(0.0, 1.0 + by / 2.0, -change), 1.0 - by / 2.0, share)
+    up = SCALING.ramp(LawState(0.0, 1.0 - by / 2.0, change), 1.0 + by / 2.0, share)
+    down = SCALING.ramp(LawState(0.0, 1.0 + by / 2.0, -change), 1.0 - by / 2.0, share)
     assert up is not None
     assert down is not None
     assert up.knots[-2] == pytest.approx(down.knots[-2], abs=1e-6)
@@ -70,7 +70,7 @@ def test_the_coordinate_that_can_brake_least_decides(coordinate: int, quantity: 
     platform = msgspec.structs.replace(LIMITS.platform, **{quantity: tuple(weaker)})
     limits = msgspec.structs.replace(LIMITS, platform=platform)
     scaling = TimeScaling(ROBOT, Checker(ROBOT, limits, Bounds(limits, PERIOD), PERIOD), PERIOD)
-    law = scaling.ramp(Rate(0.0, 1.0, 0.0), 0.0, 1.0)
+    law = scaling.ramp(LawState(0.0, 1.0, 0.0), 0.0, 1.0)
     assert law is not None
     most = (
         OF_ACCELERATION
@@ -88,9 +88,9 @@ def test_a_law_is_looked_at_until_it_changes_no_more(
 ) -> None:
     run = run_of(way(end))
     run.time = over * run.path.duration
-    law = SCALING.ramp(run.at, target, share)
+    law = SCALING.ramp(run.law_state, target, share)
     assert law is not None
-    until = SCALING.until(run, law, target)
+    until = SCALING.last_new_time(run, law, target)
     s, rate, change = at(law, until)[:, 0]
     assert s == pytest.approx(run.path.duration) or (rate, change) == pytest.approx((target, 0.0), abs=1e-9)
     assert until <= law.knots[-2] + PERIOD
@@ -100,25 +100,25 @@ def test_a_law_is_looked_at_until_it_changes_no_more(
 def test_a_path_runs_at_the_rate_at_which_it_meets_a_limit_and_no_faster(slower: float, rate: float) -> None:
     """On this one, stretched, it is the platform's jerk along x, of which plans use a share."""
     path = stretched(way((0.1, 0.0, 0.0)), slower)
-    run = SCALING.begin(path, rate, HERE)
+    run = SCALING.start_run(path, rate, HERE)
     assert (
         run.target
-        == run.at.rate
-        == pytest.approx(min(rate, max(1.0, slower * PLATFORM_PLANNED[2] ** (1 / 3))), rel=1e-5)
+        == run.law_state.rate
+        == pytest.approx(min(rate, max(1.0, slower * PLATFORM_PLAN_SHARES[2] ** (1 / 3))), rel=1e-5)
     )
 
 
 @pytest.mark.parametrize("over", [0.45, 0.5, 0.55])
 def test_the_first_stop_that_fits_is_taken_and_ends_at_rest(over: float) -> None:
-    run = run_of(stretched(way((0.1, 0.0, 0.0)), PLATFORM_PLANNED[2] ** (-1 / 3)))  # it takes what plans may
+    run = run_of(stretched(way((0.1, 0.0, 0.0)), PLATFORM_PLAN_SHARES[2] ** (-1 / 3)))  # it takes what plans may
     run.time = over * run.path.duration
-    quickest = SCALING.ramp(run.at, 0.0, 1.0)
+    quickest = SCALING.ramp(run.law_state, 0.0, 1.0)
     law = SCALING.stop(run, HERE, (1.0, 0.5, 0.25))
     assert quickest is not None
     assert law is not None
     assert at(law, 1e3)[1:, 0] == pytest.approx((0.0, 0.0), abs=1e-9)
     run.change_law(law, 0.0)
-    assert run.ends >= float(quickest.knots[-2]) - 1e-9
+    assert run.end_time >= float(quickest.knots[-2]) - 1e-9
 
 
 # ---------------------------------------------------------------------- time along a path never runs backwards
@@ -139,19 +139,19 @@ def fall(law: Path) -> float:
     return float((np.maximum.accumulate(s) - s).max())
 
 
-@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("share", CHANGE_SHARES)
 def test_whatever_a_law_begins_with_its_time_never_falls(share: float) -> None:
     """Over all states of a law: where it begins, its rate, the change of that, where to and at which share."""
     lawful = 0
     for s, rate, change, target in itertools.product(STARTS, RATES, np.linspace(-1.0, 1.0, 9) * CHANGE, TARGETS):
-        law = SCALING.ramp(Rate(s, rate, float(change)), target, share)
+        law = SCALING.ramp(LawState(s, rate, float(change)), target, share)
         unavoidable = rate - min(change, 0.0) ** 2 / (2.0 * share * JERK)
         if law is None:
             assert unavoidable < 1e-9, (s, rate, change, target)
             continue
         lawful += 1
         assert unavoidable > -1e-6
-        assert not falls(law.knots, law.pieces)
+        assert not law_falls(law.knots, law.pieces)
         assert float(law.pieces[0, 0, 0]) == s
         assert float(law.pieces[-1, 0, 1]) == target
     assert lawful > 400
@@ -174,10 +174,10 @@ def test_falling_is_told_as_dense_looks_tell_it(pieces: list[tuple[float, int]],
     law = Path(np.array(knots), np.array(rows)[:, None, :])
     by = fall(law)
     assume(not 1e-14 < by < 1e-10)  # rounding decides
-    assert falls(law.knots, law.pieces) == (by > 1e-12)
+    assert law_falls(law.knots, law.pieces) == (by > 1e-12)
 
 
 def test_a_law_of_a_higher_power_is_none() -> None:
-    law = constant(1.0)
+    law = constant_law(1.0)
     law.pieces[0, 0, 4] = 1e-3
-    assert falls(law.knots, law.pieces)
+    assert law_falls(law.knots, law.pieces)

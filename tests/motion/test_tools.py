@@ -16,13 +16,13 @@ from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.robot import forward
 from trirail.motion.goal_planner import GoalPlanner
-from trirail.motion.limits import EXCESS
+from trirail.motion.limits import MAX_RELATIVE_EXCESS
 from trirail.motion.packing import pack_path, unpack_path
 from trirail.motion.paths import Path, path_motion
-from trirail.motion.runs import MotionState, of_centre, of_tool, rest
+from trirail.motion.runs import MotionState, centre_motion, rest, tool_motion
 from trirail.motion.schedule import Schedule
 from trirail.wire.goals import OwnLimits, PoseGoal, VelocityGoal
-from trirail.wire.packets import Accepted
+from trirail.wire.packets import Accepted, Refused
 
 Tool = tuple[float, float]
 Pose = tuple[float, float, float]
@@ -58,7 +58,7 @@ def at(pose: Pose, tool: Tool) -> Pose:
 def planned(goals: GoalPlanner, begin: Pose, goal: PoseGoal) -> NDArray[np.float64]:
     """The poses of every cycle from rest to a goal, and of some cycles before and after."""
     run = goals.plan(goal, Schedule(rest(begin), PERIOD), 1.0, 3).run
-    cycles = range(-3, math.ceil(run.ends / PERIOD) + 3)
+    cycles = range(-3, math.ceil(run.end_time / PERIOD) + 3)
     return np.array([run.state(cycle * PERIOD, begin).pose for cycle in cycles])
 
 
@@ -94,7 +94,7 @@ def test_a_point_moves_as_the_rigid_body_does(motion: tuple[Pose, Pose, Pose], t
     p, v, a = np.array(motion)
     t = np.array([-h, 0.0, h])[:, None]
     before, now, after = point(p + v * t + a * t**2 / 2.0, tool)
-    pose, velocity, acceleration = of_tool(MotionState(*motion), tool)
+    pose, velocity, acceleration = tool_motion(MotionState(*motion), tool)
     assert pose[:2] == pytest.approx(now.tolist(), abs=1e-15)
     assert velocity[:2] == pytest.approx(((after - before) / (2.0 * h)).tolist(), abs=1e-8)
     assert acceleration[:2] == pytest.approx(((after - 2.0 * now + before) / h**2).tolist(), abs=1e-7)
@@ -103,7 +103,7 @@ def test_a_point_moves_as_the_rigid_body_does(motion: tuple[Pose, Pose, Pose], t
 
 @given(st.tuples(POSES, POSES, POSES), TOOLS)
 def test_from_the_centre_to_a_point_and_back(motion: tuple[Pose, Pose, Pose], tool: Tool) -> None:
-    for row, back in zip(motion, of_centre(of_tool(MotionState(*motion), tool), tool), strict=True):
+    for row, back in zip(motion, centre_motion(tool_motion(MotionState(*motion), tool), tool), strict=True):
         assert back == pytest.approx(row, abs=1e-15)
 
 
@@ -210,7 +210,7 @@ def test_a_jog_of_a_far_tool_is_as_slow_as_the_centre_has_to_be(rig: ControlRig)
     rate = 0.9 * CONFIG.limits.platform.velocity[2]
     answer = rig.send("j1", VelocityGoal(0.0, 0.0, rate, timeout=0.1, tool=(0.5, 0.0)))
     assert isinstance(answer, Accepted)
-    assert answer.slowed > 1.1
+    assert answer.reply.slowed > 1.1
     rig.cycles(200)
     assert_platform_within_limits(setpoints(rig, begun), (0.0, 0.0))
 
@@ -256,10 +256,12 @@ def assert_continuous(found: list[MotionState]) -> None:
     """Position, velocity and acceleration of the centre go on as their derivatives say, within the platform's jerk."""
     limits = CONFIG.limits.platform
     rows = np.array(found)
-    jerk = np.array(limits.jerk) * (1.0 + EXCESS) * PERIOD
+    jerk = np.array(limits.jerk) * (1.0 + MAX_RELATIVE_EXCESS) * PERIOD
     between = (rows[1:, 1] + rows[:-1, 1]) / 2.0 * PERIOD
     assert (np.abs(np.diff(rows[:, 0], axis=0) - between) <= jerk * PERIOD**2).all()
-    assert (np.abs(np.diff(rows[:, 1], axis=0)) <= np.array(limits.acceleration) * (1.0 + EXCESS) * PERIOD).all()
+    assert (
+        np.abs(np.diff(rows[:, 1], axis=0)) <= np.array(limits.acceleration) * (1.0 + MAX_RELATIVE_EXCESS) * PERIOD
+    ).all()
     assert (np.abs(np.diff(rows[:, 2], axis=0)) <= jerk).all()
 
 
@@ -305,3 +307,32 @@ def test_from_tool_to_tool_in_motion_nothing_jumps(
 def test_a_coordinate_that_hardly_moves_bounds_nothing(goals: dict[bool, GoalPlanner]) -> None:
     poses = planned(goals[False], (0.0, 0.0, 0.0), PoseGoal(1e-310, 0.05, -1e-200))
     assert poses[-1] == pytest.approx((0.0, 0.05, 0.0), abs=NANOMETRE)
+
+
+@pytest.mark.parametrize("arm", [0.1, 0.3, 0.5])
+def test_a_jog_about_a_tool_reaches_the_velocity_that_limits_allow(rig: ControlRig, arm: float) -> None:
+    """Only the ramp has too much jerk for the sliders: it is softer, the velocity stays."""
+    rig.enable()
+    asked = 0.3 * rig.config.limits.platform.velocity[2]
+    answer = rig.send("turn", VelocityGoal(0.0, 0.0, asked, timeout=0.3, tool=(arm, 0.0)))
+    assert isinstance(answer, Accepted)
+    assert answer.reply.slowed == 1.0
+    fastest = 0.0
+    while not rig.holds():
+        rig.cycle()
+        fastest = max(fastest, rig.control.commanded.velocity[2])
+    assert fastest == pytest.approx(asked)
+    assert rig.control.fault is None
+    assert_within_limits(rig)
+
+
+def test_a_jog_that_cannot_move_is_refused_with_the_limit(rig: ControlRig) -> None:
+    rig.enable()
+    rig.goal("there", rig.config.limits.platform.x[1], 0.0, 0.0)
+    rig.until(rig.holds)
+    answer = rig.send("out", VelocityGoal(0.02, 0.0, 0.0, timeout=0.1))
+    assert isinstance(answer, Refused)
+    assert answer.code == "out_of_workspace"
+    assert "limit of platform x (position 150 mm)" in answer.message
+    assert rig.holds()
+    assert isinstance(rig.send("in", VelocityGoal(-0.02, 0.0, 0.0, timeout=0.1)), Accepted)

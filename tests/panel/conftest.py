@@ -6,15 +6,45 @@ from collections.abc import Iterator
 
 import pytest
 from chromium import Page, chromium
+from panel.fake_robot import FakeRobot
 from trirail.client import held_jog
 from trirail.panel import orders, tab
 from trirail.panel.server import Panel
+
+SHOWN = "document.body.dataset.contact === 'yes'"
 
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     with chromium("chromium", tmp_path_factory.mktemp("profile"), ["--disable-gpu"]) as page:
         yield page
+
+
+@pytest.fixture
+def robot() -> FakeRobot:
+    return FakeRobot()
+
+
+@pytest.fixture
+def panel(robot: FakeRobot) -> Iterator[Panel]:
+    with Panel(robot.robot()) as panel:
+        yield panel
+
+
+@pytest.fixture
+def page(browser: Page, panel: Panel) -> Iterator[Page]:
+    page = browser.another()
+    page.open(panel.url)
+    page.until(SHOWN)
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def enabled(page: Page, robot: FakeRobot) -> Page:
+    page.click("[data-command=enable]")
+    page.until("document.querySelector('#mode-name').textContent === 'holding'")
+    return page
 
 
 @pytest.fixture

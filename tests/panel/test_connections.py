@@ -174,7 +174,8 @@ def _opens(url: str) -> bool:
 @pytest.mark.parametrize("name", ["stop", "goto"])
 def test_commands_that_nobody_answers_are_bounded_and_hinder_no_stop(name: str) -> None:
     robot = FakeRobot()
-    ask = {"stop": '{"do": "command", "name": "stop"}', "goto": '{"do": "goto", "name": "park"}'}[name]
+    goto = '{"do": "goal", "goal": {"kind": "named", "name": "park"}}'
+    ask = {"stop": '{"do": "command", "name": "stop"}', "goto": goto}[name]
     with Panel(robot.robot(), 0) as inside, connect(f"{inside.url.replace('http', 'ws')}socket", legacy=True) as tab:
         with robot.hanging({"stop": "stop", "goto": "goal"}[name]):
             for _ in range(3 * UNDER_WAY):
@@ -188,5 +189,5 @@ def test_commands_that_nobody_answers_are_bounded_and_hinder_no_stop(name: str) 
         answered = 0
         while answered < UNDER_WAY:
             said = str(tab.recv(PATIENCE))
-            answered += '"done","to":"stop"' in said or '"accepted","to":"goto"' in said
+            answered += '"done","to":"stop"' in said or '"accepted","to":"named"' in said
     assert len(robot.gone_to) == (UNDER_WAY if name == "goto" else 0)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import http.client
 import logging
+import os
 import re
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -18,8 +21,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.errors import ServiceError
-from trirail.panel.guard import refused
-from trirail.panel.server import LONGEST, Panel
+from trirail.panel.recordings import Recordings
+from trirail.panel.server import LONGEST, Panel, refused
 from waiting import WITHIN
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -122,6 +125,29 @@ def test_only_the_page_s_own_files_are_served(panel: Panel) -> None:
         assert answer.status == (200 if asked == "?x" else 404)
 
 
+def test_regular_files_of_the_folder_of_recordings_are_sent_and_nothing_that_leads_elsewhere(tmp_path: Path) -> None:
+    folder, secret = tmp_path / "recordings", tmp_path / "secret.rrd"
+    folder.mkdir()
+    secret.write_bytes(b"secret")
+    (folder / "own.rrd").write_bytes(b"own")
+    (folder / "link.rrd").symlink_to(secret)
+    (folder / "near.rrd").symlink_to("own.rrd")
+    (folder / "loop.rrd").symlink_to("loop.rrd")
+    (folder / "folder.rrd").mkdir()
+    os.mkfifo(folder / "fifo.rrd")
+
+    def sent(name: str) -> bytes:
+        here, browser = socket.socketpair()
+        with browser:
+            with here:
+                opened: Any = SimpleNamespace(socket=here)
+                Recordings("demo", str(folder)).send_file(opened, name, {})
+            return browser.makefile("rb").read()
+
+    assert sent("own.rrd").endswith(b"\r\n\r\nown")
+    assert {sent(f"{name}.rrd") for name in ("link", "near", "loop", "folder", "fifo", "none")} == {b""}
+
+
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])
 def test_no_other_page_opens_the_socket(panel: Panel, origin: str) -> None:
     with pytest.raises(InvalidStatus) as refusal, connect(socket_of(panel), origin=Origin(origin), legacy=True):
@@ -169,7 +195,12 @@ def test_a_port_that_is_taken_is_told() -> None:
         b'{"do": "hold", "velocity": [NaN, 0, 0], "seen": 1}',
         b'{"do": "hold", "velocity": [1e9, 0, 0], "seen": 1}',
         b'{"do": "command", "name": "reboot"}',
+        b'{"do": "goal", "goal": {"kind": "pose", "x": NaN, "y": 0, "phi": 0}}',
+        b'{"do": "goal", "goal": {"kind": "velocity", "x": 0.01, "y": 0, "phi": 0}}',
         b'{"do": "seen", "stamp": "x"}',
+        b'{"do": "command", "name": "stop", "name": "enable"}',
+        b'{"do": "command", "name": "stop", "n\\u0061me": "enable"}',
+        b'{"do": "release", "do": "release"}',
     ],
 )
 def test_what_is_no_message_is_refused_and_the_tab_goes_on(panel: Panel, message: bytes) -> None:

@@ -6,11 +6,12 @@ import itertools
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from chromium import Page, needs_chromium
+from panel.conftest import SHOWN
 from panel.fake_robot import FakeRobot
 from trirail.client.held_jog import TIMEOUT
 from trirail.errors import RefusalCode, RefusedError
@@ -19,35 +20,7 @@ from waiting import WITHIN
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
 
-SHOWN = "document.body.dataset.contact === 'yes'"
 SIZES = {"desk": (1280, 800, False), "phone": (390, 844, True), "small phone": (375, 667, True)}
-
-
-@pytest.fixture
-def robot() -> FakeRobot:
-    return FakeRobot()
-
-
-@pytest.fixture
-def panel(robot: FakeRobot) -> Iterator[Panel]:
-    with Panel(robot.robot()) as panel:
-        yield panel
-
-
-@pytest.fixture
-def page(browser: Page, panel: Panel) -> Iterator[Page]:
-    page = browser.another()
-    page.open(panel.url)
-    page.until(SHOWN)
-    yield page
-    page.close()
-
-
-@pytest.fixture
-def enabled(page: Page, robot: FakeRobot) -> Page:
-    page.click("[data-command=enable]")
-    page.until("document.querySelector('#mode-name').textContent === 'holding'")
-    return page
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
@@ -305,15 +278,15 @@ def test_named_poses_are_buttons_that_come_and_go_with_them(enabled: Page, robot
     robot.named["pick"] = (0.0, 0.0, 0.0)
     robot.say("pose pick taught by bob", kind="pose")
     enabled.until(f'{names} === \'["park","pick"]\'')
-    enabled.click("#poses button:last-child")
-    enabled.until("document.querySelector('#answer').textContent === 'go to pick: on its way'")
+    enabled.click("[data-pose=pick]")
+    enabled.until("document.querySelector('#answer').textContent === 'go to pick: arrived'")
     assert robot.gone_to == ["pick"]
     assert set(robot.named) == {"park", "pick"}
     robot.named.clear()  # and nobody is told
-    enabled.click("#poses button:first-child")
+    enabled.click("[data-pose=park]")
     enabled.until("document.querySelector('#answer').textContent === \"go to park: no pose 'park'\"")
     robot.say("pose park removed by bob", kind="pose")
-    enabled.until("document.querySelector('#poses').childElementCount === 0")
+    enabled.until("!document.querySelector('#poses button')")
     robot.named["<b>"] = (0.0, 0.0, 0.0)  # whatever a service says, it is a name and no page
     robot.say("pose <b> taught by bob", kind="pose")
     enabled.until(f"{names} === '[\"<b>\"]'")
@@ -329,11 +302,10 @@ def test_the_last_alignment_is_shown_with_what_each_mark_had_to_go(page: Page, r
 
     shown = "document.querySelector('#alignment').innerText"
     button = "document.querySelector('[data-view=alignment]')"
-    assert page.evaluate(f"{button}.hidden")
+    assert page.evaluate(f"{button}.disabled")
     told(1, {"left": 4.123e-4, "<b>": 1e-4}, correction=(1e-4, 0.0, 0.0))
-    page.until(f"{button}.innerText === 'Alignment: …'")
+    page.until(f"!{button}.disabled")
     told(2, {"left": 3.1e-7, "<b>": 2e-7}, end="reached", seconds=0.25)
-    page.until(f"{button}.innerText === 'Alignment: reached'")
     page.click("[data-view=alignment]")
     for words in ("align-1 of bob", "reached in 0.25 s, corrections: 1", "look 2", "412.3 µm", "0.31 µm", "<b>"):
         assert words in page.evaluate(shown), words
@@ -343,7 +315,7 @@ def test_the_last_alignment_is_shown_with_what_each_mark_had_to_go(page: Page, r
     later = page.another()
     later.open(panel.url)
     later.until("document.querySelector('#alignment').innerText !== ''")
-    later.until(f"{button}.innerText === 'Check: …'")
+    later.until("document.querySelector('#alignment').textContent.includes('Check')")
     later.close()
 
 
@@ -392,10 +364,10 @@ def test_a_pose_that_is_typed_is_checked_and_gone_to_when_told(
     before = robot.pose
     typed(enabled, *words)
     enabled.until("document.querySelector('#going').dataset.may === 'yes'")
-    assert enabled.text("#going-says") == "nothing is in the way"
+    assert enabled.text("#going-says") == "within limits"
     assert robot.pose == before
     enabled.click("#go")
-    enabled.until("document.querySelector('#answer').textContent === 'go there: on its way'")
+    enabled.until("document.querySelector('#answer').textContent === 'go there: arrived'")
     assert robot.pose == pytest.approx(pose, abs=1e-12)
 
 
@@ -456,6 +428,9 @@ def test_a_place_is_kept_and_forgotten_by_its_name(enabled: Page, robot: FakeRob
     enabled.until("document.querySelector('#poses').innerText.includes('pick')")
     assert robot.named["pick"] == robot.pose
     enabled.until("!document.querySelector('#forget').disabled")
+    enabled.click("#forget")
+    enabled.until("document.querySelector('#forget').innerText === 'Sure?'")
+    time.sleep(0.6)  # a double click is no answer
     enabled.click("#forget")
     enabled.until("!document.querySelector('#poses').innerText.includes('pick')")
     enabled.write("#pose-name", "park")  # of the configuration

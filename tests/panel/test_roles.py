@@ -29,12 +29,12 @@ MAY: dict[Role | None, set[str]] = {
 PATH = "t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
 ACTIONS: list[tuple[str, dict[str, Any]]] = [
     *((name, {"do": "command", "name": name}) for name in Command if name is not Command.OVERRIDE),
-    ("override", {"do": "override", "percent": 50.0}),
+    ("override", {"do": "command", "name": "override", "content": {"percent": 50.0}}),
     ("takeover", {"do": "takeover"}),
     ("goal", {"do": "hold", "velocity": [0.01, 0.0, 0.0], "seen": 10**15}),
-    ("goal", {"do": "step", "by": [0.001, 0.0, 0.0], "seen": 10**15}),
-    ("goal", {"do": "goto", "name": "park"}),
-    ("goal", {"do": "pose", "pose": [0.0, 0.0, 0.0]}),
+    ("goal", {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
+    ("goal", {"do": "goal", "goal": {"kind": "named", "name": "park"}}),
+    ("goal", {"do": "goal", "goal": {"kind": "pose", "x": 0.0, "y": 0.0, "phi": 0.0}}),
     ("goal", {"do": "follow", "name": "path.csv", "text": PATH}),
     ("poses", {"do": "teach", "name": "here"}),
     ("poses", {"do": "forget", "name": "park"}),

@@ -9,11 +9,13 @@ from conftest import Rig
 from hypothesis import given
 from refusals import refused_as
 from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.gateway import ROUTES
 from trirail.processes.incoming import Incoming
 from trirail.processes.requests import LOOKS, LOOKS_PER_SECOND, Looks
 from trirail.wire import boundary
 from trirail.wire.looks import WELL, AlignmentLook, in_words
-from trirail.wire.packets import Looked
+from trirail.wire.messages import Notice
+from trirail.wire.packets import Announcement
 from trirail.wire.text import printable
 from wire.looks import LARGEST, looks
 
@@ -21,18 +23,20 @@ from wire.looks import LARGEST, looks
 class Asked:
     def __init__(self) -> None:
         self.now = 0.0
-        self.sent: list[Looked] = []
+        self.sent: list[Notice] = []
         self.room = True
-        self.looks = Looks("demo", self._send, lambda: self.now)
+        self.looks = Looks(self._send, lambda: self.now)
 
-    def _send(self, looked: Looked) -> bool:
+    def _send(self, notice: Notice) -> bool:
         if self.room:
-            self.sent.append(looked)
+            self.sent.append(notice)
         return self.room
 
     def take(self, look: AlignmentLook, key: str = "trirail/demo/alignment/ann") -> AlignmentLook:
         content = boundary.encode(look)
-        return self.looks.forward(Incoming("alignment", key, len(content), content, "", None, time.monotonic_ns()))
+        incoming = Incoming("alignment", key, len(content), content, "", None, time.monotonic_ns())
+        _, (user,), sent = ROUTES["alignment"].read(incoming, "demo")
+        return self.looks.forward(user, sent)
 
 
 @given(looks)
@@ -41,8 +45,8 @@ def test_a_look_is_passed_on_in_a_line_that_a_terminal_shows(look: AlignmentLook
     taken = asked.take(look)
     (sent,) = asked.sent
     assert sent.user == "ann"
-    assert sent.look == taken
-    assert sent.look.marks == look.marks
+    assert sent.alignment == taken
+    assert taken.marks == look.marks
     assert sent.level == ("info" if look.end in WELL else "warning")
     assert sent.message == printable(sent.message)
     for words in (look.id, look.purpose, look.end or ""):
@@ -84,7 +88,7 @@ def test_a_key_that_names_nobody_is_refused(key: str) -> None:
 
 
 def test_it_is_told_to_everyone(rig: Rig) -> None:
-    rig.cycle(Looked("ann", "warning", "so it looked", LOOK))
+    rig.cycle(Announcement(Notice("alignment", "warning", "so it looked", user="ann", alignment=LOOK)))
     (notice,) = [notice for notice in rig.notices if notice.kind == "alignment"]
     assert (notice.level, notice.user, notice.message) == ("warning", "ann", "so it looked")
     assert notice.alignment == LOOK

@@ -7,9 +7,10 @@ from collections import Counter
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import uncoded
 from trirail.processes import sockets
 from trirail.processes.zenoh_links import EACH, LOOK_EVERY, Crowding, surplus
-from trirail.wire.packets import Remark
+from trirail.wire.messages import Notice
 
 USERS = frozenset({"ann", "eva", "max"})
 MOST = 100
@@ -41,11 +42,20 @@ class Crowd:
         self.now = 0.0
         self.links: dict[str, str | None] = {}
         self.ended: list[str] = []
-        self.told: list[Remark] = []
+        self.told: list[Notice] = []
         self.descriptors = 10
         monkeypatch.setattr(sockets, "descriptors_used", lambda: self.descriptors)
         monkeypatch.setattr(sockets, "descriptor_limit", lambda: 1000)
-        self.crowding = Crowding(lambda: self.links, self.ended.extend, USERS, MOST, self.told.append, lambda: self.now)
+        self.unopened: Counter[str] = Counter()
+        self.crowding = Crowding(
+            lambda: self.links,
+            self.ended.extend,
+            USERS,
+            MOST,
+            self.told.append,
+            lambda: self.now,
+            lambda _: self.unopened,
+        )
 
     def look(self, links: int, descriptors: int = 10, name: str | None = "eva") -> tuple[str, ...]:
         self.links = {f"at {number}": name for number in range(links)}
@@ -71,7 +81,23 @@ def test_what_is_nearly_used_up_is_told_once_and_warned_of_until_it_is_over(crow
     (warning,) = crowd.look(1, descriptors=800)
     assert warning.startswith("800 of 1000 descriptors")
     assert len(crowd.told) == 2
-    assert crowd.crowding.use == (1, MOST, 800, 1000)
+    assert crowd.crowding.use == (1, MOST, 800, 1000, 0)
+
+
+def test_connections_that_open_no_session_are_told_once_with_the_wait_that_they_are(crowd: Crowd) -> None:
+    crowd.unopened = Counter({"192.0.2.7": 15, "192.0.2.8": 4})
+    assert crowd.look(1) == ()
+    crowd.unopened["192.0.2.7"] = 600
+    (warning,) = crowd.look(1)
+    assert warning == (
+        "604 connections to the gateway open no session (600 from 192.0.2.7): a new one waits 60 s, no stop does"
+    )
+    assert crowd.crowding.use.unopened == 604
+    crowd.unopened = Counter({"192.0.2.7": 18})
+    assert len(crowd.look(1)) == 1
+    crowd.unopened = Counter({"192.0.2.7": 17})
+    assert crowd.look(1) == ()
+    assert uncoded(crowd.told) == [Notice("service", "warning", warning)]
 
 
 def test_who_shows_no_certificate_is_told_of_and_not_ended(crowd: Crowd) -> None:

@@ -24,7 +24,8 @@ from processes.test_service import (
 )
 from processes.test_service import told as told_by
 from trirail.processes.supervisor import CHILDREN_WITH_DRIVES
-from trirail.telemetry.reading import Recording, read
+from trirail.telemetry.reading import read
+from trirail.telemetry.recording import Recording
 from trirail.wire.messages import Event
 from trirail.wire.vocabulary import MODES, Mode
 from waiting import WITHIN

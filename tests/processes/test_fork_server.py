@@ -14,9 +14,9 @@ import pytest
 import servers
 from trirail.config import SIM, load
 from trirail.processes import forked_processes
-from trirail.processes.child_process import Order
 from trirail.processes.forked_processes import UNTOLD, ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.order import Order
 from trirail.wire import links
 from waiting import WITHIN
 
@@ -108,8 +108,9 @@ def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parent]:
         yield made
     finally:
         made.warm.close()
-        for descriptor in (made.heartbeats.descriptor, *(child.pipe for child in made.children)):
-            os.close(descriptor)
+        made.heartbeats.close()
+        for child in made.children:
+            os.close(child.pipe)
         for listening in made.listening:
             listening.close()
 

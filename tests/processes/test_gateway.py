@@ -13,23 +13,25 @@ from pathlib import Path
 import pytest
 import zenoh
 from control_rig import CONFIG, carried
+from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
-from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, Incoming, Kind
+from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, Incoming
 from trirail.processes.replies import REFUSALS_PER_SECOND
 from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
+from trirail.wire.event_codes import EventCode
 from trirail.wire.links import Closed
-from trirail.wire.messages import Event
+from trirail.wire.messages import Event, GoalReply, Notice
 from trirail.wire.packets import (
     Accepted,
+    Announcement,
     Answer,
     CommandRequest,
     Confirmed,
     Farewell,
     GoalRequest,
     Happened,
-    RefusedRequest,
     Request,
     Status,
     Welcome,
@@ -73,7 +75,7 @@ class Rig:
         self.gateway._hear(packets.message(answer), lambda: None)
 
     def accepted(self, ticket: int) -> None:
-        self.hear(Accepted(ticket, "g", 1.0, 1.0, False, False))
+        self.hear(Accepted(ticket, GoalReply("g", 1.0)))
 
     def goals(self) -> list[tuple[str, str | None]]:
         """The goals that the loop was given, and why they are not to begin."""
@@ -82,8 +84,8 @@ class Rig:
     def commands(self) -> list[CommandRequest]:
         return [request for request in self.sent if isinstance(request, CommandRequest)]
 
-    def refusals(self) -> list[RefusedRequest]:
-        return [request for request in self.sent if isinstance(request, RefusedRequest)]
+    def refusals(self) -> list[Notice]:
+        return [request.notice for request in self.sent if isinstance(request, Announcement)]
 
 
 EVERYBODYS_STOPS = (Command.STOP, Command.QUICK_STOP, Command.DISABLE)
@@ -92,10 +94,16 @@ EVERYBODYS_STOPS = (Command.STOP, Command.QUICK_STOP, Command.DISABLE)
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
-        yield Rig(opened)
+        made = Rig(opened)
+        yield made
+        made.gateway._replies.close()  # a thread that is still in Zenoh when the interpreter ends aborts it
 
 
-def came(kind: Kind, key: str, content: bytes, number: int = 0) -> Incoming:
+def refused(user: str, words: str, code: RefusalCode) -> Notice:
+    return Notice("refused", "warning", words, user=user, code=code, event_code=EventCode.REFUSED)
+
+
+def came(kind: str, key: str, content: bytes, number: int = 0) -> Incoming:
     return Incoming(kind, key, len(content), content, "", None, time.monotonic_ns(), number)
 
 
@@ -120,13 +128,14 @@ def test_what_a_command_does_not_take_is_refused_with_what_it_takes(rig: Rig, na
     rig.command(name, b'{"odd": 1}')
     *carried_out, said = rig.sent
     assert [one.name for one in carried_out if isinstance(one, CommandRequest)] == [name] * (name in EVERYBODYS_STOPS)
-    assert isinstance(said, RefusedRequest)
-    assert said.message.startswith(f"{name} takes {name.content.words}: ")
+    assert isinstance(said, Announcement)
+    assert said.notice.message.startswith(f"{name} takes {name.content.words}: ")
 
 
 def test_a_command_that_there_is_not_is_refused_with_those_that_there_are(rig: Rig) -> None:
     rig.command("dance")
-    assert rig.sent == [RefusedRequest("ann", f"dance: no such command; there are {', '.join(Command)}")]
+    there_are = f"dance: no such command; there are {', '.join(Command)}"
+    assert rig.sent == [Announcement(refused("ann", there_are, RefusalCode.UNKNOWN_COMMAND))]
 
 
 def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,8 +189,8 @@ def test_goals_of_one_who_floods_are_refused_and_nobody_elses(rig: Rig) -> None:
     for number in range(AHEAD + GOALS_OF_ONE + 3):
         rig.goal(f"e{number}", "eve")
     rig.goal("a", "ann")
-    refused = rig.refusals()
-    assert refused == [RefusedRequest("eve", f"{GOALS_OF_ONE} goals of eve are waiting already: send fewer")] * 3
+    words = f"{GOALS_OF_ONE} goals of eve are waiting already: send fewer"
+    assert rig.refusals() == [refused("eve", words, RefusalCode.BUSY)] * 3
     assert rig.goals()[-1] == ("a", None)
 
 
@@ -237,7 +246,7 @@ def test_the_lease_is_taken_over_by_a_role_that_may(rig: Rig, monkeypatch: pytes
         assert rig.sent == [CommandRequest(1, "ann", Command.ACQUIRE, AcquireLease("l", 0.5, force=True))]
     else:
         said = "ann is operator at demo: taking the lease over needs maintainer"
-        assert rig.sent == [RefusedRequest("ann", said)]
+        assert rig.sent == [Announcement(refused("ann", said, RefusalCode.NOT_ALLOWED))]
 
 
 def test_an_error_of_its_own_is_told_and_does_not_end_it(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -312,6 +321,22 @@ def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.Mon
     assert info.missing_protections == missing
 
 
+def test_info_follows_drives_that_are_set_up_later_and_nothing_is_declared_twice(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[object] = []
+    monkeypatch.setattr(rig.gateway._replies, "send", lambda _incoming, content: said.append(content))
+    missing = (MissingProtection("A", "1006", "its watch on SYNC"),)
+    rig.hear(Welcome((), 0.5))
+    declared = list(rig.gateway._inbox._declared)
+    rig.hear(Welcome((), 0.5, missing))
+    assert rig.gateway._inbox._declared == declared
+    rig.gateway._handle(came("info", "trirail/demo/info", b""))
+    (info,) = said
+    assert isinstance(info, Info)
+    assert info.missing_protections == missing
+
+
 class EndedLoop(FakeLink):
     """A loop that has said something and ended: it takes nothing any more."""
 
@@ -333,7 +358,7 @@ class EndedLoop(FakeLink):
 
 def test_what_the_loop_said_before_it_ended_is_heard_though_it_takes_nothing_any_more(tmp_path: Path) -> None:
     """Else a loop that ended as it should would be told to have died."""
-    accepted, ended = (packets.message(said) for said in (Accepted(1, "g", 1.0, 1.0, False, False), Farewell()))
+    accepted, ended = (packets.message(said) for said in (Accepted(1, GoalReply("g", 1.0)), Farewell()))
     unreadable = bytes([packets.Kind.MESSAGE]) + b"\xc1"
     told: list[Event] = []
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:

@@ -15,8 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import SIM, load
-from trirail.processes.child_process import Child, Order
+from trirail.processes.child_process import Child
 from trirail.processes.heartbeats import PROCESSES, Effort, HangWatch, Heartbeats, effort
+from trirail.processes.order import Order
 
 TURN = 0.1
 TURNS = st.tuples(st.booleans(), st.sampled_from("RDSTtZ"), st.floats(0.0, TURN))

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import math
+import queue
+import random
 import select
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zenoh
 from rigs import Clock
+from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.gateway import ROUTES
 from trirail.processes.inbox import UNREAD, UNREAD_OF_ONE, Inbox, _incoming
-from trirail.processes.incoming import BURST, RATE, Incoming, Pace
+from trirail.processes.incoming import BURST, RATE, FairQueue, Incoming, Pace
+from trirail.processes.memory_budget import OVERHEAD
 from trirail.wire import zenoh_session
-from trirail.wire.sizes import MAX_MESSAGE, MAX_UNREAD
+from trirail.wire.messages import ErrorReply
+from trirail.wire.sizes import MAX_BESIDE, MAX_MESSAGE, MAX_TRANSPORT, MAX_UNREAD, MAX_UNREAD_OF_ONE
 from trirail.wire.vocabulary import Command
+from waiting import WITHIN
+
+KEYS = {kind: len(route.names) for kind, route in ROUTES.items()}
 
 
 @pytest.fixture
@@ -30,7 +40,7 @@ def clock() -> Clock:
 @pytest.fixture
 def inbox(tmp_path: Path, refused: list[Incoming], clock: Clock) -> Iterator[Inbox]:
     with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/z"]) as opened:
-        yield Inbox(opened, "demo", refused.append, clock)
+        yield Inbox(opened, "demo", KEYS, lambda incoming, _: refused.append(incoming), clock)
 
 
 def readable(inbox: Inbox) -> bool:
@@ -39,7 +49,7 @@ def readable(inbox: Inbox) -> bool:
 
 def keep(inbox: Inbox, kind: str, payload: bytes = b"", user: str = "ann", name: str = "") -> None:
     key = "/".join(filter(None, ("trirail/demo", kind, user, name)))
-    inbox._keep(_incoming(kind, key, zenoh.ZBytes(payload), "", None))  # type: ignore[arg-type]
+    inbox._keep(_incoming(kind, key, zenoh.ZBytes(payload), "", None))
 
 
 def test_messages_are_taken_in_their_order(inbox: Inbox) -> None:
@@ -126,15 +136,54 @@ def test_users_who_have_their_whole_burst_again_are_forgotten() -> None:
     assert len(pace._full_at) <= 1001
 
 
-def test_what_waits_is_bounded_in_bytes(inbox: Inbox, refused: list[Incoming]) -> None:
-    for _ in range(MAX_UNREAD // MAX_MESSAGE + 3):
-        keep(inbox, "goal", bytes(MAX_MESSAGE))
-    assert len(refused) == 3
-    assert all(incoming.payload == b"" for incoming in refused)
-    taken = list(inbox.next_messages(1000))
-    assert sum(len(incoming.payload) for incoming in taken) == MAX_UNREAD
-    keep(inbox, "goal", bytes(MAX_MESSAGE))
-    assert len(refused) == 3
+@pytest.mark.generated(0, 1, 2)
+def test_what_waits_is_bounded_in_bytes_of_each_user_and_in_total(
+    inbox: Inbox, refused: list[Incoming], seed: int
+) -> None:
+    chance = random.Random(seed)
+    users = [f"u{number}" for number in range(chance.randrange(1, 9))]
+    held: Counter[str] = Counter()
+    for _ in range(6 * MAX_UNREAD // MAX_MESSAGE):
+        kind, user = chance.choice(("goal", "cmd", "role")), chance.choice(users)
+        keep(inbox, kind, bytes(chance.choice((0, 100, MAX_MESSAGE))), user, "enable" * (kind == "cmd"))
+    waiting = list(inbox._others)
+    for incoming in waiting:
+        held[incoming.user] += incoming.held
+    assert refused
+    assert "" in held
+    assert inbox._budget.held == held.total() <= 2 * MAX_UNREAD
+    assert max(held.values()) <= 2 * MAX_UNREAD_OF_ONE
+    goals = Counter(
+        {user: sum(one.held for one in waiting if one.user == user and one.kind == "goal") for user in users}
+    )
+    assert max(goals.values()) <= MAX_UNREAD_OF_ONE
+    del incoming
+    waiting.clear()
+    inbox._others = FairQueue()
+    assert inbox._budget.held == 0
+
+
+@pytest.mark.generated(0, 1, 2, 3)
+def test_what_is_too_large_is_refused_when_it_comes_and_its_memory_is_not_held(tmp_path: Path, seed: int) -> None:
+    chance, locator = random.Random(seed), f"unixsock-stream/{tmp_path}/z"
+    refused: queue.SimpleQueue[tuple[Incoming, ErrorReply]] = queue.SimpleQueue()
+    large = bytes(chance.randrange(MAX_MESSAGE + MAX_BESIDE, MAX_TRANSPORT - MAX_BESIDE))
+    with zenoh_session.open_service([locator]) as opened, zenoh_session.open_client(locator) as client:
+        inbox = Inbox(opened, "demo", KEYS, lambda incoming, error: refused.put((incoming, error)))
+        inbox.declare()
+        for name in chance.sample(["role/u0", "goal/eve", "cmd/eve/stop", "cmd/eve/reset", "info"], 5):
+            content, attached = (large, None) if chance.random() < 0.5 else (None, large)
+            before = inbox._budget.held
+            client.get(f"trirail/demo/{name}", zenoh.handlers.FifoChannel(1), payload=content, attachment=attached)
+            incoming, error = refused.get(timeout=WITHIN)
+            assert (incoming.payload, error.code) == (b"", RefusalCode.TOO_LARGE)
+            assert ("the robot is told to stop all the same" in error.message) == (name == "cmd/eve/stop")
+            assert inbox._budget.held - before == OVERHEAD * (name == "cmd/eve/stop")
+        (stop,) = inbox.next_messages(9)
+        assert stop.key == "trirail/demo/cmd/eve/stop"
+        assert stop.query is None
+        with pytest.raises(RefusedError, match="at most"):  # so that it is carried out as one without content
+            stop.content(type(None), "")
 
 
 def test_what_is_too_large_is_not_kept_but_its_size_is(inbox: Inbox) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from processes.test_service import SLOWLY, Service, again, until
 from refusals import refused_as
-from trirail.analysis.replay import again as replayed
+from trirail.analysis.replay import replay_session
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
 from trirail.telemetry import provenance
@@ -194,6 +194,6 @@ def test_a_session_with_leases_comes_out_again_to_the_last_bit(service: Service)
     recording = read(path)
     config = provenance.configuration(recording.texts)
     assert config is not None
-    compared = replayed(recording, config, simulated=False)
+    compared = replay_session(recording, config, simulated=False)
     assert compared.cycles == len(recording.records)
     assert (compared.differing, compared.first, compared.plans_differing) == (0, None, 0)

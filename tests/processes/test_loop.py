@@ -14,11 +14,14 @@ from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import Loop
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
 from trirail.processes.reports import BATCHES_PER_SECOND
+from trirail.processes.requests import AHEAD_OF_ALL, UNDER_WAY_OF_ALL
 from trirail.wire import links
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal
 from trirail.wire.links import Closed, PacketLink, Port
-from trirail.wire.messages import Event
+from trirail.wire.messages import Event, Notice
 from trirail.wire.packets import (
+    Announcement,
     Answer,
     CommandRequest,
     Confirmed,
@@ -29,14 +32,13 @@ from trirail.wire.packets import (
     Happened,
     Kind,
     Refused,
-    Remark,
     Status,
     Unrecorded,
     Welcome,
     decode_answer,
     message,
 )
-from trirail.wire.plan_packets import MAX_PLANNING, Planned, decode_plan_request, encode
+from trirail.wire.plan_packets import Planned, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, Mode, Override
@@ -50,10 +52,10 @@ class Shell:
         self.rig = rig
         self.folder = folder
         names = ("gateway", "recorder", "planner")
-        self.ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
+        self.ports = Ports(*(Port(links.listen(folder / name)) for name in names))
         self.gateway: PacketLink = links.connect(folder / "gateway")
         self.recorder: PacketLink = links.connect(folder / "recorder")
-        self.planner: PacketLink = links.connect(folder / "planner", MAX_PLANNING)
+        self.planner: PacketLink = links.connect(folder / "planner")
         self.motion_planner = MotionPlanner(rig.config)
         self.took_ns = 0
         """How long after its tick a cycle comes to deciding."""
@@ -336,7 +338,7 @@ def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) 
 
 def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     shell.enabled()
-    shell.recorder.send(message(Remark("warning", "the disk is full")))
+    shell.recorder.send(message(Announcement(Notice("service", "warning", "the disk is full"))))
     shell.recorder.send(b"\x02nonsense")
     shell.cycles(60)
     full, unreadable = shell.events()[2:]
@@ -351,7 +353,7 @@ def test_that_nothing_is_recorded_stands_in_the_status_while_it_is_so(shell: She
         return [answer.unrecorded for answer in shell.said() if isinstance(answer, Status)]
 
     shell.enabled()
-    shell.recorder.send(message(Remark("info", "recording to x.rrd")))
+    shell.recorder.send(message(Announcement(Notice("service", "info", "recording to x.rrd"))))
     assert set(standing()) == {""}
     shell.recorder.send(message(Unrecorded("nothing is recorded: /rec is full")))
     assert standing() == ["nothing is recorded: /rec is full"]
@@ -365,7 +367,7 @@ def test_that_nothing_is_recorded_stands_in_the_status_while_it_is_so(shell: She
     assert standing() == ["the recorder has gone: nothing is recorded until it is back"]
     shell.recorder = links.connect(shell.folder / "recorder")
     shell.cycles(60)
-    shell.recorder.send(message(Remark("info", "recording to y.rrd")))
+    shell.recorder.send(message(Announcement(Notice("service", "info", "recording to y.rrd"))))
     assert standing()[-1] == ""
 
 
@@ -373,7 +375,7 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
     """It is told anew whenever one of them is started again: one that it ended would end for good."""
     shell.enabled()
     shell.received()
-    shell.loop.control.modes.trip("x" * 200_000 + "\n\x1b[2J", "internal")
+    shell.loop.control.modes.trip(coded("x" * 200_000 + "\n\x1b[2J", EventCode.OTHER), "internal")
     shell.cycles(60)
     for link in (shell.gateway, shell.recorder):
         said = shell.said(link)
@@ -401,6 +403,25 @@ def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shel
     assert shell.mode() is Mode.STOPPING
     shell.cycles(400)
     assert answered(shell)[1:] == list(range(100, 201))
+
+
+@pytest.mark.parametrize("name", [command for command in Command if command.stops])
+def test_an_urgent_stop_takes_effect_in_its_cycle_whatever_was_sent_before_it(shell: Shell, name: Command) -> None:
+    """The loop may have been kept waiting while goals and commands came, as many as the gateway sends ahead."""
+    shell.enabled()
+    shell.send(2, "g-1", PoseGoal(0.08, 0.02, 0.2))
+    shell.cycles(100)
+    assert shell.mode() is Mode.MOVING
+    for ticket in range(100, 100 + AHEAD_OF_ALL):
+        shell.send(ticket, f"g{ticket}", PoseGoal(-0.08, 0.02, 0.2))
+    for ticket in range(200, 200 + UNDER_WAY_OF_ALL):
+        shell.gateway.send(message(CommandRequest(ticket, "eve", Command.OVERRIDE, Override(100.0))))
+    with shell.heartbeats.hurrying():
+        shell.gateway.send(message(CommandRequest(300, "ann", name)))
+    shell.cycles(1)
+    assert shell.mode() is not Mode.MOVING
+    shell.cycles(400)
+    assert shell.mode() is not Mode.MOVING, "goals that were sent before it do not begin"
 
 
 def test_an_answer_waits_for_a_gateway_that_is_slow(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -456,14 +477,16 @@ def test_a_planner_that_is_not_there_costs_the_goal_and_the_next_one_is_taken(sh
     shell.send(2, "g-1", PoseGoal(0.05, 0.0, 0.0))
     shell.cycles(2)
     assert refusals(shell) == [(2, "planner_lost")]
-    shell.planner, shell.serves = links.connect(tmp_path / "planner", MAX_PLANNING), True
+    shell.planner, shell.serves = links.connect(tmp_path / "planner"), True
     beating(shell, 50)
     shell.send(3, "g-2", PoseGoal(0.05, 0.0, 0.0))
     shell.cycles(3)
     assert shell.mode() is Mode.MOVING
 
 
-@pytest.mark.parametrize("junk", [b"", b"\x00", b"nonsense", message(Remark("info", "hello")), b"\xff" * 1000])
+@pytest.mark.parametrize(
+    "junk", [b"", b"\x00", b"nonsense", message(Announcement(Notice("service", "info", "hello"))), b"\xff" * 1000]
+)
 def test_what_is_no_answer_ends_the_planner_and_not_the_robot(shell: Shell, junk: bytes) -> None:
     """An empty packet is how an end looks; after anything else the loop hangs up, and the supervisor starts another."""
     sent_in_motion(shell)

@@ -26,8 +26,7 @@ from trirail.config import SIM, Config
 from trirail.errors import ServiceError
 from trirail.processes.child_process import MEASURED
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
-from trirail.processes.metrics import ServiceMetrics
-from trirail.processes.metrics_server import MetricsServer
+from trirail.processes.metrics import MetricsServer, ServiceMetrics
 from trirail.processes.monitoring import (
     KINDS_OF_FAULT,
     NOT_RUNNING,

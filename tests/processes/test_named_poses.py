@@ -111,6 +111,20 @@ def test_what_was_taught_outlasts_gateway_and_service(place: Place, number: int)
         assert set(robot.poses()) == {"park"}
 
 
+def test_a_file_that_breaks_while_the_service_runs_ends_nothing(place: Place) -> None:
+    with place.service() as process, Robot("demo", place.locator) as robot:
+        robot.teach("pick")
+        file = place.state / "demo/poses.json"
+        broken = file.read_bytes()[:9]
+        file.write_bytes(broken)
+        gateway = child(process.pid, "gateway")
+        os.kill(gateway, signal.SIGKILL)
+        wait_gone(gateway)
+        until(robot, lambda state: any("poses.json" in warning for warning in state.warnings))
+        assert set(robot.poses()) == {"park"}
+        assert file.with_name("poses.json.broken").read_bytes() == broken
+
+
 def test_a_taught_pose_that_the_robot_cannot_reach_any_more_is_refused_where_it_is_gone_to(place: Place) -> None:
     (place.state / "demo").mkdir(parents=True)
     (place.state / "demo/poses.json").write_text('{"far": [0.3, 0.0, 0.0]}', encoding="utf-8")
@@ -149,7 +163,7 @@ def test_from_the_command_line(place: Place, robot: Robot) -> None:
     assert told["park"] == {"name": "park", "x": 0.0, "y": 0.05, "phi": 0.0, "taught": False}
     unknown = trirail("goto", "nowhere", locator=place.locator)
     assert (unknown.returncode, unknown.stdout) == (1, "")
-    assert unknown.stderr == "trirail: no pose 'nowhere': `trirail poses` lists those that there are\n"
+    assert unknown.stderr == "trirail: no pose 'nowhere': `trirail poses` lists the saved poses\n"
     for words, names in ((("goto", ""), ["park", "pick"]), (("forget", ""), ["pick"])):
         assert trirail("__complete", *words, locator=place.locator).stdout.splitlines()[-len(names) :] == names
     assert trirail("forget", "pick", locator=place.locator).returncode == 0

@@ -24,6 +24,7 @@ from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary, records
 from trirail.wire.goals import TrajectoryGoal, TrajectoryPoint
+from trirail.wire.kinds.trajectory import parts
 from trirail.wire.messages import Event
 from trirail.wire.sizes import MAX_MESSAGE, MAX_POINTS, MAX_TRANSPORT
 from trirail.wire.zenoh_session import open_client
@@ -189,21 +190,27 @@ def test_the_longest_trajectory_is_taken_in_every_way(shared: tuple[Service, Rob
     points = [TrajectoryPoint(t, x, y, phi, velocity=still, acceleration=still) for t in times]
     goal = robot.follow(points)
     goal.cancel()
-    message = msgspec.to_builtins(TrajectoryGoal(tuple(points)))
-    for payload, encoding in (
-        (json.dumps(message, indent=2).encode(), boundary.JSON),
-        (msgspec.msgpack.encode(message), boundary.MSGPACK),
-    ):
-        ((code, content),) = asked(session, "trirail/demo/goal/ann", payload=payload, encoding=encoding)
+    encoders: tuple[tuple[Callable[[object], bytes], str], ...] = (
+        (lambda message: json.dumps(message).encode(), boundary.JSON),
+        (msgspec.msgpack.encode, boundary.MSGPACK),
+    )
+    for encode, encoding in encoders:
+        sent = parts(TrajectoryGoal(tuple(points), encoding.replace("/", "-")))
+        first, *others = (encode(msgspec.to_builtins(part)) for part in sent)
+        for part in others:
+            session.put(
+                "trirail/demo/goal/ann", part, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK
+            )
+        ((code, content),) = asked(session, "trirail/demo/goal/ann", payload=first, encoding=encoding)
         assert code == "ok", content
         robot.stop()
         until(robot, lambda state: state.mode == "holding")
 
 
-def test_a_client_refuses_itself_what_is_too_large(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+def test_a_client_refuses_itself_a_trajectory_of_too_many_points(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     _, robot, _ = shared
     points = [TrajectoryPoint(float(n), 0.0, 0.0, 0.0) for n in range(10_000)]
-    with refused_as(RefusalCode.TOO_LARGE):
+    with refused_as(RefusalCode.MALFORMED):
         robot.follow(points)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import tempfile
 import threading
 import time
@@ -17,20 +18,21 @@ from conftest import Rig
 from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
-from refusals import refused_as
+from refusals import refused_as, uncoded
 from trirail.config import Config, geometry, parse
 from trirail.errors import ConfigError, RefusalCode, RefusedError, ServiceError
 from trirail.kinematics.geometry import travels
 from trirail.kinematics.robot import inverse
 from trirail.motion.limits import Bounds
 from trirail.processes import poses
-from trirail.processes.incoming import Incoming, Kind
+from trirail.processes.gateway import ROUTES
+from trirail.processes.incoming import Incoming
 from trirail.processes.pose_file import NAME, PoseFile, state_directory
 from trirail.processes.poses import LOOK_EVERY, MOST, UNDER_WAY, Poses
 from trirail.telemetry.provenance import toml
 from trirail.wire.goals import NamedGoal, OwnLimits, PoseGoal
-from trirail.wire.messages import ErrorReply
-from trirail.wire.packets import PoseChanged, Refused, Remark
+from trirail.wire.messages import ErrorReply, Notice
+from trirail.wire.packets import Announcement, Refused
 from trirail.wire.records import DTYPE
 from trirail.wire.state import NamedPose
 from trirail.wire.vocabulary import MODES, Mode
@@ -50,13 +52,15 @@ def record(pose: tuple[float, float, float] = POSE, mode: Mode = Mode.HOLDING, h
 class Asked:
     """The gateway around the poses: asks as ann, keeps answers, refusals and what everyone is told."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, *, again: bool = False) -> None:
         self.replies: list[NamedPose] = []
         self.refusals: list[RefusedError] = []
-        self.told: list[PoseChanged | Remark] = []
+        self.told: list[Notice] = []
         self.now = 0.0
         self.woken = threading.Event()
-        self.poses = Poses(config, self._reply, self._refuse, self.told.append, self.woken.set, lambda: self.now)
+        self.poses = Poses(
+            config, self._reply, self._refuse, self.told.append, self.woken.set, lambda: self.now, again=again
+        )
 
     def _reply(self, incoming: Incoming, reply: msgspec.Struct) -> None:
         if isinstance(reply, ErrorReply):
@@ -68,9 +72,10 @@ class Asked:
     def _refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
         self.refusals.append(refusal)
 
-    def ask(self, kind: Kind, name: str, content: bytes = b"") -> None:
+    def ask(self, kind: str, name: str, content: bytes = b"") -> None:
         key = f"trirail/demo/{kind}/ann/{name}"
-        self.poses.edit(Incoming(kind, key, len(content), content, "", None, time.monotonic_ns()))
+        incoming = Incoming(kind, key, len(content), content, "", None, time.monotonic_ns())
+        self.poses.edit(incoming, *ROUTES[kind].read(incoming, "demo").names)
 
     def teach(self, name: str, at: np.void | None = None) -> None:
         self.ask("teach", name)
@@ -87,7 +92,7 @@ class Asked:
         return {pose.name: (pose.x, pose.y, pose.phi) for pose in self.poses.table().poses}
 
 
-Make = Callable[[Config], Asked]
+Make = Callable[..., Asked]
 
 
 @pytest.fixture
@@ -95,8 +100,8 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
     made: list[Asked] = []
 
-    def ask(config: Config) -> Asked:
-        made.append(Asked(config))
+    def ask(config: Config, *, again: bool = False) -> Asked:
+        made.append(Asked(config, again=again))
         return made[-1]
 
     yield ask
@@ -111,14 +116,16 @@ def test_a_pose_is_taught_where_the_next_record_has_the_robot_and_kept(make: Mak
     asked.poses.measure(record())
     asked.write()
     assert asked.replies == [NamedPose("pick", *POSE, taught=True)]
-    assert asked.told == [PoseChanged("ann", "pose pick taught by ann: x 20 mm, y -10 mm, phi 5.7296°")]
+    assert uncoded(asked.told) == [
+        Notice("pose", "info", "pose pick taught by ann: x 20 mm, y -10 mm, phi 5.7296°", user="ann")
+    ]
     assert asked.known() == make(CONFIG).known() == {"pick": POSE}
     asked.teach("pick", record((0.0, 0.0, 0.0), Mode.DISABLED))
     assert asked.known() == {"pick": (0.0, 0.0, 0.0)}
     asked.ask("forget", "pick")
     asked.write()
     assert asked.replies[-1] == NamedPose("pick", 0.0, 0.0, 0.0, taught=True)
-    assert asked.told[-1] == PoseChanged("ann", "pose pick removed by ann")
+    assert uncoded(asked.told[-1:]) == [Notice("pose", "info", "pose pick removed by ann", user="ann")]
     assert asked.known() == make(CONFIG).known() == {}
 
 
@@ -148,10 +155,10 @@ def test_poses_whose_file_goes_are_neither_silently_kept_nor_lost(acts: list[str
                     known = set() if gone else known
             for _ in range(2):
                 asked.now += LOOK_EVERY
-                before = [said for said in asked.told if isinstance(said, Remark)]
+                before = [said for said in asked.told if said.kind == "service"]
                 was_told = bool(asked.poses.warnings())
                 asked.poses.poll()
-                told = [said for said in asked.told if isinstance(said, Remark)][len(before) :]
+                told = [said for said in asked.told if said.kind == "service"][len(before) :]
                 assert len(told) == (gone and not was_told)
                 assert bool(asked.poses.warnings()) is gone
                 assert all(name in words for name in known for words in asked.poses.warnings())
@@ -250,7 +257,7 @@ def test_where_it_is_not_known_to_stand_it_cannot_be_taught(make: Make) -> None:
         ("teach", "pick", b'{"x": 0}', RefusalCode.MALFORMED),
     ],
 )
-def test_what_is_refused_at_once(make: Make, kind: Kind, name: str, content: bytes, code: RefusalCode) -> None:
+def test_what_is_refused_at_once(make: Make, kind: str, name: str, content: bytes, code: RefusalCode) -> None:
     asked = make(PARKED)
     with refused_as(code):
         asked.ask(kind, name, content)
@@ -312,8 +319,33 @@ def test_what_cannot_be_read_ends_the_start(make: Make) -> None:
         make(CONFIG)
 
 
+@pytest.mark.generated(0, 1, 2)
+def test_a_gateway_that_is_started_again_goes_on_without_what_cannot_be_read_and_keeps_each_such_file(
+    make: Make, seed: int
+) -> None:
+    chance, whole = random.Random(seed), b'{"pick": [0.0, 0.0, 0.0]}'
+    contents = [whole[: chance.randrange(len(whole))], b"{" + chance.randbytes(9), b'{"a b": [0, 0, 0]}', b"[" * 9999]
+    contents = chance.sample(contents, 3)
+    folder = state_directory("demo")
+    folder.mkdir()
+    for content in contents:
+        (folder / "poses.json").write_bytes(content)
+        later = make(PARKED, again=True)
+        assert later.known() == PARKED.poses
+        (warning,) = later.poses.warnings()
+        assert "; there are no taught poses now; the file is kept as " in warning
+        for later.now in (0.0, 100.0):
+            later.poses.poll()
+        assert uncoded(later.told) == [Notice("service", "warning", warning)]
+        assert [told.params for told in later.told] == [{"file": str(folder / "poses.json")}]
+    kept = [path for path in folder.iterdir() if path.name.startswith("poses.json.broken")]
+    assert sorted(path.read_bytes() for path in kept) == sorted(contents)
+    later.teach("pick")
+    assert make(PARKED, again=True).known().keys() == {"park", "pick"}
+
+
 def test_a_change_is_told_to_everyone(rig: Rig) -> None:
-    rig.cycle(PoseChanged("ann", "pose pick removed by ann"))
+    rig.cycle(Announcement(Notice("pose", "info", "pose pick removed by ann", user="ann")))
     (notice,) = [notice for notice in rig.notices if notice.kind == "pose"]
     assert (notice.level, notice.user, notice.message) == ("info", "ann", "pose pick removed by ann")
 
@@ -335,11 +367,11 @@ def test_a_configured_pose_is_refused_where_the_robot_could_not_be_and_only_ther
     except ConfigError as error:
         refused = str(error)
     bounds = Bounds(CONFIG.limits, CONFIG.period)
-    found = bounds.pose(pose)
+    found = bounds.pose_violation(pose)
     if found is None:
         motion = inverse(GEOMETRY, pose)
         still = np.zeros(3)
-        found = bounds.setpoint(np.array([motion.position, still, still, motion.passive_position]))
+        found = bounds.setpoint_violation(np.array([motion.position, still, still, motion.passive_position]))
     assert refused.startswith("poses.park = [") == (found is not None), found
     assert bool(refused) == (found is not None)
 
@@ -353,10 +385,10 @@ def test_travels_are_those_of_the_inverse_kinematics(pose: tuple[float, float, f
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ("park = [0.5, 0.0, 0.0]", "poses.park = [0.5, 0, 0]: x would be 0.5, outside of limits.platform.x = [-0.15, "),
+        ("park = [0.5, 0.0, 0.0]", "poses.park = [0.5, 0, 0]: x would be 0.5, outside limits.platform.x = [-0.15, "),
         ("park = [0.0, 0.0]", "poses.park = [0.0, 0.0]: expected array of length 3"),
-        ("park = [0.0, 0.0, 9.0]", "poses.park[2] = 9.0: expected float <= 6.28"),
-        ("'my pose' = [0.0, 0.0, 0.0]", "poses: 'my pose' is no name here: expected str matching"),
+        ("park = [0.0, 0.0, 9.0]", "poses.park[2] = 9.0: expected number, -6.28319 to 6.28319"),
+        ("'my pose' = [0.0, 0.0, 0.0]", "poses: 'my pose' is no name here: expected text matching"),
         ("park = [0.0, 0.0, nan]", "poses.park[2] = nan: it must be a finite number"),
     ],
 )

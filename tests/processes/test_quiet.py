@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import random
+import re
 import struct
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +32,7 @@ from trirail.wire import links
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.links import Port
 from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Request, decode_answer, message
-from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import MODES, Command, Mode
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED
@@ -91,8 +92,8 @@ class Session:
         driver.configure(config.period, config.limits.slider.velocities[0])
         self.setting_up = False
         names = ("gateway", "recorder", "planner")
-        ports = Ports(*(Port(links.listen(folder / name), MAX_PLANNING) for name in names))
-        self.gateway, self.recorder, self.planner = (links.connect(folder / name, MAX_PLANNING) for name in names)
+        ports = Ports(*(Port(links.listen(folder / name)) for name in names))
+        self.gateway, self.recorder, self.planner = (links.connect(folder / name) for name in names)
         for closes in (*ports, self.gateway, self.recorder, self.planner):
             self._stack.callback(closes.close)
         self.hearts = Heartbeats.create()
@@ -191,9 +192,14 @@ def _comparable(packet: bytes) -> Iterator[object]:
         said = decode_answer(packet[1:])
         if isinstance(said, Happened):
             event = said.event
-            yield event.seq, event.cycle, event.t, event.kind, event.message, event.outcome
+            yield event.seq, event.cycle, event.t, event.kind, CHANNEL.sub("can0", event.message), event.outcome
         else:
-            yield type(said).__name__, repr(said) if type(said).__name__ in ("Status", "ControlInput") else ""
+            text = repr(said) if type(said).__name__ in ("Status", "ControlInput") else ""
+            yield type(said).__name__, CHANNEL.sub("can0", text)
+
+
+CHANNEL = re.compile(r"Virtual bus channel lockstep-\d+|unix \S+/can\b")
+"""Name of a session's bus: each of the two has its own."""
 
 
 def odrives() -> Config:
@@ -206,7 +212,7 @@ def odrives() -> Config:
 
 
 def fast() -> Config:
-    """The same robot at 4 kHz, where no cycle has time for all that a request brings; on a bus that carries that."""
+    """The same robot at the highest rate, where no cycle has time for all that a request brings; its bus carries it."""
     can_bus, loop = structs.replace(CONFIG.can, bitrate=8_000_000), structs.replace(CONFIG.loop, rate_hz=4000)
     return structs.replace(CONFIG, can=can_bus, loop=loop)
 
@@ -328,9 +334,9 @@ def both_ways(
 @pytest.mark.parametrize(
     ("carrier", "protocol", "seed"),
     [
-        *(("unix", "cia402", seed) for seed in range(12)),
-        *(("unix", "odrive", seed) for seed in range(6)),
-        *((carrier, protocol, seed) for carrier in CARRIERS[1:] for protocol in CONFIGS for seed in (3, 4)),
+        *(("unix", "cia402", seed) for seed in range(6)),
+        *(("unix", "odrive", seed) for seed in range(3)),
+        *((carrier, protocol, 3) for carrier in CARRIERS[1:] for protocol in CONFIGS),
     ],
 )
 def test_quiet_cycles_are_those_of_python_to_the_last_bit(
@@ -341,7 +347,7 @@ def test_quiet_cycles_are_those_of_python_to_the_last_bit(
 
 @pytest.mark.generated(0, 1, 2, 3)
 def test_what_there_is_no_time_for_waits_alike(seed: int, tmp_path: Path) -> None:
-    """At 4 kHz a request that comes is decided by behind the next cycle, and what is said of it waits once more."""
+    """At the highest rate a request is handled behind the next cycle, and its answer waits for one more."""
     both_ways(fast(), tmp_path, lambda: script(seed), CYCLES)
 
 
@@ -360,7 +366,7 @@ def test_a_bus_that_dies_is_a_fault_in_the_same_cycle(moving: bool, unread: bool
     happens = {number: list(what) for number, what in script(1).items() if number < (400 if moving else 31)}
     happens[412] = [Happening(die)]
     one = both_ways(CONFIG, tmp_path, lambda: happens, 500, carrier)
-    assert "CAN bus: cannot" in (one.loop.control.fault or "")
+    assert re.match("CAN bus .* is down: cannot", one.loop.control.fault or "")
 
 
 BEAT: Final = 0x700 + CONFIG.drives.master_node
@@ -439,7 +445,7 @@ def test_an_odrive_that_stands_still_in_motion_is_found_in_the_same_cycle(number
         number: [Happening(lambda session: session.drives.faults.add("A stuck for 1"))],
     }
     one = both_ways(structs.replace(CONFIGS["odrive"], drives=drives), tmp_path, lambda: happens, 400)
-    assert "is beyond its window 1 mm" in (one.loop.control.fault or "")
+    assert "exceeds its window of 1 mm" in (one.loop.control.fault or "")
 
 
 @pytest.mark.parametrize("protocol", CONFIGS)

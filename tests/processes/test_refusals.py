@@ -22,7 +22,7 @@ class Listener:
         self.now = 100.0
         self.told: list[Any] = []
         self.answers: list[Any] = []
-        link: Any = SimpleNamespace(send=lambda packet: self.told.append(packets.decode_request(packet[1:])))
+        link: Any = SimpleNamespace(send=lambda packet: self.told.append(packets.decode_request(packet[1:]).notice))
         replies: Any = SimpleNamespace(answer=lambda _, content: self.answers.append(content))
         monkeypatch.setattr(refusals, "time", SimpleNamespace(monotonic=lambda: self.now))
         self.refusals = Refusals(link, replies)

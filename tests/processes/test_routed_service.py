@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 
 class Hub:
-    """`trirail router` for the robot demo."""
+    """A router for the robot demo, of what `trirail router` prints."""
 
     def __init__(self, folder: Path) -> None:
         self.locator = f"unixsock-stream/{folder}/hub"
@@ -34,18 +34,20 @@ class Hub:
 
     def start(self) -> None:
         """Start it, and wait until it says that it routes."""
+        settings = trirail("router", self._file).stdout
+        route = f"import zenoh; router = zenoh.open(zenoh.Config.from_json5({settings!r})); print('routing'); input()"
         self.process = subprocess.Popen(
-            python("-u", "-m", "trirail", "router", str(self._file)), stdout=subprocess.PIPE, text=True
+            python("-u", "-c", route), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         assert self.process.stdout is not None
-        assert self.process.stdout.readline().startswith("routing")
+        assert self.process.stdout.readline() == "routing\n"
 
     def kill(self) -> None:
         """Kill it at once."""
         self.process.kill()
         self.process.wait()
-        if self.process.stdout is not None:
-            self.process.stdout.close()
+        for pipe in filter(None, (self.process.stdin, self.process.stdout)):
+            pipe.close()
 
 
 @pytest.fixture

@@ -7,9 +7,10 @@ import threading
 import pytest
 from processes.test_gateway import Rig
 from processes.test_gateway import rig as rig  # noqa: PLC0414 - a fixture
+from refusals import uncoded
 from rigs import Clock
 from trirail.processes.zenoh_links import ASK_EVERY, PATIENCE, RouterLinks
-from trirail.wire.packets import Remark
+from trirail.wire.messages import Notice
 
 HUB = "tls/192.0.2.9:7447"
 DOWN = f"no link to the router {HUB}: connection refused; it is dialled again, local control goes on"
@@ -20,7 +21,7 @@ class Net:
 
     def __init__(self) -> None:
         self.there, self.why, self.asked = False, "connection refused", 0
-        self.told: list[Remark] = []
+        self.told: list[Notice] = []
         self.clock = Clock()
         self.links = RouterLinks(
             [HUB], lambda: {HUB} if self.there else set(), self.why_not, self.told.append, self.clock
@@ -44,19 +45,19 @@ def test_nothing_is_said_of_a_router_that_is_there_soon() -> None:
     assert (net.told, net.links.warnings(), net.asked) == ([], (), 0)
     net.there = True
     net.wait(100)
-    assert net.told == [Remark("info", f"linked to the router {HUB}")]
+    assert uncoded(net.told) == [Notice("service", "info", f"linked to the router {HUB}")]
     assert net.links.warnings() == ()
 
 
 def test_a_router_that_does_not_answer_is_told_once_and_warned_of_until_it_does() -> None:
     net = Net()
     net.wait(100)
-    assert net.told == [Remark("warning", DOWN)]
+    assert uncoded(net.told) == [Notice("service", "warning", DOWN)]
     assert net.links.warnings() == (DOWN,)
     assert net.asked <= 100 / ASK_EVERY + 1
     net.there = True
     net.wait(2)
-    assert net.told[1:] == [Remark("info", f"linked to the router {HUB}")]
+    assert uncoded(net.told[1:]) == [Notice("service", "info", f"linked to the router {HUB}")]
     assert net.links.warnings() == ()
 
 
@@ -66,7 +67,7 @@ def test_a_link_that_is_lost_is_told_at_once_with_why() -> None:
     net.wait(10)
     net.there = False
     net.wait(3)
-    assert net.told[1:] == [Remark("warning", DOWN)]
+    assert uncoded(net.told[1:]) == [Notice("service", "warning", DOWN)]
     net.why = "its certificate is in the name of stray, not of hub"
     net.wait(2 * ASK_EVERY)
     assert net.links.warnings() == (DOWN.replace("connection refused", net.why),)
@@ -109,5 +110,5 @@ def test_the_gateway_has_the_loop_tell_of_it_and_warns(rig: Rig) -> None:
     net._asking.submit(lambda: None).result()
     net._due = 0.0
     net.poll()
-    assert rig.sent == [Remark("warning", DOWN)]
+    assert uncoded(rig.sent) == [Notice("service", "warning", DOWN)]
     assert gateway.warnings() == (DOWN,)

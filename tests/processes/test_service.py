@@ -271,7 +271,7 @@ def test_a_session_with_odrives(tmp_path: Path) -> None:
             until(robot, lambda state: state.sliders.status == ("switch on disabled",) * 3)
         assert service.end() == 0
         sent = service.frames()
-        commands = {0x00, 0x01, 0x03, 0x04, 0x05, 0x07, 0x09, 0x0B, 0x0C}
+        commands = {0x00, 0x01, 0x03, 0x04, 0x05, 0x06, 0x07, 0x09, 0x0B, 0x0C}
         assert {identifier for identifier, _ in sent} == {
             node << 5 | number for node in (1, 2, 3) for number in commands
         }
@@ -287,7 +287,7 @@ def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_pat
     lines = f'\neds = "{eds}"\naccept_without = ["1006"]\n'
     with Service(tmp_path, **{f"[drives.{name}]\n": f"[drives.{name}]{lines}" for name in "BC"}) as service:
         service.wait_up()
-        words = "its watch on SYNC; without: it goes on without SYNC"
+        words = "its watch on SYNC; without: it continues without SYNC"
         said = trirail("doctor", tmp_path / "robot.toml", "--quick").stdout
         assert f"drives B, C may lack 1006, {words}" in said
         assert f"drive B, drive C: 1006, {words}" in trirail("status", locator=service.locator).stdout
@@ -820,9 +820,7 @@ def test_killed_drives_are_a_fault_and_the_service_stays(service: Service) -> No
         os.kill(service.child("drives"), signal.SIGKILL)
         state = until(robot, lambda state: state.mode == "fault")
         (fault,) = state.faults
-        assert re.fullmatch(
-            r"CAN bus: cannot (send|receive): .*(listening end|end of the bus that listens) is gone", fault
-        )
+        assert re.fullmatch(r"CAN bus .* is down: cannot (send|receive): .*listening end( of the bus)? is gone", fault)
         service.wait_said(
             "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
             "service's next start"
@@ -901,36 +899,6 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
         drives.stdout.close()
 
 
-def test_a_session_is_sent_again(tmp_path: Path) -> None:
-    files: list[Path] = []
-    for number in range(2):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        service = Service(folder)
-        service.wait_up()
-        with service.robot() as robot:
-            if number == 0:
-                robot.enable()
-                robot.move_to(x=0.05, y=0.01, phi=0.2, id="out").wait(WITHIN)
-                until(robot, lambda state: state.mode == "holding")
-                robot.move_sliders(0.0, 0.0, 0.0, id="back").wait(WITHIN)
-                until(robot, lambda state: state.mode == "holding")
-            else:
-                again = trirail("replay", files[0], "--to", service.locator, "--json")
-                assert again.returncode == 0, again.stderr
-                once_more = trirail("replay", files[0], "--to", service.locator)
-                until(robot, lambda state: state.pose == pytest.approx((0.0, 0.0, 0.0), abs=1e-5))
-        assert service.end() == 0
-        files += list((folder / "recordings").glob("*.rrd"))
-    motions = json.loads(again.stdout)
-    assert [(motion["id"], motion["outcome"]) for motion in motions] == [("out", "done"), ("back", "done")]
-    for motion in motions:
-        assert motion["cycles"] > 100
-        assert motion["lacking"] == 0, motions
-        assert max(motion["position"]) < 1e-9
-    assert once_more.returncode == 0, once_more.stderr  # for it stands where the session began
-
-
 # ---------------------------------------------------------------------- what cannot start
 
 
@@ -938,7 +906,6 @@ def test_a_session_is_sent_again(tmp_path: Path) -> None:
     ("before", "after", "said"),
     [
         ("rate_hz = 1000", "rate_hx = 1000", "loop.rate_hx: unknown key; did you mean rate_hz?"),
-        ('interface = "simulated"', 'interface = "socketcan"\nchannel = "can7"', ("AF_CAN", "can7")),
         ('interface = "simulated"', 'interface = "vcan"', 'can.interface "vcan" is unknown'),
         ("bitrate = 1_000_000", "bitrate = 500_000", "takes 150% of the bus at 500000 bit/s"),
         ('listen = ["tcp/127.0.0.1:7447"]', 'listen = ["tcp/127.0.0.1:{port}"]', "cannot listen on tcp/127.0.0.1"),
@@ -966,7 +933,7 @@ def test_nobody_there(tmp_path: Path) -> None:
     failed = trirail("status", locator=f"unixsock-stream/{tmp_path}/none")
     assert failed.returncode == 1
     assert failed.stderr.startswith("trirail: no service at unixsock-stream/")
-    assert "start what is to answer there, trirail run or trirail router, or name another address" in failed.stderr
+    assert "start what is to answer there, trirail run or zenohd, or name another address" in failed.stderr
 
 
 @pytest.mark.alone  # the demo has a port of the machine

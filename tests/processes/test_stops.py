@@ -23,7 +23,7 @@ from trirail.processes.incoming import Incoming
 from trirail.processes.replies import REMEMBERED, Copies
 from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
-from trirail.wire.messages import CommandReply, ErrorReply
+from trirail.wire.messages import CommandReply, ErrorReply, GoalReply
 from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused
 from trirail.wire.records import DTYPE
 from trirail.wire.stop_protocol import STOPS
@@ -88,7 +88,7 @@ class Played:
     def send(self, packet: bytes) -> bool:
         request = packets.decode_request(packet[1:])
         if isinstance(request, GoalRequest):
-            self._packets.append(packets.message(Accepted(request.ticket, request.id, 1.0, 1.0, False, False)))
+            self._packets.append(packets.message(Accepted(request.ticket, GoalReply(request.id, 1.0))))
         elif isinstance(request, CommandRequest):
             under_way = getattr(request.content, "goal", None) is None or any(
                 isinstance(each, GoalRequest) and each.id == request.content.goal for each in self.sent
@@ -114,7 +114,7 @@ class Played:
         else:
             content, key, copy = step.content, f"trirail/demo/cmd/{step.user}/{step.name}", step.copy
         kind = "goal" if isinstance(step, Goal) else "cmd"
-        incoming = Incoming(kind, key, len(content), content, "", None, time.monotonic_ns())  # type: ignore[arg-type]
+        incoming = Incoming(kind, key, len(content), content, "", None, time.monotonic_ns())
         self._gateway._inbox._keep(incoming._replace(id=copy, at_door=self.answers[number].append))
 
     def _read(self, at_most: int) -> None:

@@ -314,6 +314,18 @@ def test_drives_that_cannot_start_are_the_end(does: str, run: Running) -> None:
     assert run.told == ["the drives could not start (exit code 3)"]
 
 
+@pytest.mark.core
+@pytest.mark.usefixtures("patient")
+@pytest.mark.parametrize("other", ["planner", "drives", "recorder"])
+@pytest.mark.parametrize("is_ready", [True, False])
+def test_of_a_start_that_fails_the_loops_reason_alone_is_said(other: str, is_ready: bool, run: Running) -> None:
+    """A process that loses its connection to a loop that cannot start ends by itself, before the loop has ended."""
+    ends = f"{'ready()' if is_ready else 'pass'}\nwhile not (begun('failing') or never()): time.sleep(0.01)"
+    fails = f"(folder / 'failing.begun').touch(); time.sleep(0.3); os._exit({os.EX_CONFIG})"
+    run.ends(1, loop_1=fails, **{"gateway_1": "freeze()", f"{other}_1": ends})
+    assert run.told == []
+
+
 def test_a_real_bus_has_no_process_of_drives(run: Running) -> None:
     on_a_bus = structs.replace(CONFIG, can=structs.replace(CONFIG.can, interface="socketcan", channel="can0"))
     turning = "ready(); beat_until(lambda: begun('up')); heartbeats.of('loop').rest()"

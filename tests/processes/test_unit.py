@@ -19,8 +19,11 @@ from trirail import Robot
 from trirail.client import own_service
 
 UNIT = Path(__file__).parents[2] / "configs" / "trirail.service"
+CAN_UNIT = UNIT.with_name("trirail-can@.service")
+SYSTEM_USER = UNIT.with_name("trirail-user.conf")
 UP_WITHIN = 60.0
 BOOT = """\
+mount --bind {folder}/ip $(command -v ip)
 mount -t tmpfs tmpfs /run
 mkdir -p /run/systemd/system /run/systemd/inaccessible/dir
 touch /run/systemd/inaccessible/reg
@@ -81,8 +84,14 @@ class Systemd:
             "XDG_CONFIG_HOME": str(folder / "config"),
             "XDG_CACHE_HOME": str(folder / "cache"),
         }
+        self.commands = folder / "commands"
+        (folder / "ip").write_text(f'#!/bin/sh\necho "ip $*" >>{self.commands}\n')
+        (folder / "ip").chmod(0o755)
+        # A user's systemd knows no devices: the unit is started as when the interface is there.
+        can_unit = CAN_UNIT.read_text(encoding="utf-8").splitlines(keepends=True)
+        (units / CAN_UNIT.name).write_text("".join(line for line in can_unit if ".device" not in line))
         self._manager = subprocess.Popen(
-            ["unshare", "--mount", "sh", "-ec", BOOT],
+            ["unshare", "--mount", "sh", "-ec", BOOT.replace("{folder}", str(folder))],
             env=self._environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -139,3 +148,34 @@ def test_it_is_up_when_it_says_so_comes_back_disabled_and_stops_in_a_controlled_
         robot.move_to(x=0.02, y=0.0, phi=0.0)
         systemd.ctl("stop", "trirail")
     assert systemd.shows(ActiveState="inactive", Result="success")(), systemd.ctl("status", "trirail")
+
+
+def test_the_can_interface_comes_up_with_bitrate_and_queue(systemd: Systemd) -> None:
+    systemd.ctl("start", "trirail-can@can0")
+    systemd.ctl("stop", "trirail-can@can0")
+    assert systemd.commands.read_text().splitlines() == [
+        "ip link set can0 txqueuelen 100",
+        "ip link set can0 type can restart-ms 100",
+        "ip link set can0 up type can bitrate 1000000",
+        "ip link set can0 down",
+    ]
+
+
+@pytest.mark.parametrize("unit", [UNIT, CAN_UNIT])
+def test_systemd_finds_nothing_wrong_with_what_is_shipped(unit: Path, tmp_path: Path) -> None:
+    text = unit.read_text(encoding="utf-8").replace("/opt/trirail/.venv/bin/trirail", sys.executable)
+    file = tmp_path / unit.name.replace("@", "@can0")
+    file.write_text(text, encoding="utf-8")
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(file)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+def test_the_service_has_a_user_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    subprocess.run(["systemd-sysusers", f"--root={tmp_path}", str(SYSTEM_USER)], capture_output=True, check=True)
+    name, *_, home, shell = (tmp_path / "etc/passwd").read_text().splitlines()[-1].split(":")
+    assert (name, home, shell) == ("trirail", "/var/lib/trirail", "/usr/sbin/nologin")
+    assert f"User={name}\n" in UNIT.read_text(encoding="utf-8")
+    assert f"WorkingDirectory={home}\n" in UNIT.read_text(encoding="utf-8")

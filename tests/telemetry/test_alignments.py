@@ -11,7 +11,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from telemetry.test_reading import written
-from trirail.analysis.summary import summary
+from trirail.analysis.summary import summarise
 from trirail.telemetry.reading import read
 from trirail.telemetry.shown_alignment import MOST_LOOKS, RESIDUALS, ShownAlignment
 from trirail.wire.looks import AlignmentLook, SeenMark
@@ -33,7 +33,7 @@ def test_every_look_comes_back_by_its_alignment(sent: list[AlignmentLook]) -> No
         assert (each.looks, each.user) == (mine, "ann")
         assert each.residuals.shape == (len(each.marks), len(mine))
     assert sum(len(each.looks) for each in found) == len(sent)
-    assert [(each.id, each.purpose, each.end) for each in summary(recording).alignments] == [
+    assert [(each.id, each.purpose, each.end) for each in summarise(recording).alignments] == [
         (each.id, each.purpose, each.end) for each in found
     ]
 

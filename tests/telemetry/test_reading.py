@@ -23,8 +23,7 @@ from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry import journal, reading
 from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
-from trirail.telemetry.reading import read
-from trirail.telemetry.recorded_cycles import OlderRecordingWarning
+from trirail.telemetry.reading import OlderRecordingWarning, read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_robot import ShownRobot
@@ -306,3 +305,16 @@ def test_a_file_that_grows_while_it_is_read_is_read_up_to_a_whole_message(
     monkeypatch.setattr(reading, "RrdReader", slow_reader)
     assert len(read(tmp_path / "a.rrd").records) == 200
     recorder.close()
+
+
+def test_a_recording_is_read_by_its_name_and_printed_in_one_line(tmp_path: Path) -> None:
+    written(tmp_path / "a.rrd", made.records(0.5))
+    recording = read(str(tmp_path / "a.rrd"))
+    assert made.bits(recording.records) == made.bits(read(tmp_path / "a.rrd").records)
+    assert repr(recording) == str(recording)
+    assert "\n" not in repr(recording)
+    assert len(repr(recording)) < 200
+    assert f"{len(recording.records)} cycles" in repr(recording)
+    assert repr(recording._replace(records=recording.records[:0], t=recording.t[:0], name="")).startswith(
+        "<Recording unnamed"
+    )

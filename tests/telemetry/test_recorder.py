@@ -362,7 +362,7 @@ def test_the_log_of_frames_leaves_the_reserve_free_says_so_and_goes_on(
 ) -> None:
     usage = namedtuple("usage", "free")
     told: list[str] = []
-    recording = recorder(tmp_path, configured(capture_can=True), warn=told.append)
+    recording = recorder(tmp_path, configured(capture_can=True), warn=lambda text: told.append(text.text))
 
     def frame(number: int) -> None:
         recording.frames(CAPTURED.pack(number, Frame(0x200 + number).packed))

@@ -21,7 +21,7 @@ from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.records import DTYPE
 from trirail.wire.state import Info
 from trirail.wire.vocabulary import MODES, Mode
-from trirail.workspace.part_positions import RobotParts, sliders
+from trirail.workspace.part_positions import RobotParts, slider_points
 from trirail.workspace.reach import Reach
 from trirail.workspace.singularity import distance_to_singularity
 
@@ -71,7 +71,7 @@ def test_every_field_of_every_record_is_kept_as_it_was(scene: Scene) -> None:
 def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -> None:
     records = made.records(5.0, geometry)
     records["pose"], records["position"] = records["commanded_pose"], records["commanded_position"]
-    parts = RobotParts.of(geometry, CONFIG.limits.slider)
+    parts = RobotParts.from_geometry(geometry, CONFIG.limits.slider)
     config = _with_geometry(geometry)
     drawn = by_entity(Scene(ShownRobot.configured(config), 0).drawn(records, Standing()))
 
@@ -92,7 +92,7 @@ def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -
 
 
 def test_the_symmetric_robot_is_two_equal_triangles() -> None:
-    parts = RobotParts.of(Geometry.symmetric(0.3), CONFIG.limits.slider)
+    parts = RobotParts.from_geometry(Geometry.symmetric(0.3), CONFIG.limits.slider)
     (outline,) = parts.outline
     sides = np.linalg.norm(np.diff(outline, axis=0), axis=1)
     assert sides == pytest.approx([math.sqrt(3.0) * 0.3] * 3)
@@ -106,13 +106,13 @@ def test_the_symmetric_robot_is_two_equal_triangles() -> None:
 def test_a_platform_with_parallel_edges_is_drawn_as_its_edges() -> None:
     legs = GENERAL.legs
     parallel = Geometry(legs=(legs[0], legs[1], Leg((-0.25, 0.16), -1.08, 0.172, (-0.171, 0.002), 0.03)))
-    parts = RobotParts.of(parallel, CONFIG.limits.slider)
+    parts = RobotParts.from_geometry(parallel, CONFIG.limits.slider)
     assert [len(edge) for edge in parts.outline] == [2, 2, 2, 5]  # with the table over them
     assert [len(arm) for arm in parts.arms] == [2, 2, 2]
 
 
 def test_sliders_follow_their_rails() -> None:
-    at = sliders(Geometry.symmetric(0.3), np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
+    at = slider_points(Geometry.symmetric(0.3), np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
     assert at[1, 0] - at[0, 0] == pytest.approx([0.05, 0.1 * math.sqrt(3.0) / 2.0])
     assert np.array_equal(at[1, 1:], at[0, 1:])
 
@@ -184,7 +184,7 @@ def test_the_goal_is_drawn_where_it_leads_and_not_without_one(scene: Scene) -> N
     (lines,) = chunk.to_record_batch().column("LineStrips2D:strips").to_pylist()
     outline = np.array(lines[0])
     assert outline[:3].mean(axis=0) == pytest.approx([0.03, -0.02], abs=1e-6)
-    (home,) = RobotParts.of(Geometry.symmetric(0.3), CONFIG.limits.slider).outline
+    (home,) = RobotParts.from_geometry(Geometry.symmetric(0.3), CONFIG.limits.slider).outline
     assert math.dist(outline[0], (0.03, -0.02)) == pytest.approx(math.dist(home[0], (0.0, 0.0)), abs=1e-6)
     turned = np.arctan2(*(outline[0] - [0.03, -0.02])[::-1]) - np.arctan2(*home[0][::-1])
     assert math.remainder(turned, math.tau) == pytest.approx(0.4, abs=1e-5)
@@ -195,7 +195,7 @@ def test_the_goal_is_drawn_where_it_leads_and_not_without_one(scene: Scene) -> N
 def test_the_distance_to_singularity_is_that_of_the_mathematics() -> None:
     for geometry, tolerance in ((Geometry.symmetric(0.3), 1e-9), (GENERAL, math.radians(1.5))):
         poses = made.records(5.0)["commanded_pose"][::10]
-        found = Reach(geometry, CONFIG.limits).distance(poses)
+        found = Reach(geometry, CONFIG.limits).singularity_distance(poses)
         assert found == pytest.approx(np.abs(distance_to_singularity(geometry, poses)), abs=tolerance)
 
 

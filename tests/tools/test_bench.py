@@ -116,11 +116,11 @@ def test_a_rate_that_is_not_kept_is_said_and_not_met() -> None:
     bare = bench_loop.together([(cycles, 1), (cycles, 0)])
     assert (bare["cycles"], bare["answers"], bare["missed"], bare["lost_by_the_machine"]) == (4, 10, 4, 1)
     assert bare["cycle"][-1] == 40.0
-    found = bench_loop.of_both({"rate_hz": 4000, "seconds": 1.0, "not_kept": "9 faults"}, bare)
+    found = bench_loop.of_both({"rate_hz": 2000, "seconds": 1.0, "not_kept": "9 faults"}, bare)
     assert "to_bare" not in found
     assert any("9 faults" in line for line in bench.lines({"rates": [found]}))
-    (row,) = bench_aims.table({"loop": {"rates": [found]}})
-    assert (row["name"], row["measured"], row["met"]) == ("ticks missed at 4 kHz beyond the machine's", (), False)
+    rows = bench_aims.table({"loop": {"rates": [found]}})
+    assert [(row["measured"], row["met"]) for row in rows] == [((), False)] * 2, "the ratio and the ticks missed"
 
 
 def test_alignment_needs_one_correction_by_the_right_model_and_more_by_the_others() -> None:

@@ -16,6 +16,7 @@ import nbformat
 import pytest
 from trirail import Robot
 from trirail.client import own_service
+from trirail.client.async_client import AsyncRobot
 from trirail.panel.server import Panel
 
 EXAMPLES = Path(__file__).parents[2] / "tools/examples"
@@ -262,7 +263,7 @@ def test_javascript_and_json_alone_are_enough(
     program = tmp_path / "move_and_wait.js"
     text = (EXAMPLES / "move_and_wait.js").read_text(encoding="utf-8")
     program.write_text(text if pose_there is None else text.replace("[0.01, 0.02, 0.1]", pose_there))
-    with Robot("demo", service.locator) as robot, Panel(robot, 0) as panel:
+    with Panel(AsyncRobot("demo", service.locator), 0) as panel:
         command = ["node", str(program), panel.url]
         done = subprocess.run(command, env=NODE, capture_output=True, text=True, timeout=WITHIN, check=False)
     assert done.stdout.startswith(said), done.stdout + done.stderr

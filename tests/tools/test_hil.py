@@ -153,7 +153,7 @@ def test_the_foreign_drive_says_its_units_and_what_it_lacks() -> None:
         scales = scale_of("A", a), scale_of("B", b), scale_of("C", c)
         *_, looked = setup.survey(ends[0], drives, scales, 0.1, time.monotonic)
         assert not isinstance(looked, DriveError), looked
-        assert looked.lacking == ("1006",)
+        assert looked.missing_protections == ("1006",)
         assert looked.units.velocity_name == "rev/min"
     finally:
         over.set()

@@ -18,7 +18,8 @@ from refusals import refused_as
 from trirail.client import own_service
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, ServiceError
-from trirail.telemetry.reading import Line, Recording
+from trirail.telemetry.journal import Line
+from trirail.telemetry.recording import Recording
 from trirail.wire.goals import TrajectoryGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import Accepted

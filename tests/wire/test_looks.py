@@ -11,8 +11,9 @@ from refusals import refused_as
 from trirail.alignment.procedure import AlignmentEnd
 from trirail.errors import AlignmentFault, RefusalCode
 from trirail.wire import boundary
-from trirail.wire.looks import WELL, AlignmentLook, LookEnd, SeenMark
-from trirail.wire.packets import Happened, Looked, decode_answer, decode_request, event_packet, message
+from trirail.wire.looks import WELL, AlignmentLook, LookEnd, SeenMark, look_text
+from trirail.wire.messages import Notice
+from trirail.wire.packets import Announcement, Happened, decode_answer, decode_request, event_packet, message
 from trirail.wire.sizes import MAX_MESSAGE, MAX_PACKET
 from wire.looks import LARGEST, looks
 from wire.looks import told as event
@@ -22,14 +23,16 @@ from wire.looks import told as event
 def test_a_look_is_read_as_it_was_said_and_goes_between_the_processes(look: AlignmentLook) -> None:
     for encoding in (boundary.JSON, boundary.MSGPACK):
         assert boundary.decode(boundary.encode(look, encoding), AlignmentLook, "no look", encoding) == look
-    request = Looked("ann", "info", "so it looked", look)
+    request = Announcement(Notice("alignment", "info", "so it looked", user="ann", alignment=look))
     assert decode_request(message(request)[1:]) == request
     assert decode_answer(event_packet(event(1, look))[1:]) == Happened(event(1, look))
 
 
 def test_the_largest_fits_into_a_message_and_a_packet() -> None:
     assert len(boundary.encode(LARGEST)) <= MAX_MESSAGE
-    assert len(message(Looked("u" * 64, "warning", "w" * 4000, LARGEST))) <= MAX_PACKET
+    text = look_text(LARGEST, "w" * 6000)
+    notice = Notice("alignment", "warning", text.text, user="u" * 64, alignment=LARGEST, **text.fields)
+    assert len(message(Announcement(notice))) <= MAX_PACKET
     assert decode_answer(event_packet(event(1, LARGEST))[1:]) == Happened(event(1, LARGEST))
 
 

@@ -9,20 +9,17 @@ from trirail.errors import RefusalCode
 from trirail.wire import packets
 from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
-from trirail.wire.messages import Event
+from trirail.wire.messages import Event, GoalReply, Notice
 from trirail.wire.packets import (
     Accepted,
+    Announcement,
     Answer,
     CommandRequest,
     Confirmed,
     GoalRequest,
     Happened,
     Kind,
-    Looked,
-    PoseChanged,
     Refused,
-    RefusedRequest,
-    Remark,
     Request,
     Status,
     Welcome,
@@ -37,10 +34,10 @@ from trirail.wire.vocabulary import Command
     [
         GoalRequest(1, "ann", "g", PoseGoal(x=0.1, y=0.2, phi=0.3, speed=0.5, valid_for=1.0), 5),
         CommandRequest(2, "ann", Command.STOP),
-        RefusedRequest("ann", "no"),
-        PoseChanged("ann", "pose pick removed by ann"),
-        Looked("ann", "info", "a look", AlignmentLook("a", "check", 1)),
-        Remark("info", "linked to the router tls/192.0.2.9:7447"),
+        Announcement(Notice("refused", "warning", "no", user="ann", code=RefusalCode.BUSY)),
+        Announcement(Notice("pose", "info", "pose pick removed by ann", user="ann")),
+        Announcement(Notice("alignment", "info", "a look", user="ann", alignment=AlignmentLook("a", "check", 1))),
+        Announcement(Notice("service", "info", "linked to the router tls/192.0.2.9:7447")),
     ],
 )
 def test_requests(request_: Request) -> None:
@@ -52,7 +49,7 @@ def test_requests(request_: Request) -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        Accepted(1, "g", 0.5, 1.0, False, True),
+        Accepted(1, GoalReply("g", 0.5, queued=True)),
         Confirmed(2, Command.STOP, "holding", 1),
         Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
         Happened(Event("goal", "info", "goal g done", id="g", outcome="done", seq=1, t=0.5, cycle=500, time=1.0)),

@@ -15,6 +15,7 @@ from jsonschema import Draft202012Validator, ValidationError
 from trirail.client import own_service
 from trirail.errors import RefusalCode
 from trirail.wire import goals, zenoh_session
+from trirail.wire.goal_kind import field_description
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -63,6 +64,22 @@ def test_every_message_has_a_schema() -> None:
     }
     described = {name for file in message_schemas.MESSAGES for name in schema(file)["$defs"]}
     assert structs - described == set()
+
+
+@pytest.mark.parametrize("field", ["id", "valid_for", "speed", "limits", "blend", "tool", "frame"])
+def test_a_field_of_several_kinds_of_goals_means_the_same_in_schema_and_guide(field: str) -> None:
+    guide = Path(goals.__file__).parents[2] / "talking.md"
+    rows = [row.strip("| ").split(" | ") for row in guide.read_text(encoding="utf-8").splitlines() if row[:3] == "| `"]
+    told: dict[str, str] = {}
+    for name, of, meaning in rows:
+        if name == f"`{field}`":
+            told |= dict.fromkeys(of.split(", "), meaning.replace("`", ""))
+    of_kind = {str(kind.__struct_config__.tag): kind for kind in goals.KINDS if field in kind.__struct_fields__}
+    if "all" in told:
+        told = dict.fromkeys(of_kind, told["all"])
+    assert told == {kind: field_description(struct, field) for kind, struct in of_kind.items()}
+    for kind, struct in of_kind.items():
+        assert schema("goal")["$defs"][struct.__name__]["properties"][field]["description"] == told[kind]
 
 
 def test_the_schema_of_an_error_reply_tells_what_each_code_means() -> None:

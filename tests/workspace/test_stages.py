@@ -13,7 +13,7 @@ from trirail.workspace import part_positions
 from trirail.workspace.part_positions import RobotParts
 from trirail.workspace.singularity import conditioning, distance_to_singularity
 from trirail.workspace.violations import violations
-from trirail.workspace.workspace import extent, permitted, reachable
+from trirail.workspace.workspace import measure_extent, permitted_slice, reachable_slice
 
 
 @pytest.fixture(params=["uvw", "xxy", "uvw-ppr"])
@@ -34,19 +34,19 @@ def test_each_sliders_own_stroke_bounds_the_workspace(stage: Config, seed: int) 
     inside = ((motion.position >= low) & (motion.position <= high)).all(axis=1)
     inside &= (np.abs(motion.passive_position) <= 0.018).all(axis=1)
     assert [not violations(robot, limits, pose) for pose in poses] == inside.tolist()
-    polygon = permitted(robot, limits, phi)
+    polygon = permitted_slice(robot, limits, phi)
     sides = np.roll(polygon, -1, axis=0) - polygon
     arms = poses[:, None, :2] - polygon
     cross = sides[:, 0] * arms[..., 1] - sides[:, 1] * arms[..., 0]
     assert ((cross >= 0.0).all(axis=1) & (len(polygon) > 0)).tolist() == inside.tolist()
-    travel = RobotParts.of(robot, slider).travel
+    travel = RobotParts.from_geometry(robot, slider).travel
     assert [np.linalg.norm(end - start) for start, end in travel] == pytest.approx(high - low)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.04, -0.087])
 def test_a_slice_is_where_no_limit_is_exceeded(stage: Config, phi: float) -> None:
     robot, limits = geometry(stage.geometry), stage.limits
-    polygon = reachable(robot, limits, phi)
+    polygon = reachable_slice(robot, limits, phi)
     sides = np.roll(polygon, -1, axis=0) - polygon
     sides /= np.linalg.norm(sides, axis=1, keepdims=True)
     for x, y in np.random.default_rng(0).uniform(-0.016, 0.016, (60, 2)):
@@ -61,7 +61,7 @@ def test_a_slice_is_where_no_limit_is_exceeded(stage: Config, phi: float) -> Non
 
 
 def test_the_extent_is_that_of_the_strokes(stage: Config) -> None:
-    found = extent(geometry(stage.geometry), stage.limits, permitted)
+    found = measure_extent(geometry(stage.geometry), stage.limits, permitted_slice)
     assert_allclose((*found.x, *found.y), (-0.01, 0.01, -0.01, 0.01), atol=1e-9)
     assert_allclose(found.phi, stage.limits.platform.phi, atol=1e-9)
     assert found.volume > 0.0
@@ -81,12 +81,12 @@ def test_the_distance_to_a_singularity_is_that_to_the_nearest_singular_angle(sta
 
 def test_rails_carriages_cross_slides_and_table_are_drawn_where_they_are(stage: Config) -> None:
     robot = geometry(stage.geometry)
-    parts = RobotParts.of(robot, stage.limits.slider)
+    parts = RobotParts.from_geometry(robot, stage.limits.slider)
     pose = np.array([[0.003, -0.002, 0.06]])
     motion = inverse(robot, pose)
-    carriages = part_positions.sliders(robot, motion.position)
-    pivots = part_positions.pivots(robot, carriages, pose)
-    lines = part_positions.cross_slides(robot, parts, carriages, pose[:, 2])
+    carriages = part_positions.slider_points(robot, motion.position)
+    pivots = part_positions.pivot_points(robot, carriages, pose)
+    lines = part_positions.cross_slide_lines(robot, parts, carriages, pose[:, 2])
     for k, leg in enumerate(robot.each):
         rail = carriages[0, k] - leg.anchor
         assert rail @ (-math.sin(leg.rail_angle), math.cos(leg.rail_angle)) == pytest.approx(0.0, abs=1e-12)

@@ -15,7 +15,7 @@ from trirail.config import SIM, Limits, load
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, Leg, singular_angles
 from trirail.kinematics.robot import inverse, jacobians
-from trirail.workspace.aspect import range_of_phi
+from trirail.workspace.aspect import phi_range
 from trirail.workspace.singularity import (
     characteristic_length,
     conditioning,
@@ -23,7 +23,7 @@ from trirail.workspace.singularity import (
     sensitivity,
 )
 from trirail.workspace.violations import violations
-from trirail.workspace.workspace import area, extent, permitted, reachable
+from trirail.workspace.workspace import measure_extent, permitted_slice, polygon_area, reachable_slice
 
 Array = NDArray[np.float64]
 
@@ -163,14 +163,14 @@ def test_the_distance_is_negative_in_another_aspect() -> None:
     low, high = -2 * math.pi / 3, math.pi / 3
     expected = [high, high - 1.0, high - 1.1, -2.0 - low, -2.2 - low]
     assert_allclose(distance_to_singularity(PAPER, poses), expected, atol=1e-12)
-    assert_allclose(range_of_phi(PAPER), [low, high], atol=1e-12)
+    assert_allclose(phi_range(PAPER), [low, high], atol=1e-12)
 
 
 def test_beyond_a_singularity_of_j2_alone_the_distance_is_negative_too() -> None:
     robot = next(
         robot
         for robot in (as_built(seed, 0.01) for seed in range(100))
-        if min(angle for angle in singular_angles(robot) if angle > 0.0) < range_of_phi(robot)[1] - 0.1
+        if min(angle for angle in singular_angles(robot) if angle > 0.0) < phi_range(robot)[1] - 0.1
     )
     nearest = min(angle for angle in singular_angles(robot) if angle > 0.0)
     for step in (0.02, -0.02):
@@ -197,7 +197,7 @@ def slack(robot: Geometry, limits: Limits, poses: Array) -> Array:
     motion = inverse(robot, poses)
     position, passive = motion.position, motion.passive_position
     (low, high), (inner, outer) = limits.slider.positions[0], limits.slider.passive
-    start, end = range_of_phi(robot)
+    start, end = phi_range(robot)
     phi, margin = poses[:, 2], limits.singularity_margin
     left = np.minimum(phi - start, end - phi) - margin
     for turn in np.linspace(-margin, margin, 257):
@@ -225,16 +225,16 @@ def test_a_slice_is_where_every_limit_is_kept(robot: Geometry, limits: Limits, p
     except KinematicsError:
         assume(False)
     clear = np.abs(least) > 1e-4
-    inside = contains(reachable(robot, limits, phi), poses[:, :2])
+    inside = contains(reachable_slice(robot, limits, phi), poses[:, :2])
     assert_allclose(inside[clear], least[clear] > 0.0)
 
 
 @given(robots, some_limits, st.floats(-1.0, 0.8))
 @settings(max_examples=300, deadline=None)
 def test_at_every_vertex_two_limits_are_reached(robot: Geometry, limits: Limits, phi: float) -> None:
-    polygon = reachable(robot, limits, phi)
+    polygon = reachable_slice(robot, limits, phi)
     assume(len(polygon) > 0)
-    assert area(polygon) > 0.0
+    assert polygon_area(polygon) > 0.0
     poses = np.column_stack([polygon, np.full(len(polygon), phi)])
     kept = slack(robot, limits, poses)
     rounding = 1e-12 * (1.0 + np.abs(sensitivity(robot, poses)).max())
@@ -245,7 +245,7 @@ def test_at_every_vertex_two_limits_are_reached(robot: Geometry, limits: Limits,
 
 def test_vertices_are_exact() -> None:
     for phi in np.linspace(-1.0, 0.85, 41):
-        polygon = reachable(PAPER, LIMITS, phi)
+        polygon = reachable_slice(PAPER, LIMITS, phi)
         kept = slack(PAPER, LIMITS, np.column_stack([polygon, np.full(len(polygon), phi)]))[:, :-1]
         assert kept.min() > -1e-12
         assert (np.count_nonzero(kept < 1e-12, axis=1) >= 2).all()
@@ -254,7 +254,7 @@ def test_vertices_are_exact() -> None:
 @given(robots, some_limits, st.floats(-1.0, 0.8))
 @settings(deadline=None)
 def test_slices_are_convex_and_anticlockwise(robot: Geometry, limits: Limits, phi: float) -> None:
-    polygon = permitted(robot, limits, phi)
+    polygon = permitted_slice(robot, limits, phi)
     assume(len(polygon) > 0)
     assert len(polygon) >= 3
     sides = np.roll(polygon, -1, axis=0) - polygon
@@ -275,8 +275,8 @@ def test_the_area_at_zero_by_hand(low: float, high: float) -> None:
     """
     corner = max(2 * low - high, 0.0)
     expected = math.sqrt(3) / 4 * ((3 * low) ** 2 - 3 * corner**2)
-    polygon = reachable(PAPER, limited((-low, high), (-low, high)), 0.0)
-    assert_allclose(area(polygon), expected, rtol=1e-12)
+    polygon = reachable_slice(PAPER, limited((-low, high), (-low, high)), 0.0)
+    assert_allclose(polygon_area(polygon), expected, rtol=1e-12)
     assert len(polygon) == (3 if corner == 0.0 else 6)
 
 
@@ -285,22 +285,26 @@ def test_the_window_at_zero_by_hand() -> None:
     bottom, tip, half = -0.17 * math.sqrt(3) / 2, 0.17 * math.sqrt(3), 0.15
     bend = tip - half * math.sqrt(3)  # up to here the window is narrower than the triangle
     above = ((tip - bend) ** 2 - (tip - half) ** 2) / math.sqrt(3)
-    assert_allclose(area(permitted(PAPER, LIMITS, 0.0)), 2 * half * (bend - bottom) + above, rtol=1e-12)
+    assert_allclose(polygon_area(permitted_slice(PAPER, LIMITS, 0.0)), 2 * half * (bend - bottom) + above, rtol=1e-12)
 
 
 def test_outside_of_the_window_and_beyond_the_margin_nothing_is_left() -> None:
-    low, high = range_of_phi(PAPER)
+    low, high = phi_range(PAPER)
     everything = limited((-9.0, 9.0), (-9.0, 9.0), margin=0.2)
     for end, inwards in ((low, 0.2), (high, -0.2)):
-        assert len(reachable(PAPER, everything, end + inwards * 1.0001)) > 0
-        assert len(reachable(PAPER, everything, end + inwards * 0.9999)) == 0
+        assert len(reachable_slice(PAPER, everything, end + inwards * 1.0001)) > 0
+        assert len(reachable_slice(PAPER, everything, end + inwards * 0.9999)) == 0
         # as near to a singular angle as the margin lets slices come, rounding leaves them whole
-        at_end, before = (area(reachable(PAPER, everything, end + inwards * part)) for part in (1 + 1e-9, 1.0001))
+        at_end, before = (
+            polygon_area(reachable_slice(PAPER, everything, end + inwards * part)) for part in (1 + 1e-9, 1.0001)
+        )
         assert_allclose(at_end, before, rtol=1e-3)
-    assert len(reachable(PAPER, everything, 2.0)) == 0  # another aspect
-    assert_allclose(reachable(PAPER, everything, 0.3 - 2 * math.pi), reachable(PAPER, everything, 0.3), atol=1e-9)
-    assert len(permitted(PAPER, LIMITS, 0.8499)) > 0
-    assert len(permitted(PAPER, LIMITS, 0.8501)) == 0 < len(reachable(PAPER, LIMITS, 0.8501))
+    assert len(reachable_slice(PAPER, everything, 2.0)) == 0  # another aspect
+    assert_allclose(
+        reachable_slice(PAPER, everything, 0.3 - 2 * math.pi), reachable_slice(PAPER, everything, 0.3), atol=1e-9
+    )
+    assert len(permitted_slice(PAPER, LIMITS, 0.8499)) > 0
+    assert len(permitted_slice(PAPER, LIMITS, 0.8501)) == 0 < len(reachable_slice(PAPER, LIMITS, 0.8501))
 
 
 @pytest.mark.parametrize("seed", [4, 5, 10])
@@ -308,12 +312,14 @@ def test_the_margin_cuts_a_slice_of_a_robot_as_built(seed: int) -> None:
     """There det J2 depends on G: at the same angle one part of a slice keeps the margin and another does not."""
     robot = as_built(seed, 0.01)
     nearest = min(angle for angle in singular_angles(robot) if angle > 0.0)
-    assert nearest < range_of_phi(robot)[1] - 0.1
+    assert nearest < phi_range(robot)[1] - 0.1
     origin = np.zeros((1, 2))
-    wide, narrow = (reachable(robot, limited((-0.5, 0.5), (-0.5, 0.5), m), nearest - 0.1) for m in (0.0999, 0.1001))
+    wide, narrow = (
+        reachable_slice(robot, limited((-0.5, 0.5), (-0.5, 0.5), m), nearest - 0.1) for m in (0.0999, 0.1001)
+    )
     assert contains(wide, origin)
     assert not contains(narrow, origin)
-    assert 0.0 < area(narrow) < area(wide)
+    assert 0.0 < polygon_area(narrow) < polygon_area(wide)
 
 
 # ---- violations
@@ -322,13 +328,13 @@ def test_the_margin_cuts_a_slice_of_a_robot_as_built(seed: int) -> None:
 def test_violations_name_leg_value_and_limit() -> None:
     assert violations(PAPER, LIMITS, [0.0, 0.0, 0.0]) == []
     found = violations(PAPER, LIMITS, [0.3, 0.0, 0.0])  # by hand: lambda = 0, -x, x; the passive ones x, 0, -x
-    assert [(v.what, v.quantity, v.limit) for v in found] == [
+    assert [(v.axis, v.quantity, v.limit) for v in found] == [
         ("B", "position", -0.17),
         ("C", "passive position", -0.17),
     ]
     assert_allclose([v.value for v in found], -0.3, atol=1e-12)
     (near,) = violations(PAPER, LIMITS, [0.0, 0.0, 1.0])
-    assert (near.what, near.quantity, near.limit, near.unit) == ("phi", "distance to singularity", 0.15, "rad")
+    assert (near.axis, near.quantity, near.limit, near.unit) == ("phi", "distance to singularity", 0.15, "rad")
     assert_allclose(near.value, math.pi / 3 - 1.0, atol=1e-12)
 
 
@@ -338,7 +344,7 @@ def test_a_pose_in_the_slice_violates_nothing(robot: Geometry, limits: Limits, s
     x, y, phi = np.random.default_rng(seed).uniform(-0.3, 0.3, 3).tolist()
     least = slack(robot, limits, np.array([[x, y, phi]])).min()
     assume(abs(least) > 1e-3)
-    inside = contains(reachable(robot, limits, phi), np.array([[x, y]]))[0]
+    inside = contains(reachable_slice(robot, limits, phi), np.array([[x, y]]))[0]
     assert inside == (violations(robot, limits, [x, y, phi]) == [])
 
 
@@ -347,7 +353,7 @@ def test_a_pose_in_the_slice_violates_nothing(robot: Geometry, limits: Limits, s
 
 def test_extents_by_hand() -> None:
     """The slice at zero is the widest; a platform at the origin turns until all three sliders meet an end."""
-    found = extent(PAPER, LIMITS, reachable)
+    found = measure_extent(PAPER, LIMITS, reachable_slice)
     assert_allclose(found.x, [-0.255, 0.255], atol=1e-9)
     assert_allclose(found.y[1], 0.17 * math.sqrt(3), atol=1e-9)
     sliders = 3 * -0.17
@@ -361,7 +367,7 @@ def test_extents_by_hand() -> None:
 @pytest.mark.parametrize("robot", [PAPER, as_built(1, 0.01)])
 def test_the_volume_by_chance(robot: Geometry) -> None:
     """Poses drawn at random in a box around the window, against the joints' limits."""
-    found = extent(robot, LIMITS, permitted)
+    found = measure_extent(robot, LIMITS, permitted_slice)
     window = LIMITS.platform
     low, high = np.array([window.x, window.y, window.phi]).T
     poses = np.random.default_rng(0).uniform(low, high, (10_000, 3))
@@ -376,4 +382,4 @@ def test_the_volume_by_chance(robot: Geometry) -> None:
 
 def test_limits_that_leave_nothing_are_refused() -> None:
     with pytest.raises(KinematicsError, match="no pose is within the limits"):
-        extent(PAPER, limited((0.2, 0.3), (-0.3, -0.2)), reachable)
+        measure_extent(PAPER, limited((0.2, 0.3), (-0.3, -0.2)), reachable_slice)

@@ -1,1 +1,1 @@
-"""What carries frames: buses, what is heard and sent on them, what goes wrong with them."""
+"""CAN frames and buses, and their errors."""

@@ -1,4 +1,4 @@
-"""What python-can's interfaces need beside python-can: another package, or the library of the adapter's maker."""
+"""Requirements of python-can's interfaces: further packages, or the library of the adapter's maker."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _PACKAGES: Final = {
     "slcan": (("serial",), "serial"),
     "udp_multicast": (("msgpack",), "multicast"),
 }
-"""By interface: the modules that it imports, and python-can's extra that brings them."""
+"""Modules that an interface imports, and python-can's extra that installs them."""
 _LIBRARIES: Final = {
     "kvaser": ("canlib", "Kvaser's CANlib"),
     "pcan": ("pcanbasic", "PEAK's PCAN-Basic"),
 }
-"""By interface: the library of the adapter's maker. Linux has drivers of its own for both makers' adapters."""
+"""Library of the adapter's maker. Linux has its own drivers for the adapters of both makers."""
 
 
-def lacking(interface: str) -> str:
-    """What this machine lacks for an interface, with how to get it; "" where nothing is known to be missing."""
+def missing_support(interface: str) -> str:
+    """Return what this machine lacks for an interface and how to install it; "" if nothing is known to be missing."""
     modules, extra = _PACKAGES.get(interface, ((), ""))
     if missing := [module for module in modules if find_spec(module) is None]:
         return f"the Python module {missing[0]}; install it with: pip install 'python-can[{extra}]'"

@@ -1,7 +1,7 @@
-"""What goes wrong on a CAN bus, in words: error frames, and frames that cannot be sent.
+"""Errors of a CAN bus in words: error frames, and frames that cannot be sent.
 
 Error frames are those of SocketCAN (linux/can/error.h): the identifier holds their classes, eight bytes of data the
-details. Controllers of other interfaces number theirs in ways of their own.
+details. Other interfaces have their own codings.
 """
 
 from __future__ import annotations
@@ -86,28 +86,28 @@ _WIRES = {
 }
 
 
-class Gravity(IntEnum):
-    """How much a report of the controller matters."""
+class Severity(IntEnum):
+    """Severity of an error frame."""
 
     ROUTINE = 0
-    """Part of a bus that works: arbitration lost, errors over."""
+    """Normal on a working bus: arbitration lost, errors over."""
     WARNING = 1
-    """The bus still carries frames, but something is wrong with it."""
+    """The bus still carries frames, with errors."""
     FAULT = 2
-    """The bus carries nothing any more."""
+    """The bus no longer carries frames."""
 
 
-class Report(NamedTuple):
-    """What an error frame says."""
+class ErrorReport(NamedTuple):
+    """Content of an error frame."""
 
-    gravity: Gravity
+    severity: Severity
     text: str
 
 
-def report(kind: int, data: bytes | bytearray) -> Report:
-    """Read an error frame's identifier and data; one that is not SocketCAN's is a warning that says so."""
+def decode_error_frame(kind: int, data: bytes | bytearray) -> ErrorReport:
+    """Decode an error frame's identifier and data; one in another coding than SocketCAN's is a warning."""
     if len(data) != _LENGTH:
-        return Report(Gravity.WARNING, f"error frame {kind:X} in the interface's own coding")
+        return ErrorReport(Severity.WARNING, f"error frame {kind:X} in the interface's own coding")
     parts = [words for bit, words in _CLASSES.items() if kind & bit]
     if kind & CONTROLLER:
         parts += [words for bit, words in _CONTROLLER.items() if data[1] & bit] or ["controller problem"]
@@ -119,25 +119,25 @@ def report(kind: int, data: bytes | bytearray) -> Report:
         parts.append("arbitration lost")
     text = "; ".join(parts) or f"error frame {kind:X}"
     if kind & BUS_OFF:
-        return Report(Gravity.FAULT, text)
-    told = kind & ~(_LOST_ARBITRATION | 0x200)  # 200h says only that the error counters are in the data
-    routine = not told or (told == CONTROLLER and data[1] == ACTIVE)
-    return Report(Gravity.ROUTINE if routine else Gravity.WARNING, text)
+        return ErrorReport(Severity.FAULT, text)
+    errors = kind & ~(_LOST_ARBITRATION | 0x200)  # CAN_ERR_CNT, 200h: only that the data has the error counters
+    routine = not errors or (errors == CONTROLLER and data[1] == ACTIVE)
+    return ErrorReport(Severity.ROUTINE if routine else Severity.WARNING, text)
 
 
 def queue_is_full(error: Exception) -> bool:
-    """Whether a frame was not sent only because others still wait: it may be different in the next cycle."""
-    # ENOBUFS: the interface's queue takes no more; EAGAIN, and python-can without a number: the socket does not.
+    """Whether a frame was not sent because the transmit queue is full, which may have passed in the next cycle."""
+    # ENOBUFS: the interface's queue is full; EAGAIN, and python-can without a number: the socket's.
     number = error_number(error)
     return number in (errno.ENOBUFS, errno.EAGAIN) or (isinstance(error, can.CanOperationError) and number is None)
 
 
-def cannot_send(error: Exception) -> str:
-    """Why a frame could not be sent, and what to do."""
+def explain(error: Exception, *, sending: bool = True) -> str:
+    """Return the reason for which a frame could not be sent or received, with the remedy."""
     reason = " ".join(str(error).split())
-    if queue_is_full(error):
+    if sending and queue_is_full(error):
         return (
-            f"{reason}: the transmit queue is full, because nobody acknowledges (are the drives powered? check cable, "
+            f"{reason}: the transmit queue is full, because no node acknowledges (are the drives powered? check cable, "
             f"termination, bitrate) or it is shorter than a cycle's frames: ip link set DEV txqueuelen 100"
         )
     match error_number(error):
@@ -146,12 +146,12 @@ def cannot_send(error: Exception) -> str:
         case errno.ENODEV | errno.ENXIO:
             return f"{reason}: the interface is gone; is the adapter still plugged in?"
         case errno.EPIPE | errno.ECONNRESET:
-            return f"{reason}: the end of the bus that listens is gone"
+            return f"{reason}: the listening end of the bus is gone"
     return reason
 
 
 def error_number(error: BaseException | None) -> int | None:
-    """The system's error number, from the error or from what caused it."""
+    """Return the system's error number, from the error or from its causes."""
     while error is not None:
         number = error.error_code if isinstance(error, can.CanError) else getattr(error, "errno", None)
         if number is not None:

@@ -1,7 +1,7 @@
-"""How compiled code, which runs cycles, reaches a bus: on its socket, else by two functions of Python's.
+"""Access of compiled cycles to a bus: on its socket, or by two Python functions if it has none.
 
-These functions are called as libc's recvmmsg and sendmmsg are, and move the same frames in the same order, one by one.
-What they meet is kept for whoever moves the next frame, and raised there: as if he had met it himself.
+These functions are called like libc's recvmmsg and sendmmsg, and move the same frames in the same order, one by one.
+An exception cannot pass compiled code, so they keep it, and the next `send` or `receive` raises it.
 """
 
 from __future__ import annotations
@@ -17,86 +17,86 @@ from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 
 _CALL = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-"""Given the address of frames, `struct can_frame` one after the other, and how many these are."""
+"""Function of the address of consecutive `struct can_frame`, and their number."""
 
 
 class LentFrames(FrameIO, Protocol):
-    """Frames to and from a bus that somebody else may move for a while."""
+    """Frames to and from a bus that compiled code may move for a while."""
 
     @property
     def access(self) -> BusAccess:
-        """How he reaches the bus."""
+        """Access for compiled code."""
 
-    def hand_in(self, arrived: PackedFrames, number: int, error: int) -> None:
-        """So many frames that he took and has not looked at, and the error that he met after them (errno.h).
+    def hand_in(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+        """Take back `number` frames: `receive` returns those after the first `handled`, then raises `error` (errno.h).
 
-        They come before all that is there.
+        `error` is 0 if receiving has not failed.
         """
 
 
-def lendable(frames: FrameIO) -> LentFrames:
-    """Return frames that may be lent, on their socket where nothing has to know of each."""
+def lendable_frames(frames: FrameIO) -> LentFrames:
+    """Return frames that compiled code can move: on their socket, unless every frame must be captured."""
     return frames if isinstance(frames, SocketFrames) and not frames.captured else FrameCalls(frames)
 
 
 class FrameCalls:
-    """Frames to and from any bus, moved by Python for whoever asks."""
+    """Frames to and from any bus, moved by Python for compiled code."""
 
     def __init__(self, frames: FrameIO) -> None:
         self._frames = frames
-        self._taken: list[Received] = []
-        """Frames that the function has taken last."""
-        self._handed_in: deque[Received] = deque()
+        self._last_received: list[Received] = []
+        """Frames of the last receiving call."""
+        self._returned: deque[Received] = deque()
         self._failure: BaseException | None = None
-        """With which receiving has failed, behind those handed in."""
+        """Exception of receiving, to be raised after the returned frames."""
         self._refusal: BaseException | None = None
-        """With which the next frame has been refused."""
+        """Exception of sending, to be raised by the next `send`."""
         self._calls = _CALL(self._receive_all), _CALL(self._send_all)
         receive, send = (ctypes.cast(call, ctypes.c_void_p).value or 0 for call in self._calls)
         self.access = BusAccess(-1, receive, send)
 
     def send(self, frame: Frame) -> None:
-        """Send a frame at once, or raise."""
+        """Send a frame without waiting, or raise."""
         if self._refusal is not None:
             error, self._refusal = self._refusal, None
             raise error
         self._frames.send(frame)
 
     def receive(self, timeout: float = 0.0) -> Received | None:
-        """The next frame that has arrived, or arrives within `timeout` [s]; None where there is none left."""
-        if self._handed_in:
-            return self._handed_in.popleft()
+        """Return the next frame that has arrived or arrives within `timeout` [s], or None."""
+        if self._returned:
+            return self._returned.popleft()
         if self._failure is not None:
             error, self._failure = self._failure, None
             raise error
         return self._frames.receive(timeout)
 
-    def hear(self, identifiers: Collection[int]) -> None:
-        """As the frames themselves."""
-        self._frames.hear(identifiers)
+    def set_identifiers(self, identifiers: Collection[int]) -> None:
+        """Restrict the received identifiers, see FrameIO."""
+        self._frames.set_identifiers(identifiers)
 
-    def hand_in(self, arrived: PackedFrames, number: int, error: int) -> None:  # noqa: ARG002 - both are kept here
-        """So many frames of those taken last have not been looked at."""
-        self._handed_in.extend(self._taken[:number])
+    def hand_in(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
+        """Take frames back: `receive` returns those of the last call after the first `handled`."""
+        self._returned.extend(self._last_received[handled:number])
 
     def _receive_all(self, address: int, most: int) -> int:
-        taken = self._taken = []
+        frames = self._last_received = []
         try:
-            while len(taken) < most and (received := self._frames.receive()) is not None:
+            while len(frames) < most and (received := self._frames.receive()) is not None:
                 identifier, data = received
                 ctypes.memmove(address, CAN_FRAME.pack(identifier, len(data), data), CAN_FRAME.size)
-                taken.append(received)
+                frames.append(received)
                 address += CAN_FRAME.size
-        except BaseException as error:  # noqa: BLE001 - nothing gets through compiled code; it is raised behind that
+        except BaseException as error:  # noqa: BLE001 - no exception passes compiled code; the next receive raises it
             self._failure = error
-            return ~len(taken)
-        return len(taken)
+            return ~len(frames)  # negative even for 0 frames
+        return len(frames)
 
     def _send_all(self, address: int, number: int) -> int:
         try:
             for sent in range(number):
-                self._frames.send(Frame.of(ctypes.string_at(address + sent * CAN_FRAME.size, CAN_FRAME.size)))
-        except BaseException as error:  # noqa: BLE001 - likewise
+                self._frames.send(Frame.from_packed(ctypes.string_at(address + sent * CAN_FRAME.size, CAN_FRAME.size)))
+        except BaseException as error:  # noqa: BLE001 - the next send raises it
             self._refusal = error
             return sent
         return number

@@ -1,4 +1,4 @@
-"""Frames in memory as compiled code moves them, many at once, and how it reaches the bus for that."""
+"""Arrays of frames that compiled code sends and receives in one call, and its access to the bus."""
 
 from __future__ import annotations
 
@@ -7,57 +7,59 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEAD
+from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT, HEADER
 from trirail_drivers.bus.frames import Frame
 
 
 class BusAccess(NamedTuple):
-    """How a bus is reached by who is compiled."""
+    """Access of compiled code to a bus: a socket or, if it has none, two functions."""
 
     descriptor: int
-    """Its socket of `struct can_frame`, one a packet; below 0 where it has none, and the functions are to be called."""
+    """Socket of `struct can_frame`, one per packet; below 0 if there is none and the functions must be called."""
     receive: int = 0
-    """Address of a function that fills so many frames at most; returns their number, or `~number` if it then failed."""
+    """Address of a function that fills up to n frames; returns their number, or `~number` if it then failed."""
     send: int = 0
-    """Address of a function that sends so many frames; returns how many the bus has taken, before the first refused."""
+    """Address of a function that sends n frames; returns the number sent before the first failure."""
 
 
 class PackedFrames:
-    """Frames as libc's sendmmsg and recvmmsg take them: `struct mmsghdr` of sys/socket.h, one `iovec` each."""
+    """Frames for libc's sendmmsg and recvmmsg: `struct mmsghdr` of sys/socket.h, one `iovec` each."""
 
     def __init__(self, number: int) -> None:
         self.frames = np.zeros((number, CAN_FRAME.size), np.uint8)
-        """`struct can_frame`, one a row."""
+        """`struct can_frame`, (number, size) of uint8."""
         self._vectors = np.zeros((number, 2), np.uint64)
         self.headers = np.zeros((number, 8), np.uint64)
-        """`struct mmsghdr`: what was received of each is in the last number."""
+        """`struct mmsghdr`; its last number is the received length [bytes]."""
+        # On 64-bit Linux a header is msg_name, msg_namelen, msg_iov, msg_iovlen, msg_control, msg_controllen,
+        # msg_flags, msg_len, eight bytes each with padding.
         for frame, vector, header in zip(self.frames, self._vectors, self.headers, strict=True):
             vector[:] = frame.ctypes.data, CAN_FRAME.size
             header[2:4] = vector.ctypes.data, 1
 
     def part(self, first: int, end: int) -> PackedFrames:
-        """Return some of them, which stay the same."""
+        """Return a view of a range of the frames."""
         part = PackedFrames.__new__(PackedFrames)
         part.frames, part._vectors, part.headers = self.frames[first:end], self._vectors, self.headers[first:end]
         return part
 
     def fill(self, frames: Iterable[Frame]) -> None:
-        """Have these frames."""
+        """Replace the frames."""
         for row, frame in zip(self.frames, frames, strict=True):
             row[:] = np.frombuffer(frame.packed, np.uint8)
 
-    def unpacked(self, number: int) -> list[tuple[int, bytearray]]:
-        """The first so many, as identifier with flags and data."""
-        found = []
-        for row in self.frames[:number]:
+    def unpacked(self, first: int, end: int) -> list[tuple[int, bytearray]]:
+        """Return a range of the frames, as identifier with flags and data."""
+        unpacked = []
+        for row in self.frames[first:end]:
             packed = row.tobytes()
-            identifier, length = HEAD.unpack_from(packed)
-            found.append((identifier, bytearray(packed[DATA_AT : DATA_AT + length])))
-        return found
+            identifier, length = HEADER.unpack_from(packed)
+            unpacked.append((identifier, bytearray(packed[DATA_AT : DATA_AT + length])))
+        return unpacked
 
 
 def packed_frames(frames: Sequence[Frame]) -> PackedFrames:
     """Pack frames."""
-    made = PackedFrames(len(frames))
-    made.fill(frames)
-    return made
+    result = PackedFrames(len(frames))
+    result.fill(frames)
+    return result

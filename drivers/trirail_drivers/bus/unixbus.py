@@ -13,18 +13,17 @@ import can
 
 from trirail_drivers.bus.can_frame import CAN_FRAME
 from trirail_drivers.bus.frames import packed, unpacked
-from trirail_drivers.errors import BusError
+from trirail_drivers.errors import BusAbsentError, BusError
 
-MOST_WAITING = 1 << 22
-"""Bytes that the kernel may keep of frames on their way, where its limit is not lower."""
+SEND_BUFFER_BYTES = 1 << 22
+"""Requested size of a socket's send buffer [bytes]; the kernel's limit may be lower."""
 
 
 class UnixBus(can.BusABC):
     """One end of a bus over an AF_UNIX SOCK_SEQPACKET socket at the path `channel`.
 
-    The end that listens makes the bus: whenever it receives, it relays each frame to all its peers but the
-    sender. Any number of others connect. A peer that does not read loses frames, like a full CAN controller.
-    Each packet is a `struct can_frame`.
+    One end listens: whenever it receives, it relays each frame to all its peers but the sender. Any number of others
+    connect. A peer that does not read loses frames, like a full CAN controller. Each packet is a `struct can_frame`.
     """
 
     def __init__(self, channel: str, listen: bool = False, **kwargs: object) -> None:
@@ -42,11 +41,12 @@ class UnixBus(can.BusABC):
                 self._add(_connect(self._path))
         except OSError as error:
             self._epoll.close()
-            raise BusError(_remedy(self._path, listen)) from error
+            kind = BusError if listen else BusAbsentError
+            raise kind(_remedy(self._path, listen)) from error
         super().__init__(channel, **kwargs)  # type: ignore[arg-type]
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Send to the peers; raises can.CanOperationError where the listening end is gone or too slow."""
+        """Send to the peers; raises can.CanOperationError if the listening end is gone or too slow."""
         if msg.is_fd:
             raise can.CanOperationError(f"{self.channel_info}: classical CAN frames only, not CAN FD")
         packet = packed(msg)
@@ -60,15 +60,15 @@ class UnixBus(can.BusABC):
 
     @property
     def carrier(self) -> socket.socket | None:
-        """The socket on which a connected end sends and receives; None of the end that listens, or that was left."""
+        """Socket of a connected end; None for the listening end, and after the connection was lost."""
         return next(iter(self._peers.values()), None) if self._listener is None else None
 
     def fileno(self) -> int:
-        """Readable when a frame or a new peer may be there."""
+        """Return a descriptor that is readable when a frame or a new peer may be there."""
         return self._epoll.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus; the listening end ends it for all."""
+        """Leave the bus; the listening end closes it for all."""
         if self._is_shutdown:
             return
         super().shutdown()
@@ -92,9 +92,9 @@ class UnixBus(can.BusABC):
     def _listen(self) -> socket.socket:
         with contextlib.suppress(OSError):
             _connect(self._path).close()
-            raise BusError(f"{self.channel_info}: somebody listens there already; stop it or take another path")
+            raise BusError(f"{self.channel_info}: another process listens there; stop it or use another path")
         if self._path.is_socket():
-            self._path.unlink()  # left behind by one that died
+            self._path.unlink()  # left by a process that died
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
             listener.bind(str(self._path))
@@ -110,7 +110,7 @@ class UnixBus(can.BusABC):
         self._epoll.register(peer, select.EPOLLIN)
 
     def _read_frame(self, peer: socket.socket) -> None:
-        """Read one frame, or the end, of a peer."""
+        """Read one frame of a peer, or its end of file."""
         try:
             packet = peer.recv(CAN_FRAME.size)
         except ConnectionError:
@@ -130,18 +130,18 @@ class UnixBus(can.BusABC):
             return
         for peer in self._peers.values():
             if peer is not sender:
-                with contextlib.suppress(OSError):  # full, or about to be found closed
+                with contextlib.suppress(OSError):  # buffer full, or closed, which the next read finds
                     peer.send(packet)
 
 
-def widen(peer: socket.socket) -> None:
-    """Let frames wait for a peer that its machine keeps waiting: as many as the system's limit has room for."""
-    peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_WAITING)
+def widen_send_buffer(peer: socket.socket) -> None:
+    """Enlarge the send buffer, within the system's limit, for a peer that is not scheduled for a while."""
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
 
 
 def _connect(path: Path) -> socket.socket:
     peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    widen(peer)
+    widen_send_buffer(peer)
     try:
         peer.connect(str(path))
     except OSError:
@@ -153,4 +153,4 @@ def _connect(path: Path) -> socket.socket:
 def _remedy(path: Path, listen: bool) -> str:
     if listen:
         return f"unix {path}: cannot listen there; is the folder writable, the path under 108 bytes?"
-    return f"unix {path}: nobody listens there; start tools/virtual_drives.py --interface unix --channel {path}"
+    return f"unix {path}: no process listens there; start tools/virtual_drives.py --interface unix --channel {path}"

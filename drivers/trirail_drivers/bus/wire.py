@@ -1,7 +1,8 @@
-"""A CAN bus as the cycle uses it: it never waits and never raises, and keeps the first fault."""
+"""Access of the cycle to the CAN bus: it never waits or raises, latches the first fault, and reopens a lost bus."""
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Callable
 from typing import Protocol
@@ -10,40 +11,50 @@ import can
 
 from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.can_frame import ERROR, EXTENDED_BITS
-from trirail_drivers.bus.frame_calls import lendable
+from trirail_drivers.bus.frame_calls import lendable_frames
 from trirail_drivers.bus.frame_io import frame_io
 from trirail_drivers.bus.frames import BITS, Frame
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
+from trirail_drivers.bus.reopening import AbsentBus, Reopening
+from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Clock, DriveFault
 
-MOST_FRAMES = 1000
-"""Frames taken in by one `receive` at most, so that a chattering bus cannot hold it."""
+MAX_FRAMES = 1000
+"""Largest number of frames handled by one `receive`, so that a babbling node cannot block it."""
 UNSENT_CYCLES = 3
-"""So many cycles in a row with a full transmit queue are a fault."""
+"""Number of consecutive cycles with a full transmit queue that are a fault."""
+
+TRIAL_CYCLES = 3
+"""Number of consecutive cycles in which a reopened bus must take every frame before it counts as back."""
 
 Handler = Callable[[bytearray, float], None]
-"""Takes a frame's data and the time; struct.error if the length is wrong."""
+"""Function of a frame's data and the time [s]; raises struct.error for a wrong length."""
 
 
 class Listener(Protocol):
-    """Whose frame it is."""
+    """Receiver of frames: one drive."""
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
-        """Keep what is wrong with it."""
+        """Latch a fault of the drive."""
 
 
 class Wire:
-    """The bus, who hears which frame, the first fault since the last reset, and what else people should know.
+    """The bus, the handlers of its frames, the first fault since the last reset, and warnings.
 
-    `stop` is called in the moment when a fault is latched.
+    `stop` is called when a fault is latched.
     """
 
-    def __init__(self, bus: can.BusABC, stop: Callable[[], None]) -> None:
+    def __init__(self, bus: can.BusABC, stop: Callable[[], None], reopening: Reopening | None = None) -> None:
+        """`reopening` reopens a lost bus; without it, the bus stays lost."""
         self.bus = bus
-        """For what is no part of the cycle: setting drives up, leaving."""
+        """Bus for use outside the cycle: set-up and closing."""
+        self.down = ""
+        """Reason for which the bus is lost, a line for people; "" while it is usable."""
+        self._name = reopening.name if reopening is not None else str(bus.channel_info)
+        self._reopening = reopening
         self.traffic = 0
-        """Bits of all frames sent and received so far, each with worst-case stuffing."""
-        self._frames = lendable(frame_io(bus))
+        """Bits of all frames sent and received, each with worst-case stuffing."""
+        self._frames = lendable_frames(frame_io(bus))
         self.fault: DriveFault | None = None
         self._stop = stop
         self._handlers: dict[int, tuple[Listener, Handler]] = {}
@@ -51,105 +62,192 @@ class Wire:
         self._warned: set[str] = set()
         self._unsent = False
         self._unsent_cycles = 0
+        self._sent = False
+        """Whether a frame was sent in this cycle."""
+        self._dead = False
+        """Whether the lost bus cannot send either."""
+        self._trial: int | None = None
+        """Number of cycles in which a reopened bus took every frame; None if no bus is on trial."""
+        self._awaits_frame = False
+        """Whether only a received frame shows that the bus is back."""
 
     def listen(self, can_id: int, listener: Listener, handler: Handler) -> None:
-        """Let a handler have the data frames of an 11-bit identifier."""
+        """Set the handler of the data frames of an 11-bit identifier."""
         self._handlers[can_id] = listener, handler
-        self._frames.hear(self._handlers)
+        self._frames.set_identifiers(self._handlers)
 
-    def begin(self) -> None:
-        """Note that a cycle begins."""
+    def begin(self, now: float, *, stopping: bool = False) -> None:
+        """Begin a cycle, while drives may be `stopping`; continue the reopening of a lost bus."""
+        # Only cycles with a sent frame count: an idle bus proves nothing.
+        if self._trial is not None and self._sent:
+            self._trial = 0 if self._unsent else self._trial + 1
         self._unsent_cycles = self._unsent_cycles + 1 if self._unsent else 0
-        self._unsent = False
+        self._unsent = self._sent = False
+        if self.down and self._reopening is not None:
+            self._continue_reopening(self._reopening, now, stopping=stopping)
+
+    def _continue_reopening(self, reopening: Reopening, now: float, *, stopping: bool) -> None:
+        """Do the next step of reopening: abandon the lost bus, open it in the background, try it out."""
+        if self._trial is not None:
+            if self._trial >= TRIAL_CYCLES and not self._awaits_frame:
+                self._end_trial()
+            return
+        if stopping and not self._dead:
+            return  # it may still carry the frames that stop the drives
+        if not isinstance(self.bus, AbsentBus):
+            reopening.retire(self.bus)
+            self._use(AbsentBus(self._name))
+            self._dead = True
+        outcome = reopening.attempt(now)
+        if isinstance(outcome, str):
+            self.down = self._down_text(outcome)
+        elif outcome is not None:
+            self._dead, self._trial, self._unsent_cycles = False, 0, 0
+            try:
+                self._use(outcome)
+            except (can.CanError, OSError) as error:
+                self.lose(f"cannot receive: {canerrors.explain(error)}")
+
+    def _end_trial(self) -> None:
+        self.down, self._trial, self._awaits_frame = "", None, False
+        self._warnings.append(f"CAN bus {self._name} is back")
+
+    def _use(self, bus: can.BusABC) -> None:
+        """Replace the bus."""
+        self.bus = bus
+        self._frames = lendable_frames(frame_io(bus))
+        self._frames.set_identifiers(self._handlers)
+
+    def lose(self, reason: str, *, dead: bool = True) -> None:
+        """Mark the bus as lost, to be reopened, and latch a fault; one that is not `dead` may still send."""
+        text = self._down_text(reason)
+        if self._reopening is not None:
+            self.down = self.down or text
+            self._dead, self._trial = self._dead or dead, None
+        self.fail(DriveFault("", "bus", 0, text))
+
+    def _down_text(self, reason: str) -> str:
+        return shortened(f"CAN bus {self._name} is down: {reason}".replace("DEV", self._name))
+
+    def close(self) -> None:
+        """Close the bus."""
+        if self._reopening is not None:
+            self._reopening.close()
+        with contextlib.suppress(can.CanError, OSError):
+            self.bus.shutdown()
 
     def fail(self, fault: DriveFault) -> None:
-        """Latch the first fault."""
+        """Latch a fault, unless one is latched already."""
         if self.fault is None:
             self.fault = fault
             self._stop()
 
     @property
+    def carries(self) -> bool:
+        """Whether the bus is usable, or reopened and on trial."""
+        return not self.down or self._trial is not None
+
+    @property
+    def reopens(self) -> bool:
+        """Whether a lost bus is reopened."""
+        return self._reopening is not None
+
+    @property
     def access(self) -> BusAccess:
-        """How somebody else may move frames, beside this object."""
+        """Access of compiled code to the bus."""
         return self._frames.access
 
     @property
-    def calm(self) -> bool:
-        """Whether nothing is wrong, nothing is to be told, and the bus takes what it is given."""
-        return self.fault is None and not self._warnings and not self._unsent and self._unsent_cycles == 0
+    def is_healthy(self) -> bool:
+        """Whether there is no fault and no warning, and the bus takes every frame."""
+        sends = not self._unsent and self._unsent_cycles == 0
+        return self.fault is None and not self._warnings and not self.down and sends
 
-    def hand_in(self, arrived: PackedFrames, number: int, error: int) -> None:
-        """So many frames that somebody else took and has not looked at, and the error that he met after them."""
-        self._frames.hand_in(arrived, number, error)
+    def hand_in(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+        """Take back frames that compiled code has received: see frame_calls.LentFrames."""
+        self._frames.hand_in(arrived, handled, number, error)
 
     def warn(self, text: str) -> None:
-        """Tell something once, until faults are reset."""
+        """Add a warning; the same one only once between resets."""
         if text not in self._warned:
             self._warned.add(text)
             self._warnings.append(text)
 
     def warnings(self) -> tuple[str, ...]:
-        """Hand over what is to be told."""
-        told = tuple(self._warnings)
+        """Return and clear the new warnings."""
+        warnings = tuple(self._warnings)
         self._warnings.clear()
-        return told
+        return warnings
 
     def reset(self) -> None:
-        """Forget the fault and what has been told."""
+        """Clear the fault, and allow every warning again."""
         self.fault = None
         self._warned.clear()
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame at once; return whether the bus took it.
+        """Send a frame without waiting; return whether the bus took it.
 
-        One that a full queue does not take is left out and, for a few cycles, no fault.
+        A frame that a full queue refuses is dropped; this is a fault only after UNSENT_CYCLES.
         """
         try:
             self._frames.send(frame)
         except (can.CanError, OSError) as error:
-            text = f"CAN bus: cannot send: {canerrors.cannot_send(error)}"
             self._unsent = True
-            if canerrors.queue_is_full(error) and self._unsent_cycles < UNSENT_CYCLES - 1:
-                self.warn(text)
-            else:
-                self.fail(DriveFault("", "bus", 0, text))
+            if not self._dead:
+                self._handle_send_error(error)
             return False
+        self._sent = True
         self.traffic += frame.bits
         return True
 
+    def _handle_send_error(self, error: Exception) -> None:
+        """Turn a failed send into a warning, a fault or a lost bus."""
+        reason = f"cannot send: {canerrors.explain(error)}"
+        if not canerrors.queue_is_full(error):
+            self.lose(reason)
+        elif self._unsent_cycles < UNSENT_CYCLES - 1:
+            self.warn(f"CAN bus: {reason}")
+        elif canerrors.error_number(error) is not None:  # ENOBUFS, EAGAIN: the interface is there, reopening is no help
+            self.fail(DriveFault("", "bus", 0, f"CAN bus: {reason}"))
+        else:  # the queue is full or the adapter is gone: without a number python-can does not say which
+            self._awaits_frame = True
+            self.lose(reason, dead=False)
+
     def receive(self, now: float) -> None:
-        """Take in every frame that has arrived."""
+        """Handle every frame that has arrived."""
         try:
-            for _ in range(MOST_FRAMES):
+            for _ in range(MAX_FRAMES):
                 received = self._frames.receive()
                 if received is None:
                     return
                 self._dispatch(*received, now)
         except (can.CanError, OSError) as error:
-            self.fail(DriveFault("", "bus", 0, f"CAN bus: cannot receive: {error}"))
+            self.lose(f"cannot receive: {canerrors.explain(error, sending=False)}", dead=False)
 
     def wait(self, seconds: float, clock: Clock) -> None:
-        """Wait for a frame, at most so long [s], and take it in; not for the cycle. Raises can.CanError, OSError."""
+        """Wait up to `seconds` for a frame and handle it; not for the cycle. Raises can.CanError, OSError."""
         received = self._frames.receive(seconds)
         if received is not None:
             self._dispatch(*received, clock())
 
     def _dispatch(self, identifier: int, data: bytearray, now: float) -> None:
         if identifier & ERROR:
-            self._take_error(canerrors.report(identifier & EXTENDED_BITS, data))
+            self._handle_error_frame(canerrors.decode_error_frame(identifier & EXTENDED_BITS, data))
             return
         self.traffic += BITS[min(len(data), 8)]
-        heard = self._handlers.get(identifier)  # identifiers of 29 bits and remote frames have flags, and so no handler
-        if heard is None:
+        if self._trial is not None:  # a received frame proves that the bus is back
+            self._end_trial()
+        entry = self._handlers.get(identifier)  # 29-bit identifiers and remote frames have flags, and so no handler
+        if entry is None:
             return
-        listener, handler = heard
+        listener, handler = entry
         try:
             handler(data, now)
         except struct.error:
             listener.note_fault("frame", 0, f"frame {identifier:03X} has wrong length {len(data)}")
 
-    def _take_error(self, report: canerrors.Report) -> None:
-        if report.gravity is canerrors.Gravity.FAULT:
-            self.fail(DriveFault("", "bus", 0, f"CAN bus: {report.text}"))
-        elif report.gravity is canerrors.Gravity.WARNING:
+    def _handle_error_frame(self, report: canerrors.ErrorReport) -> None:
+        if report.severity is canerrors.Severity.FAULT:
+            self.lose(report.text)
+        elif report.severity is canerrors.Severity.WARNING:
             self.warn(f"CAN bus: {report.text}")

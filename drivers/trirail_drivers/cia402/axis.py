@@ -1,4 +1,4 @@
-"""One CiA 402 drive as its frames tell of it: position, state, and what is wrong with it."""
+"""State of one CiA 402 drive from its frames: position, power state, faults."""
 
 from __future__ import annotations
 
@@ -6,161 +6,211 @@ import math
 from typing import Any
 
 from trirail_drivers.cia402 import canopen_frames, process_data
-from trirail_drivers.cia402.codes import words
-from trirail_drivers.cia402.duplicate_node import AnswersAfter, AnswersPerSync, warning
+from trirail_drivers.cia402.codes import describe_error
+from trirail_drivers.cia402.duplicate_node import AnswersAfterStop, AnswersPerSync, warning
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
-from trirail_drivers.driver.cyclic import expected
+from trirail_drivers.driver.cyclic import expected_row
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 
 MISSED_STATUSES = 3
 FOLLOW_TIME = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
-"""How long an enabled drive may take to say that it follows setpoints [s]."""
+"""Longest time until an enabled drive reports that it follows setpoints [s]."""
 REGISTER_TIME = 0.5
-"""How long a drive may take to tell its error register after a reset [s]."""
-STILL = 2e-5
-"""A slider that has been within this [m] of a place for STILL_FOR [s] stands."""
-STILL_FOR = 0.1
+"""Longest time until a drive answers with its error register after a reset [s]."""
+ANSWER_TIME = 0.5
+"""Longest time until a drive answers an SDO request of the cycle [s]; a set-up waits for that answer first."""
+STANDSTILL_DISTANCE_M = 2e-5
+"""A slider is at rest once it has stayed within this distance for STANDSTILL_TIME_S."""
+STANDSTILL_TIME_S = 0.1
 RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
-"""How long a drive may take to leave fault after a fault reset, in which it tells its state twice [s]."""
+"""Longest time until a drive leaves fault after a fault reset [s]: two periods of its statusword."""
 
+_RESTARTED = "has restarted and lost its set-up: wait until it is configured again, then send reset"
 _NMT_STATES = {canopen_frames.STOPPED: "stopped", canopen_frames.PRE_OPERATIONAL: "pre-operational"}
 _STATE_BITS = 0x6F
-"""Bits of a statusword that tell the state."""
+"""Bits of a statusword that code the state."""
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 _WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
-_ON_THE_WAY = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
-"""States from which a drive that is to be enabled goes on by controlwords."""
-_CAN_MOVE_OR_SOON = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED)
-"""States in which no drive stays that has been told to stop or to lose power."""
+_ENABLING_STATES = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
+"""States that a drive passes by controlwords while it is enabled."""
+_ENABLED_OR_ENABLING = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED)
+"""States that every drive leaves on a command to stop or to take the power off."""
 
 
 class Cia402Axis(Axis):
-    """One drive's newest feedback; the `on_` methods take a frame's data or raise struct.error."""
+    """Newest feedback of one drive; the `on_` methods take a frame's data or raise struct.error."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
-        self.set_up(process_data.usual(node), Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre)))
+        self.set_up(
+            process_data.default_exchange(node), Units(scale, scale.counts_per_metre, abs(scale.counts_per_metre))
+        )
         self.velocity_step, self.velocity_bytes = 1.0, 4
-        self.still = max(1.0, abs(scale.counts_per_metre) * STILL)
+        self.still = max(1.0, abs(scale.counts_per_metre) * STANDSTILL_DISTANCE_M)
         self.status_heard = self.stands_since = math.inf
         self.status_within = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
         self.has_setpoint = False
-        """It was sent one."""
+        """Whether it has been sent a setpoint."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.controlword = canopen_frames.DISABLE_VOLTAGE
-        """The last one sent."""
+        """Controlword sent last."""
         self.mode_bits = 0
-        """Controlword bits that go with "enable operation"."""
+        """Mode-specific controlword bits, added to "enable operation"."""
         self.held: int | None = None
-        """The position [counts] that it gets in place of setpoints."""
+        """Position [counts] that it gets instead of setpoints."""
         self.mode = ShownMode(drives.sdo_timeout)
         self.cyclic = True
-        """It is for sure in the mode in which it follows setpoints."""
+        """Whether it is certainly in the mode in which it follows setpoints."""
         self.follows = True
-        """It follows setpoints, or soon will: those that come are to hold it."""
+        """Whether it follows setpoints, or soon will; meanwhile they must hold its position."""
         self.has_followed = False
-        """It has said that it follows setpoints, since it was to get power."""
-        self.homed = True
-        """Its position is counted from a known place."""
+        """Whether it has reported that it follows setpoints since it was enabled."""
         self.sdo_answer: bytes | None = None
-        """The newest answer about an object."""
+        """Newest SDO answer to `sdo_asked`."""
         self.error_code = 0
-        """What the drive last gave as the reason of its fault; 0 once it said that is over."""
+        """Last error code that the drive reported; 0 once it has reported the end of the error."""
         self.reset_until = -math.inf
-        """Until when a fault reset is under way [s]."""
-        self.mute = False
-        """Its last heartbeat was that of a drive that sends no PDO: its state has to be asked for."""
+        """Time until which a fault reset may take effect [s]."""
+        self.pdo_silent = False
+        """Whether its last heartbeat showed a state without PDOs, so that its statusword must be requested."""
         self.left_operational = False
-        """It said that it is operational no more, and was not started again since."""
+        """Whether it has left NMT operational and was not started again."""
         self.sdo_asked: bytes | None = None
-        """The index of the object that is asked about and was not answered."""
+        """Index of the object whose SDO answer is pending, little-endian."""
+        self.unanswered = 0
+        """Number of SDO requests without an answer."""
+        self.answered_by = -math.inf
+        """Time until which the newest of them may be answered [s]."""
         self.poll_due = self._register_until = -math.inf
-        """When its statusword is to be asked for again [s]."""
+        """Time of the next statusword request, and time until which the error register may be answered [s]."""
         self.register_wanted = False
-        """Its error register 1001h is to be asked for."""
-        self._operational = self._restarted = self._followed = self.stopped = False
+        """Whether its error register 1001h must be requested."""
+        self._operational = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
-        self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfter()
+        self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
 
-    def set_up(self, way: process_data.Exchange, units: Units) -> None:
-        """Note what goes by which frames, and in which units."""
-        self.way, self.units = way, units
+    def set_up(self, exchange: process_data.Exchange, units: Units) -> None:
+        """Set the frames and units of the exchange."""
+        self.exchange, self.units = exchange, units
         self.velocity_per_metre = units.velocity_per_metre
-        self.position_at, self.velocity_at = way.setpoints.place(0), way.setpoints.place(1)
+        self.position_at, self.velocity_at = exchange.setpoints.offset(0), exchange.setpoints.offset(1)
 
-    def aim(self, target: int, offset: int) -> None:
-        """Note position and velocity that it is sent, in its units."""
+    def forget_power_state(self) -> None:
+        """Forget the last power state, and trust positions again: a new set-up begins."""
+        self.state = PowerState.NOT_READY_TO_SWITCH_ON
+        self.unanswered = 0
+        self._answers_after.forget()
+
+    def note_request(self, now: float) -> None:
+        """Record an SDO request."""
+        self.unanswered += 1
+        self.answered_by = now + ANSWER_TIME
+
+    def rejoin(self, exchange: process_data.Exchange, units: Units, now: float, *, homed: bool) -> None:
+        """Take part in the cycle again after a set-up in the background."""
+        self.set_up(exchange, units)
+        self.restarted = self.silent = self.left_operational = self.pdo_silent = False
+        self.stopped = self._operational = False
+        self.powered_up = self.has_followed = self._followed = self.has_setpoint = False
+        self.mode.shown, self.cyclic, self.follows, self.held, self.mode_bits = exchange.mode_shown, True, True, None, 0
+        self.controlword, self.sdo_asked, self.homed = canopen_frames.DISABLE_VOLTAGE, None, homed
+        self.status_heard, self.heard = now, now if exchange.heard else math.inf
+        self.clear_missed()
+
+    @property
+    def last_heard(self) -> float:
+        """Time of its last sign of life other than a position [s]."""
+        return max(self.status_heard, super().last_heard)
+
+    def lose(self, *, stopping: bool) -> None:
+        """Handle the loss of the bus: its set-up must be checked again; unless `stopping`, it has no power any more."""
+        self.silent = True
+        if not stopping:
+            self.forget_power_state()
+
+    def note_setpoint(self, target: int, offset: int) -> None:
+        """Record the position and velocity sent to it, in its units."""
         self.target, self.offset, self.has_setpoint = target, offset, True
 
     @property
     def setpoint(self) -> tuple[int, int]:
-        """What it was sent last, in its units; where that is nothing yet, the place where it is."""
+        """Setpoint sent last, in its units; before the first, its actual position."""
         return (self.target, self.offset) if self.has_setpoint else (self.actual, 0)
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:
-        """TPDO2: the position sampled at a SYNC, and the statusword where the drive's way has it here."""
-        counts, statusword = self.way.feedback.unpack(data)
+        """Handle TPDO2: the position sampled at a SYNC, and the statusword if it is mapped there."""
+        if not self.configured:  # a drive that started by itself may send anything; duplicate nodes are found by it
+            self.came = True
+            return
+        counts, statusword = self.exchange.feedback.unpack(data)
         if abs(counts - self.stands_at) > self.still:
             self.stands_at, self.stands_since = counts, now
         self.stands_since = min(self.stands_since, now)
-        self._answers_per_sync.come(counts)
-        self.take_position(counts)
+        self._answers_per_sync.add_position(counts)
+        self.update_position(counts)
         self.answer()
         if statusword is not None:
             self.status_heard = now
-            self.take_status(statusword)
+            self.update_status(statusword)
         self._operational = True  # CiA 301: PDOs are sent in NMT operational only
 
-    def rests(self, wanted: canopen_frames.Wanted) -> bool:
-        """Whether nothing is to be done for it, nor found out, as long as its frames say nothing new."""
+    def is_steady(self, wanted: canopen_frames.TargetState) -> bool:
+        """Whether the driver has nothing to send or decide as long as the drive's frames do not change."""
         settled = self.state is wanted and wanted is not PowerState.QUICK_STOP_ACTIVE
-        told = self.event is None and not self.error_code and self.reset_until == -math.inf
-        lives = self._operational and not (self.stopped or self.left_operational or self.mute or self.register_wanted)
-        asked = self.sdo_asked is not None or self.way.polled or self.awaits_mode
-        follows = wanted is PowerState.OPERATION_ENABLED and self.way.tells_following
-        quiet = self._answers_after.idle and self._answers_per_sync.calm and self._unfollowed_since is None
+        no_fault = self.event is None and not self.error_code and self.reset_until == -math.inf
+        lives = self._operational and not (
+            self.stopped or self.left_operational or self.pdo_silent or self.register_wanted
+        )
+        asked = self.sdo_asked is not None or self.exchange.polled or self.awaits_mode
+        follows = wanted is PowerState.OPERATION_ENABLED and self.exchange.tells_following
+        quiet = self._answers_after.idle and self._answers_per_sync.is_clear and self._unfollowed_since is None
         return (
-            (settled and told and lives and quiet and not asked)
+            (settled and no_fault and lives and quiet and not asked)
             and (self.cyclic and self.follows and self.holds is None and self.has_setpoint)
             and self.missed == 0
             and self._followed == follows
             and self.controlword == self.word(-math.inf, wanted)
         )
 
-    def expected(self, number: int) -> list[tuple[Any, ...]]:
-        """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
-        way, word = self.way, canopen_frames.STATUSWORD.pack(self.statusword)
-        decides = canopen_frames.STATUSWORD.pack(_STATE_BITS | (canopen_frames.FOLLOWS if way.tells_following else 0))
-        feedback, place = way.feedback, way.feedback.place(process_data.STATUSWORD)
+    def expected_rows(self, number: int) -> list[tuple[Any, ...]]:
+        """Return rows of trirail_drivers.driver.cyclic.EXPECTED: frames of drive `number` that carry no news."""
+        exchange, word = self.exchange, canopen_frames.STATUSWORD.pack(self.statusword)
+        decides = canopen_frames.STATUSWORD.pack(
+            _STATE_BITS | (canopen_frames.FOLLOWS_SETPOINTS if exchange.tells_following else 0)
+        )
+        feedback, offset = exchange.feedback, exchange.feedback.offset(process_data.STATUSWORD)
         data, mask = bytearray(feedback.size), bytearray(feedback.size)
-        if place >= 0:
-            data[place : place + 2], mask[place : place + 2] = word, decides
-        position, identifier = feedback.place(process_data.ACTUAL_POSITION), feedback.identifier
-        rows = [expected(identifier, number, bytes(data), bytes(mask), position_at=position, status_at=place)]
-        if way.status is not None:
-            rows.append(expected(way.status, number, word, decides, status_at=0))
+        if offset >= 0:
+            data[offset : offset + 2], mask[offset : offset + 2] = word, decides
+        position, identifier = feedback.offset(process_data.ACTUAL_POSITION), feedback.identifier
+        rows = [expected_row(identifier, number, bytes(data), bytes(mask), position_at=position, status_at=offset)]
+        if exchange.status is not None:
+            rows.append(expected_row(exchange.status, number, word, decides, status_at=0))
         alive = canopen_frames.NMT_STATE.pack(canopen_frames.OPERATIONAL)
-        bits = bytes([canopen_frames.NMT_STATE_BITS if way.guarded else 0xFF])
-        rows.append(expected(canopen_frames.HEARTBEAT + self.node, number, alive, bits, lives=way.heard))
+        bits = bytes([canopen_frames.NMT_STATE_BITS if exchange.guarded else 0xFF])
+        rows.append(expected_row(canopen_frames.HEARTBEAT + self.node, number, alive, bits, lives=exchange.heard))
         return rows
 
-    def take_position(self, counts: int) -> None:
-        """Note an actual position."""
+    def update_position(self, counts: int) -> None:
+        """Update the actual position."""
         self.actual = counts
         self.position = self.scale.metres(counts)
 
     def on_sdo(self, data: bytes | bytearray, now: float) -> None:
-        """An SDO server's answer; one that is not eight bytes long is none (CiA 301)."""
+        """Handle an SDO answer; an answer has eight bytes (CiA 301)."""
         if len(data) != 8:
             return
+        if self.setup_listener is not None:
+            self.setup_listener(canopen_frames.SDO_ANSWER + self.node, data)
+        self.unanswered = max(0, self.unanswered - 1)
         if data[1:3] == self.sdo_asked:
             self.sdo_answer, self.sdo_asked = bytes(data), None
         if data[:4] == canopen_frames.MODE_DISPLAY_UPLOADED and self.awaits_mode:
-            self._take_mode(data[4])
+            self._update_mode(data[4])
         elif data[:4] == canopen_frames.STATUSWORD_UPLOADED:
             self.on_status(data[4:6], now)
         elif data[:4] == canopen_frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
@@ -170,39 +220,39 @@ class Cia402Axis(Axis):
 
     @property
     def awaits_mode(self) -> bool:
-        """It has power, and is to show its mode before it gets setpoints."""
+        """Whether it has power but does not show its mode yet, which it must before it gets setpoints."""
         return not self.mode.shown and self.cyclic and self.state is PowerState.OPERATION_ENABLED
 
-    def _take_mode(self, mode: int) -> None:
-        """6061h: 0 is none yet, and no other will do."""
-        self.mode.shown = mode == self.way.mode
+    def _update_mode(self, mode: int) -> None:
+        """Check the mode display 6061h: 0 is no mode yet, another mode is a fault."""
+        self.mode.shown = mode == self.exchange.mode
         if not self.mode.shown and mode:
-            self.note_fault("state", 0, f"shows mode {mode} (object 6061), with power; wanted {self.way.mode}")
+            self.note_fault("state", 0, f"shows mode {mode} (object 6061), with power; wanted {self.exchange.mode}")
 
     def request(self) -> bytes:
-        """What it is to be asked for by SDO: its statusword, the mode that it shows, or both in turn."""
-        both = self.way.polled or self.mute
+        """Return the next SDO request: its statusword, its mode display, or both in turn."""
+        both = self.exchange.polled or self.pdo_silent
         for_mode = self.awaits_mode and self.mode.is_next(alone=not both)
         return canopen_frames.MODE_DISPLAY_UPLOAD if for_mode else canopen_frames.STATUSWORD_UPLOAD
 
     @property
     def holds(self) -> int | None:
-        """The position [counts] that it gets in place of setpoints; None where it gets those."""
+        """Position [counts] that it gets instead of setpoints; None if it gets setpoints."""
         return self.held if self.mode.shown or self.held is not None else self.actual
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
-        """TPDO1: the statusword, when it changes and from time to time."""
+        """Handle TPDO1: the statusword, on change and every STATUS_PERIOD."""
         (statusword,) = canopen_frames.STATUSWORD.unpack(data)
         self.status_heard = now
-        self.take_status(statusword)
+        self.update_status(statusword)
 
-    def take_status(self, statusword: int) -> None:
-        """Note the state in a statusword."""
+    def update_status(self, statusword: int) -> None:
+        """Update the power state from a statusword."""
         self.statusword = statusword
         self.seen_clear |= ~statusword
         state = canopen_frames.power_state(statusword)
         if state is None:
-            self.note_fault("state", 0, f"statusword {statusword:04X} is that of no CiA 402 state")
+            self.note_fault("state", 0, f"statusword {statusword:04X} has no CiA 402 state")
             return
         if state is PowerState.OPERATION_ENABLED:
             self.powered_up = True
@@ -212,156 +262,165 @@ class Cia402Axis(Axis):
             self.reset_until = -math.inf
         self.state = state
 
-    def cycle_over(self) -> DriveFault | None:
-        """Note that the frames of a cycle are in: a node answers a SYNC once, and only while it is operational.
+    def end_cycle(self) -> DriveFault | None:
+        """Check the cycle's frames for a second node with this id: a node answers a SYNC once, only while operational.
 
-        Returns what this drive was said to have done, and another node of its id has: `event` says so from now on.
+        Return the fault that was attributed to this drive but caused by the other node; `event` then names that node.
         """
-        mistaken = self._answers_after.of_another(came=self.came)
+        mistaken = self._answers_after.end_cycle(came=self.came)
         if self._answers_per_sync.from_two_nodes():
             self.note_fault("frame", 0, warning(self.node, "each SYNC has two positions"))
         if mistaken is not None:
-            self._restarted = self.left_operational = self.mute = False
-            by = "one has booted, or is not operational, and the other goes on"
-            self.event = self.made("frame", 0, warning(self.node, by))
+            self.restarted = self.left_operational = self.pdo_silent = False
+            by = "one has booted, or is not operational, while the other sends positions"
+            self.event = self.make_fault("frame", 0, warning(self.node, by))
         return mistaken
 
     @property
     def shown_state(self) -> PowerState:
-        """Its state; "switched on" while it has power and does not say yet that it follows setpoints."""
-        waits = self.cyclic and (not self.mode.shown or (self.way.tells_following and not self.has_followed))
+        """Its state, but "switched on" while it has power and has not reported yet that it follows setpoints."""
+        if not self.configured and self.state not in _ENABLED_OR_ENABLING:
+            return PowerState.NOT_READY_TO_SWITCH_ON
+        waits = self.cyclic and (not self.mode.shown or (self.exchange.tells_following and not self.has_followed))
         return PowerState.SWITCHED_ON if waits and self.state is PowerState.OPERATION_ENABLED else self.state
 
     def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """EMCY: an error code, of which 00xxh say that errors are over (CiA 301)."""
+        """Handle an EMCY: an error code; codes 00xxh report the end of errors (CiA 301)."""
         code, register, _ = canopen_frames.EMERGENCY.unpack(data)
         if code & 0xFF00 == 0:
             self.error_code = 0
             return
         self.error_code = code
-        self.note_fault("emcy", code, f"emergency {words(code, f', error register 0x{register:02X}')}")
+        self.note_fault("emcy", code, f"emergency {describe_error(code, f', error register 0x{register:02X}')}")
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
-        """Heartbeat, answer to node guarding or boot-up: the drive lives, and should be operational."""
+        """Handle a heartbeat, an answer to node guarding, or a boot-up message."""
         (state,) = canopen_frames.NMT_STATE.unpack(data)
-        if self.way.guarded:
+        if self.setup_listener is not None and state != canopen_frames.BOOT_UP:  # set-up tests node guarding
+            self.setup_listener(canopen_frames.HEARTBEAT + self.node, data)
+        if self.exchange.guarded:
             state &= canopen_frames.NMT_STATE_BITS
-        if self.way.heard:
+        if self.exchange.heard:
             self.heard = now
         self.stopped = state == canopen_frames.STOPPED
         if state == canopen_frames.OPERATIONAL:
             self._operational = True
         elif state == canopen_frames.BOOT_UP:
-            self._restarted = True
+            was_there = self.configured and self.missed < MISSED_STATUSES
+            self.restarted, self.boots, self.unanswered = True, self.boots + 1, 0
+            self.left_operational = self._operational = False
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
-            # Takes the place of an earlier event, for it is the one that a reset cannot help.
-            self.event = self.made("state", 0, "has restarted and lost its set-up; restart the service")
-            self._answers_after.begin(self.event)
+            # Replaces an earlier event: a restart explains it.
+            self.event = self.make_fault("state", 0, _RESTARTED)
+            if was_there:  # otherwise later positions are its own: some drives start by themselves
+                self._answers_after.begin(self.event)
         elif self._operational:  # before that, it is a heartbeat from before the drive was started
             self.leave_operational()
             self.note_fault("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
-        self.mute = self.left_operational and state != canopen_frames.OPERATIONAL
+        self.pdo_silent = self.left_operational and self.configured and state != canopen_frames.OPERATIONAL
 
     def leave_operational(self) -> None:
-        """It hears PDOs no more: its state is unknown until it answers, which stopped ones do not."""
+        """Note that it receives no PDOs any more: its state is unknown until an SDO answer."""
         self._operational = False
         self.left_operational = True
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
 
     @property
-    def may_be_deaf(self) -> bool:
-        """It may hear no PDO: what it is to do it has to be told by SDO too."""
+    def may_miss_pdos(self) -> bool:
+        """Whether it may miss PDOs, so that controlwords must be sent by SDO too."""
         return self.left_operational or self.missed > 0
 
-    def forgive(self, now: float) -> None:
-        """Forget what happened, but not what lasts, and allow time for a fault reset."""
+    def clear_faults(self, now: float) -> None:
+        """Forget the latched event, not a lasting condition, and allow time for a fault reset."""
         self._answers_after.forget()
-        if not self._restarted:
+        if self.configured:
             self.event = None
-        if self.state is PowerState.FAULT or self.left_operational:  # not operational, it did not tell of a fault
+        if self.state is PowerState.FAULT or self.left_operational:  # it could not report a fault
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
-            self.forgive_unanswered()
+            self.clear_missed()
             self.status_heard = now
         if self.error_code and self.state not in _IN_FAULT:
-            # An EMCY that was never followed by "error reset": the register tells whether it is over.
+            # An EMCY without a following "error reset": only the register shows whether it is over.
             self.register_wanted = True
             self._register_until = now + REGISTER_TIME
 
-    def word(self, now: float, wanted: canopen_frames.Wanted) -> int:
-        """The controlword that the drive is to have at time `now`, on its way to the state that is `wanted`."""
+    def word(self, now: float, wanted: canopen_frames.TargetState) -> int:
+        """Return the controlword for the drive at time `now` [s], for its next transition towards `wanted`."""
         if self.state is PowerState.FAULT and now < self.reset_until:
-            # Bit 7 stays up until the drive is out of fault: some look at it once in a few cycles only.
+            # Bit 7 stays set until the drive leaves fault: some drives sample it only every few cycles.
             return canopen_frames.FAULT_RESET
-        if self.state is PowerState.QUICK_STOP_ACTIVE and self._stands(now):
-            # 605Ah = 5 to 8: it would stay there, with power (CiA 402-2, transition 12). Before, it would coast.
+        if self.state is PowerState.QUICK_STOP_ACTIVE and self._is_at_rest(now):
+            # With 605Ah = 5 to 8 it stays there with power (CiA 402-2, transition 12). Sent earlier, it would coast.
             return canopen_frames.DISABLE_VOLTAGE
         word = canopen_frames.controlword(self.state, wanted)
         if word != canopen_frames.ENABLE_OPERATION:
             return word
-        interpolates = self.way.mode == process_data.INTERPOLATED_POSITION and self.cyclic
+        interpolates = self.exchange.mode == process_data.INTERPOLATED_POSITION and self.cyclic
         if interpolates and self.state is PowerState.OPERATION_ENABLED:
             word |= canopen_frames.INTERPOLATE
         return word | self.mode_bits
 
-    def is_not_followed(self, word: int, wanted: canopen_frames.Wanted) -> bool:
-        """Whether a controlword, by what the drive says, has not taken it where it is to go."""
+    def is_not_followed(self, word: int, wanted: canopen_frames.TargetState) -> bool:
+        """Whether the drive's state shows that a controlword had no effect."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
             return word == canopen_frames.DISABLE_VOLTAGE
         if wanted is PowerState.OPERATION_ENABLED:
-            return self.state in _ON_THE_WAY or not self.cyclic  # of its mode's bits the state does not tell
-        return self.state in _CAN_MOVE_OR_SOON
+            return self.state in _ENABLING_STATES or not self.cyclic  # the state does not show the mode's bits
+        return self.state in _ENABLED_OR_ENABLING
 
-    def _stands(self, now: float) -> bool:
-        """Whether its slider stands: only positions that still come can tell."""
-        return now - self.stands_since >= STILL_FOR and self.missed == 0
+    def _is_at_rest(self, now: float) -> bool:
+        """Whether its slider is at rest, by current positions."""
+        return now - self.stands_since >= STANDSTILL_TIME_S and self.missed == 0
 
-    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
-        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not.
+    def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
+        """Return the fault of a drive that still has power `seconds` [s] after `wanted`, as "quick stop".
 
-        A drive in fault, or that is not operational, has a fault of its own to tell.
+        A drive in fault, or not operational, has another fault already.
         """
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None
-        text = f"is {self.state} {seconds:g} s after {wanted}; switch on disabled was expected"
-        return self.made("timeout", 0, text)
+        text = f"is {self.state} {seconds:g} s after {wanted}; expected switch on disabled"
+        return self.make_fault("timeout", 0, text)
 
-    def fault(self, now: float, wanted: canopen_frames.Wanted) -> DriveFault | None:
-        """What is wrong with the drive at time `now`, given what it was asked for."""
+    def find_fault(self, now: float, wanted: canopen_frames.TargetState) -> DriveFault | None:
+        """Return the drive's fault at time `now` [s], if it is commanded to the state `wanted`."""
         if self.event is not None:
             return self.event
         if self.state in _IN_FAULT:
             if now >= self.reset_until:
                 still = f", still {RESET_TIME:g} s after a fault reset" if self.reset_until > -math.inf else ""
-                reason = f", error {words(self.error_code, still)}" if self.error_code else still
-                return self.made("fault", self.error_code, f"{self.state}{reason}")
+                reason = f", error {describe_error(self.error_code, still)}" if self.error_code else still
+                return self.make_fault("fault", self.error_code, f"{self.state}{reason}")
         elif (
             self.error_code and now >= self._register_until
         ):  # CiA 301: in force until the drive sends "error reset", code 00xxh
-            return self.made("emcy", self.error_code, f"emergency {words(self.error_code, ' is still in force')}")
-        elif silent := self.silence(now):
+            return self.make_fault(
+                "emcy", self.error_code, f"emergency {describe_error(self.error_code, ' is still in force')}"
+            )
+        elif silent := self.silence_fault(now):
             return silent
         elif now - self.status_heard > self.status_within:
-            return self.made("silent", 0, f"no statusword for {now - self.status_heard:.3g} s")
+            return self.make_fault("silent", 0, f"no statusword for {now - self.status_heard:.3g} s")
         elif (
             self.powered_up
             and wanted is PowerState.OPERATION_ENABLED
             and self.state is not PowerState.OPERATION_ENABLED
         ):
-            return self.made("state", 0, f"left operation enabled unasked: {self.state}")
+            return self.make_fault("state", 0, f"left operation enabled by itself: it is {self.state}")
         else:
-            return self._not_following(now, wanted)
+            return self._following_fault(now, wanted)
         return None
 
-    def _not_following(self, now: float, wanted: canopen_frames.Wanted) -> DriveFault | None:
-        """CiA 402-2, modes 7 and 8: bit 12 of the statusword says that setpoints are followed, not ignored."""
+    def _following_fault(self, now: float, wanted: canopen_frames.TargetState) -> DriveFault | None:
+        """Check bit 12 of the statusword: setpoints are followed, not ignored (CiA 402-2, modes 7 and 8)."""
         if (waited := self.mode.waited(now, awaited=self.awaits_mode)) is not None:
-            return self.made("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it got power")
+            return self.make_fault("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it got power")
         enabled = wanted is self.state is PowerState.OPERATION_ENABLED
-        meant_to = enabled and self.cyclic and self.mode.shown and self.way.tells_following
-        if not meant_to or self.statusword & canopen_frames.FOLLOWS:
+        meant_to = enabled and self.cyclic and self.mode.shown and self.exchange.tells_following
+        if not meant_to or self.statusword & canopen_frames.FOLLOWS_SETPOINTS:
             self._followed = meant_to
             self.has_followed = self.has_followed or meant_to
             self._unfollowed_since = None
@@ -371,5 +430,5 @@ class Cia402Axis(Axis):
         if not self._followed and now - self._unfollowed_since <= FOLLOW_TIME:
             return None
         text = f"does not follow setpoints: bit 12 of its statusword {self.statusword:04X} is clear"
-        never = "" if self._followed else '; if it never sets that, say accept_without = ["6041"]'
-        return self.made("state", 0, text + never)
+        never = "" if self._followed else '; if it never sets that bit, set accept_without = ["6041"]'
+        return self.make_fault("state", 0, text + never)

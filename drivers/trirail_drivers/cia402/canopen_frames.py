@@ -1,4 +1,4 @@
-"""CANopen frames as bytes: identifiers, layouts, CiA 402 states, and what they put on the bus."""
+"""CANopen frames as bytes: identifiers, layouts, CiA 402 states, bus traffic."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CONTROLWORD: Final = Struct("<H")
 STATUSWORD: Final = Struct("<H")
 """TPDO1: statusword 6041h."""
 EMERGENCY: Final = Struct("<HB5s")
-"""Error code, error register 1001h, and what the manufacturer adds."""
+"""Error code, error register 1001h, manufacturer-specific bytes."""
 NMT_STATE: Final = Struct("<B")
 """Heartbeat and boot-up: the sender's NMT state."""
 
@@ -41,15 +41,15 @@ STATUSWORD_UPLOAD: Final = b"\x40\x41\x60\x00" + bytes(4)
 ERROR_REGISTER_UPLOAD: Final = b"\x40\x01\x10\x00" + bytes(4)
 """SDO request for the error register 1001h."""
 ERROR_REGISTER_UPLOADED: Final = b"\x4f\x01\x10\x00"
-"""How its answer begins; the byte of the register follows."""
+"""Beginning of its answer; the byte of the register follows."""
 MODE_DISPLAY_UPLOAD: Final = b"\x40\x61\x60\x00" + bytes(4)
-"""SDO request for the mode of operation that is shown, 6061h."""
+"""SDO request for the modes of operation display 6061h."""
 CONTROLWORD_DOWNLOAD: Final = b"\x2b\x40\x60\x00"
-"""How an SDO begins that writes the controlword 6040h; its two bytes and two empty ones follow."""
+"""Beginning of the SDO that writes the controlword 6040h; its two bytes and two empty ones follow."""
 MODE_DISPLAY_UPLOADED: Final = b"\x4f\x61\x60\x00"
-"""How its answer begins; the byte of the mode follows."""
+"""Beginning of the answer with the mode display; the byte of the mode follows."""
 STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
-"""How its answer begins; the two bytes of the statusword follow."""
+"""Beginning of the answer with the statusword; its two bytes follow."""
 
 NMT_START: Final = 0x01
 NMT_PRE_OPERATIONAL: Final = 0x80
@@ -59,7 +59,7 @@ STOPPED: Final = 0x04
 OPERATIONAL: Final = 0x05
 PRE_OPERATIONAL: Final = 0x7F
 NMT_STATE_BITS: Final = 0x7F
-"""Of an answer to node guarding; bit 7 toggles."""
+"""State bits in an answer to node guarding; bit 7 toggles."""
 
 DISABLE_VOLTAGE: Final = 0x00
 QUICK_STOP: Final = 0x02
@@ -70,16 +70,16 @@ FAULT_RESET: Final = 0x80
 HOMING_START: Final = 0x10
 """Bit 4 in homing mode, beside ENABLE_OPERATION."""
 HALT: Final = 0x100
-"""Bit 8: stop and stand still, with power."""
+"""Bit 8: stop and hold, with power."""
 
 STATUS_PERIOD: Final = 0.1
-"""A drive repeats an unchanged statusword this often: event timer 1800h:05 [s]."""
+"""Period in which a drive repeats an unchanged statusword: event timer 1800h:05 [s]."""
 
 POLL_PERIOD: Final = 0.02
-"""A statusword that no PDO repeats is asked for this often [s]."""
+"""Period of requests for a statusword that no PDO repeats [s]."""
 INTERPOLATE: Final = 0x10
 """Bit 4 in interpolated position mode, beside ENABLE_OPERATION."""
-FOLLOWS: Final = 1 << 12
+FOLLOWS_SETPOINTS: Final = 1 << 12
 """Statusword bit of a drive that follows setpoints: modes 8 and 7."""
 
 # CiA 402-2, statusword coding: mask 4Fh (bit 5 is free) for the first four states, 6Fh for the others.
@@ -98,7 +98,7 @@ _STATES: Final = {
     0x07: PowerState.QUICK_STOP_ACTIVE,
 }
 
-# A quick stop under way is left to end: by itself, in switch on disabled (605Ah = 2), or see Cia402Axis.word.
+# A quick stop is not interrupted: it ends by itself in switch on disabled (605Ah = 2), or see Cia402Axis.word.
 _TOWARDS_OPERATION: Final = {
     PowerState.SWITCH_ON_DISABLED: SHUTDOWN,
     PowerState.READY_TO_SWITCH_ON: SWITCH_ON,
@@ -107,22 +107,22 @@ _TOWARDS_OPERATION: Final = {
     PowerState.QUICK_STOP_ACTIVE: QUICK_STOP,
 }
 
-Wanted = Literal[PowerState.SWITCH_ON_DISABLED, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE]
-"""The states one can ask a drive for; the others are on the way, or its own doing."""
+TargetState = Literal[PowerState.SWITCH_ON_DISABLED, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE]
+"""States that can be commanded; the others are transitional, or the drive's own."""
 
 
 def nmt(command: int, node: int) -> Frame:
-    """An NMT command to one node."""
+    """Return an NMT command to one node."""
     return Frame(NMT, NMT_COMMAND.pack(command, node))
 
 
 def power_state(statusword: int) -> PowerState | None:
-    """Decode statusword 6041h; None if its bits are those of no CiA 402 state."""
+    """Decode statusword 6041h; None if its bits code no CiA 402 state."""
     return _STATES.get(statusword & 0x6F)
 
 
-def controlword(state: PowerState, wanted: Wanted) -> int:
-    """Controlword 6040h for the next transition from `state` towards `wanted`."""
+def controlword(state: PowerState, wanted: TargetState) -> int:
+    """Return controlword 6040h for the next transition from `state` towards `wanted`."""
     if wanted is PowerState.OPERATION_ENABLED:
         return _TOWARDS_OPERATION.get(state, DISABLE_VOLTAGE)
     if wanted is PowerState.QUICK_STOP_ACTIVE:
@@ -131,7 +131,7 @@ def controlword(state: PowerState, wanted: Wanted) -> int:
 
 
 def _background(heartbeat: float) -> float:
-    """Bits per second of repeated statuswords and of four heartbeats of this period [s]."""
+    """Return the bits per second of repeated statuswords and of four heartbeats of this period [s]."""
     return 3 * frame_bits(STATUSWORD.size) / STATUS_PERIOD + 4 * frame_bits(NMT_STATE.size) / heartbeat
 
 
@@ -140,5 +140,5 @@ TRAFFIC: Final = Traffic(
     background=_background,
     most_sent=11,
 )
-"""One cycle: SYNC, three setpoints, three positions; sent are at most SYNC, heartbeat, setpoints, controlwords
-before they leave, and other ones that are decided behind them."""
+"""One cycle: SYNC, three setpoints, three positions. At most the service sends SYNC, a heartbeat, three setpoints, and
+three controlwords both before and after them."""

@@ -1,4 +1,4 @@
-"""Refuses settings that no CiA 402 drive could carry out."""
+"""Checks of the configuration that are specific to CiA 402 drives."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pathlib import Path
 
 from trirail_drivers.cia402 import eds, makers_objects, settings, units
 from trirail_drivers.config import Drive, Drives
-from trirail_drivers.driver.requirements import Requirements, Rule, resolution
+from trirail_drivers.driver.requirements import Requirements, Rule, resolution_rules
 from trirail_drivers.driver.scaling import INT32_MAX, scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield what refuses settings that a drive cannot be told, take or resolve."""
+    """Yield checks for settings that a drive does not have, or whose values it cannot take or resolve."""
     nodes = tuple(f"drives.{name}.node" for name in NAMES)
     yield Rule("drives.master_node", nodes, partial(settings.check_nodes, drives))
     for name, drive in zip(NAMES, drives.each, strict=True):
         table = f"drives.{name}"
         counts, scale = f"{table}.counts_per_metre", (f"{table}.offset", f"{table}.direction")
         yield Rule(counts, scale, partial(scale_of, name, drive))
-        yield from resolution(name, drive, drives, required, 1.0 / drive.counts_per_metre, _finer)
+        yield from resolution_rules(name, drive, drives, required, 1.0 / drive.counts_per_metre, _counts_remedy)
         limits = "limits.slider", "can.simulated.start"
         yield Rule(counts, (*scale, *limits), partial(_check_counts, name, drive, required))
         for key in ("velocity_unit", "acceleration_unit"):
@@ -33,12 +33,12 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
         reads = counts, f"{table}.revolutions_per_metre", "limits.slider.velocity"
         yield Rule(f"{table}.velocity_unit", reads, partial(_check_velocity, name, drive, required))
         yield Rule("drives.following_error", (counts, *scale), partial(_check_window, name, drive, drives))
-    yield Rule("drives.heartbeat", (), partial(settings.heartbeat_of, drives))
+    yield Rule("drives.heartbeat", (), partial(settings.heartbeat_period_ms, drives))
     yield Rule("loop.rate_hz", (), partial(settings.interpolation_periods, required.period))
 
 
 def files(drives: Drives) -> Iterator[Rule]:
-    """Yield what refuses an EDS that is not there, or is none."""
+    """Yield checks for an EDS that is missing or invalid."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.eds is not None:
             yield Rule(f"drives.{name}.eds", (), partial(_check_eds, name, drive))
@@ -48,43 +48,45 @@ def _check_eds(name: str, drive: Drive) -> None:
     try:
         eds.load(name, Path(drive.eds or ""), drive.node)
     except DriveError as error:
-        raise DriveError(f"drives.{name}.eds = {drive.eds!r}: {error}; correct the name, or leave it out") from error
+        raise DriveError(
+            f"drives.{name}.eds = {drive.eds!r}: {error}; correct the name or the file, or leave it out"
+        ) from error
 
 
 def _check_endpoints(name: str, drive: Drive) -> None:
     if drive.endpoints is not None:
-        raise DriveError(f"drives.{name}.endpoints = {drive.endpoints}: ODrives alone have endpoints; leave it out")
+        raise DriveError(f"drives.{name}.endpoints = {drive.endpoints}: only ODrives have endpoints; leave it out")
 
 
 def _check_window(name: str, drive: Drive, drives: Drives) -> None:
-    """The drive's own following error window is a 32-bit number."""
+    """Check that the drive's following error window fits into 32 bits."""
     scale = scale_of(name, drive)
     units.Units(scale, scale.counts_per_metre, 1.0).length(name, "following_error", drives.following_error)
 
 
 def _check_velocity(name: str, drive: Drive, required: Requirements) -> None:
-    """Feed-forward in the unit that is configured, where that is known of a metre, is a 32-bit integer, and not 0."""
+    """Check that the velocity limit fits the configured unit: a 32-bit integer other than 0."""
     key = f"drives.{name}.velocity_unit"
-    unit = units.written(key, drive.velocity_unit, 1) if drive.velocity_unit is not None else None
+    unit = units.parse_unit(key, drive.velocity_unit, 1) if drive.velocity_unit is not None else None
     per_metre = unit.per_metre(drive.counts_per_metre, drive.revolutions_per_metre) if unit is not None else None
-    if per_metre is not None and (why := units.unfit(required.velocity[NAMES.index(name)], per_metre)):
+    if per_metre is not None and (why := units.velocity_misfit(required.velocity[NAMES.index(name)], per_metre)):
         raise DriveError(f'{key} = "{drive.velocity_unit}": {why}')
 
 
-def _finer(widest: float) -> str:
+def _counts_remedy(widest: float) -> str:
     return f"wanted counts_per_metre of at least {1.0 / widest:g}"
 
 
 def _check_counts(name: str, drive: Drive, required: Requirements) -> None:
-    """Setpoints, positions and feed-forward are 32-bit integers."""
+    """Check that setpoints, positions and feed-forward fit into 32-bit integers."""
     scale, leg = scale_of(name, drive), NAMES.index(name)
     low, high, velocity = required.low[leg], required.high[leg], required.velocity[leg]
     reach = max(abs(scale.exact(low)), abs(scale.exact(high)))
-    # A position may be a following error beyond the travel, and a velocity a little beyond its limit.
+    # A position may exceed the travel by a following error, and a velocity its limit by a little.
     if reach + drive.counts_per_metre * required.following_error >= INT32_MAX:
         raise DriveError(
             f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: "
-            f"limits.slider.position = [{low:g}, {high:g}] is {reach:g} counts, and a drive takes "
+            f"limits.slider.position = [{low:g}, {high:g}] is {reach:g} counts, beyond a drive's limit of "
             f"{INT32_MAX}; wanted fewer counts, or an offset nearer to the travel"
         )
     if 2.0 * velocity * drive.counts_per_metre >= INT32_MAX:

@@ -1,7 +1,7 @@
-"""Error codes in words: those of an EMCY or of object 603Fh, and what to do about them.
+"""Error codes of EMCY and object 603Fh in words, with remedies.
 
-CiA 301, table "emergency error code classes", and CiA 402-2 (IEC 61800-7-201), table of error codes. A code that is
-in neither is told by the class that its first digits name; FFxxh are the maker's own.
+CiA 301, table "emergency error code classes", and CiA 402-2 (IEC 61800-7-201), table of error codes. A code in
+neither table is described by the class of its first digits; FFxxh are the maker's own.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ _CODES = {
     0x8A00: "control",
     0xF001: "deceleration",
 }
-"""What makers use most; the rest is told by class."""
+"""Most common codes of makers; others are described by their class."""
 
 _CLASSES = {
     0x10: "generic error",
@@ -136,37 +136,37 @@ _CLASSES = {
     0xF0: "additional function",
     0xFF: "the maker's own",
 }
-"""By the code's upper byte, or by its first digit where the byte is not listed."""
+"""Error classes by the code's upper byte, or by its first digit if the byte is not listed."""
 
-_UNKNOWN = "of no class of CiA 301"
+_UNKNOWN_CLASS = "of no class of CiA 301"
 
-_LATE = "was the service stopped or too slow? cable, terminators; trirail doctor"
+_LATE_REMEDY = "was the service stopped or too slow? cable, terminators; trirail doctor"
 _REMEDIES = {
-    0x2: "look at motor, cable and load",
-    0x3: "look at the supply; braking feeds back into it",
-    0x4: "let it cool down; look at load and air",
-    0x7121: "look for what blocks the slider",
-    0x73: "look at the encoder and its cable",
-    0x8130: _LATE,
+    0x2: "check motor, cable and load",
+    0x3: "check the supply; braking feeds energy back into it",
+    0x4: "let it cool down; check load and airflow",
+    0x7121: "check whether something blocks the slider",
+    0x73: "check the encoder and its cable",
+    0x8130: _LATE_REMEDY,
     0x8150: "give each node an identifier of its own",
-    0x81: "look at cable, terminators and bitrate: trirail doctor",
-    0x8250: _LATE,
-    0x82: "look for another node that sends with this drive's identifiers",
-    0x84: "look at load, limits and tuning",
-    0x85: "look at load, limits and tuning",
-    0x8611: "look at load, tuning, limits and counts_per_metre, and for what blocks the slider",
-    0x86: "look at load, limits and tuning",
-    0x8700: _LATE,
-    0x9: "look at what is wired to the drive's inputs",
+    0x81: "check cable, terminators and bitrate: trirail doctor",
+    0x8250: _LATE_REMEDY,
+    0x82: "find the other node that sends with this drive's identifiers",
+    0x84: "check load, limits and tuning",
+    0x85: "check load, limits and tuning",
+    0x8611: "check load, tuning, limits and counts_per_metre, and whether something blocks the slider",
+    0x86: "check load, limits and tuning",
+    0x8700: _LATE_REMEDY,
+    0x9: "check the wiring of the drive's inputs",
 }
-"""What to do, by code, upper byte or first digit."""
-_MANUAL = "see the drive's manual"
+"""Remedies by code, upper byte or first digit."""
+_DEFAULT_REMEDY = "see the drive's manual"
 
 
-def words(code: int, also: str = "") -> str:
-    """Return an error code [0, FFFFh] as hexadecimal number, its meaning, `also` what else is so, and a remedy."""
-    meaning = _CODES.get(code) or _by_class(_CLASSES, code) or _UNKNOWN
-    remedy = _REMEDIES.get(code) or _by_class(_REMEDIES, code) or _MANUAL
+def describe_error(code: int, also: str = "") -> str:
+    """Return an error code [0, FFFFh] as a hexadecimal number with its meaning, the text `also`, and a remedy."""
+    meaning = _CODES.get(code) or _by_class(_CLASSES, code) or _UNKNOWN_CLASS
+    remedy = _REMEDIES.get(code) or _by_class(_REMEDIES, code) or _DEFAULT_REMEDY
     return f"0x{code:04X} ({meaning}){also}; {remedy}"
 
 

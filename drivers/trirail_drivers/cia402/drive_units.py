@@ -1,4 +1,4 @@
-"""Asks a drive for its units, and holds them against the configuration: 60A8h to 60AAh, 608Fh to 6097h."""
+"""Reading of a drive's units, checked against the configuration: 60A8h to 60AAh, 608Fh to 6097h."""
 
 from __future__ import annotations
 
@@ -8,13 +8,21 @@ from typing import Final
 
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.sdo import Remote, SdoRefused
-from trirail_drivers.cia402.units import Of, Unit, Units, acceleration_unit, position_unit, velocity_unit, written
+from trirail_drivers.cia402.units import (
+    Unit,
+    UnitBase,
+    Units,
+    acceleration_unit,
+    parse_unit,
+    position_unit,
+    velocity_unit,
+)
 from trirail_drivers.config import Drive
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveError
 
 TOLERANCE: Final = 0.01
-"""By so much a measured number of counts or revolutions per metre may differ from the drive's own."""
+"""Largest relative difference between configured counts or revolutions per metre and the drive's own."""
 
 _IN_COUNTS: Final = {0x60A9: 0x00B5_0300, 0x60AA: 0x00B5_5700}
 """Increments per second, and per second squared."""
@@ -23,10 +31,10 @@ _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
 
 
 async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
-    """The units of a drive whose positions have a `scale`.
+    """Return the units of a drive whose positions have a `scale`.
 
-    Raises DriveError where the drive contradicts its configuration, or where neither says what a unit is that is
-    needed here: that of the velocity offset, or of the quick-stop ramp.
+    Raises DriveError if the drive contradicts its configuration, or if neither defines a required unit: that of the
+    velocity offset or the quick-stop ramp.
     """
     remote, counts = drive.remote, abs(scale.counts_per_metre)
     revolutions = await _revolutions(remote, config, counts)
@@ -43,43 +51,43 @@ async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
 
 
 def _per_metre(unit: Unit | None, counts: float, revolutions: float | None) -> float:
-    found = unit.per_metre(counts, revolutions) if unit is not None else None
-    return math.nan if found is None else found
+    per_metre = unit.per_metre(counts, revolutions) if unit is not None else None
+    return math.nan if per_metre is None else per_metre
 
 
 async def _revolutions(remote: Remote, config: Drive, counts: float) -> float | None:
-    """Revolutions per metre, as configured or as the drive's own objects have it."""
+    """Return the revolutions per metre, from the configuration or the drive's own objects."""
     derived, source = None, ""
-    told = await remote.peek(0x60A8)
-    unit = position_unit(told) if told is not None else None
-    if unit is not None and unit.of is Of.METRES:
-        _agree(
+    reported = await remote.peek(0x60A8)
+    unit = position_unit(reported) if reported is not None else None
+    if unit is not None and unit.base is UnitBase.METRES:
+        _check_agreement(
             remote.name,
             "counts_per_metre",
             config.counts_per_metre,
             1.0 / unit.size,
-            f"60A8 = {told:08X}h, {unit.name}",
+            f"60A8 = {reported:08X}h, {unit.name}",
         )
-    elif unit is not None and unit.of is Of.TURNS:
-        derived, source = counts * unit.size, f"60A8 = {told:08X}h, {unit.name}"
+    elif unit is not None and unit.base is UnitBase.TURNS:
+        derived, source = counts * unit.size, f"60A8 = {reported:08X}h, {unit.name}"
     else:
         for index, name in ((0x6092, "feed constant"), (0x608F, "encoder resolution")):
             per_turn = await _ratio(remote, index)
-            if per_turn is not None and per_turn > 1.0:  # 1 stands for "not used"
+            if per_turn is not None and per_turn > 1.0:  # 1 means "not used"
                 gear = await _ratio(remote, 0x6091) or 1.0 if index == 0x608F else 1.0
                 derived, source = counts / (per_turn * gear), f"{index:04X}, {name}, {per_turn:g} a revolution"
                 break
     if config.revolutions_per_metre is None:
         return derived
     if derived is not None:
-        _agree(remote.name, "revolutions_per_metre", config.revolutions_per_metre, derived, source)
+        _check_agreement(remote.name, "revolutions_per_metre", config.revolutions_per_metre, derived, source)
     return config.revolutions_per_metre
 
 
-def _agree(name: str, key: str, configured: float, told: float, source: str) -> None:
-    if not math.isclose(configured, told, rel_tol=TOLERANCE):
+def _check_agreement(name: str, key: str, configured: float, reported: float, source: str) -> None:
+    if not math.isclose(configured, reported, rel_tol=TOLERANCE):
         raise DriveError(
-            f"drives.{name}.{key} = {configured:g} contradicts the drive, by which it is {told:g} (object {source})"
+            f"drives.{name}.{key} = {configured:g} contradicts the drive, which has {reported:g} (object {source})"
         )
 
 
@@ -97,57 +105,59 @@ async def _unit(
     decoded: Callable[[int], Unit | None],
     velocity: Unit | None = None,
 ) -> Unit | None:
-    """What the drive says, held against the configuration, or else what that says; None where nobody does."""
+    """Return the drive's unit, checked against the configuration, or else the configured one, or None."""
     remote, key = drive.remote, _KEYS[index]
     text = config.velocity_unit if index == 0x60A9 else config.acceleration_unit
-    configured = written(f"drives.{remote.name}.{key}", text, 1 if index == 0x60A9 else 2) if text is not None else None
+    configured = (
+        parse_unit(f"drives.{remote.name}.{key}", text, 1 if index == 0x60A9 else 2) if text is not None else None
+    )
     code = await remote.peek(index)
-    told = decoded(code) if code else None
-    source = f"{index:04X} = {code:08X}h" if told is not None and code is not None else f"{_FACTORS[index]:04X}"
-    if told is None:
-        told = await _by_factor(remote, index, velocity)
-    if told is None:
+    reported = decoded(code) if code else None
+    source = f"{index:04X} = {code:08X}h" if reported is not None and code is not None else f"{_FACTORS[index]:04X}"
+    if reported is None:
+        reported = await _unit_from_factor(remote, index, velocity)
+    if reported is None:
         if configured is not None and configured.per_metre(counts, revolutions) is None:
             raise DriveError(
-                f'drives.{remote.name}.{key} = "{text}" is of revolutions, and nobody says how many a metre takes: '
-                f"say drives.{remote.name}.revolutions_per_metre"
+                f'drives.{remote.name}.{key} = "{text}" is in revolutions, whose number per metre is unknown; '
+                f"set drives.{remote.name}.revolutions_per_metre"
             )
         return configured
     if configured is not None:
-        one, other = (unit.per_metre(counts, revolutions) for unit in (configured, told))
-        if not (configured.same(told) or (one and other and math.isclose(one, other, rel_tol=TOLERANCE))):
+        one, other = (unit.per_metre(counts, revolutions) for unit in (configured, reported))
+        if not (configured.is_same(reported) or (one and other and math.isclose(one, other, rel_tol=TOLERANCE))):
             raise DriveError(
-                f'drives.{remote.name}.{key} = "{text}" contradicts the drive: object {source} is {told.name}'
+                f'drives.{remote.name}.{key} = "{text}" contradicts the drive: object {source} is {reported.name}'
             )
-    if told.per_metre(counts, revolutions) is None:
-        return await _in_counts(drive, index, told)
-    return told
+    if reported.per_metre(counts, revolutions) is None:
+        return await _switch_to_counts(drive, index, reported)
+    return reported
 
 
-async def _by_factor(remote: Remote, index: int, velocity: Unit | None) -> Unit | None:
-    """The unit that 6096h or 6097h makes: counts a second, or velocity a second, * numerator / divisor."""
+async def _unit_from_factor(remote: Remote, index: int, velocity: Unit | None) -> Unit | None:
+    """Return the unit of 6096h or 6097h: counts per second, or velocity per second, * divisor / numerator."""
     factor = await _ratio(remote, _FACTORS[index])
     if factor is None:
         return None
     if index == 0x60A9:
-        return Unit(Of.COUNTS, 1.0 / factor, f"{1.0 / factor:g} counts/s")
+        return Unit(UnitBase.COUNTS, 1.0 / factor, f"{1.0 / factor:g} counts/s")
     if velocity is None:
         return None
-    return Unit(velocity.of, velocity.size / factor, f"{1.0 / factor:g} * {velocity.name} a second")
+    return Unit(velocity.base, velocity.size / factor, f"{1.0 / factor:g} * {velocity.name} a second")
 
 
-async def _in_counts(drive: Differences, index: int, told: Unit) -> Unit:
-    """Set the unit to counts, where nobody says what the drive's own is of a metre."""
-    wanted = Unit(Of.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
+async def _switch_to_counts(drive: Differences, index: int, reported: Unit) -> Unit:
+    """Set the drive's unit to counts, since its own is unknown in metres."""
+    wanted = Unit(UnitBase.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
     code, remote = _IN_COUNTS[index], drive.remote
-    drive.note((index, 0), await remote.peek(index), code, "its unit, for nobody says its revolutions per metre")
+    drive.note((index, 0), await remote.peek(index), code, "its unit, since its revolutions per metre are unknown")
     try:
         await remote.write(index, 0, code)
-        if (await remote.becomes((index, 0), lambda held: held == code))[0] == code:
+        if (await remote.wait_until((index, 0), lambda held: held == code))[0] == code:
             return wanted
     except SdoRefused:
         pass
     raise DriveError(
-        f"drive {remote.name}: object {index:04X} is {told.name} and cannot be set to {wanted.name}; "
-        f"say drives.{remote.name}.revolutions_per_metre, the revolutions by which it counts that"
+        f"drive {remote.name}: object {index:04X} is {reported.name} and cannot be set to {wanted.name}; "
+        f"set drives.{remote.name}.revolutions_per_metre, by the revolutions of that unit"
     )

@@ -1,7 +1,7 @@
 """Three CiA 402 drives on CANopen that follow positions, and homing: trirail_drivers.interface.DriveGroup.
 
 The identifiers give the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
-setpoints, heartbeats. So the controlword of a quick stop goes before setpoints that still wait.
+setpoints, heartbeats. So the controlword of a quick stop overtakes setpoints that still wait.
 """
 
 from __future__ import annotations
@@ -9,32 +9,43 @@ from __future__ import annotations
 import math
 import struct
 import time
+from functools import partial
 
 import can
 
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import packed_frames
+from trirail_drivers.bus.reopening import Reopening
 from trirail_drivers.cia402 import canopen_frames, process_data, setup
 from trirail_drivers.cia402.axis import Cia402Axis
 from trirail_drivers.cia402.homing import HomingSequence
-from trirail_drivers.cia402.objects import means
-from trirail_drivers.cia402.one_drive import HAS_POWER
+from trirail_drivers.cia402.objects import describe_protection
+from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, Start
 from trirail_drivers.cia402.other_masters import OtherMasters
+from trirail_drivers.cia402.returning import ReturningCia402
 from trirail_drivers.driver.axis_row import NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
+from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
-"""A controlword that a drive does not follow is sent again after so many SYNCs: the frame may be lost."""
+"""SYNCs after which a controlword without effect is sent again: the frame may be lost."""
 
 
 class Cia402(Driver[Cia402Axis]):
     """Three CiA 402 drives on one CAN bus."""
 
-    def __init__(self, bus: can.BusABC, bitrate: int, drives: config.Drives, clock: Clock = time.monotonic) -> None:
-        super().__init__(bus, bitrate, drives, clock, Cia402Axis)
+    def __init__(
+        self,
+        bus: can.BusABC,
+        bitrate: int,
+        drives: config.Drives,
+        clock: Clock = time.monotonic,
+        reopening: Reopening | None = None,
+    ) -> None:
+        super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening)
         self._other_masters = OtherMasters(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
             self._listen(axis)
@@ -45,65 +56,98 @@ class Cia402(Driver[Cia402Axis]):
                 canopen_frames.HEARTBEAT + drives.master_node, canopen_frames.NMT_STATE.pack(canopen_frames.OPERATIONAL)
             )
         ]
-        self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
+        self._setpoints = tuple(axis.exchange.setpoints.frame() for axis in self._axes)
         self._heartbeat_due: float | None = None
-        self._wanted: canopen_frames.Wanted = PowerState.SWITCH_ON_DISABLED
+        self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
-        self._lent_with: list[tuple[int, int]] = []
-        """The controlwords and statuswords that the tables are made for."""
+        self._lent_state: list[tuple[int, int]] = []
+        """Controlwords and statuswords for which the tables are filled."""
 
-    def configure(self, period: float, fastest: float | None = None) -> None:
+    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
 
-        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout, ConfigurationRefused; of a drive
-        that takes velocities in a unit that cannot say the sliders' limit `fastest` [m/s], where that is given.
-        A drive in fault is not an error here; feedback tells of it and `reset` clears it.
+        With `awaits`, drives that do not answer latch a fault and are configured when they appear; a missing bus
+        latches a fault and is opened when it appears.
+
+        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout, ConfigurationRefused, or
+        DriveError if a drive's unit of velocity does not fit the sliders' limit `fastest` [m/s], if that is given.
+        A drive in fault raises nothing: the feedback reports it and `reset` clears it.
         """
         self._set_period(period, canopen_frames.TRAFFIC)
         scales = tuple(axis.scale for axis in self._axes)
-        done = setup.configure(self._wire.bus, self._drives, scales, period, self._clock, fastest)
-        self._set_period(period, process_data.traffic(made.way for made, _ in done))
-        for axis, (made, start) in zip(self._axes, done, strict=True):
-            axis.set_up(made.way, made.units)
-            axis.mode.shown = made.way.mode_shown
-            self._listen(axis)
-            axis.take_position(start.counts)
-            axis.error_code = start.error_code
-            axis.take_status(start.statusword)
-        self._setpoints = tuple(axis.way.setpoints.frame() for axis in self._axes)
-        guarded = (axis.node for axis in self._axes if axis.way.guarded)
-        self._beats += [Frame(canopen_frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
-        self._warn_of_setup([made for made, _ in done], means)
+        ones = setup.setup_tasks(self._wire.bus, self._drives, scales, period, self._clock)
+        configure = partial(setup.configure, self._wire.bus, self._drives, ones, fastest, awaits=awaits)
+        done, lost = self._set_up(configure, awaits=awaits)
+        each = [
+            ReturningCia402(axis, one, fastest, partial(self._rejoin_drive, number), lambda: recovery.setups)
+            for number, (axis, one) in enumerate(zip(self._axes, ones, strict=True))
+        ]
+        self._recovery = recovery = Recovery(self._wire, period * self._bitrate, each)
+        for axis, returning, result in zip(self._axes, each, done, strict=True):
+            if result is None:
+                axis.silent, axis.homed = True, False
+                axis.update_position(0)
+                continue
+            made, start = result
+            axis.set_up(made.exchange, made.units)
+            axis.mode.shown = made.exchange.mode_shown
+            returning.record_setup(made, returning.one.remote.client.answered)
+            self._apply_start(axis, start)
+        self._prepare_frames()
+        self._warn_of_setup(recovery.setups)
+        self._report_absent(lost)
+
+    def _apply_start(self, axis: Cia402Axis, start: Start) -> None:
+        """Adopt the state that a drive had at the end of its set-up."""
+        self._listen(axis)
+        axis.update_position(start.counts)
+        axis.error_code = start.error_code
+        axis.update_status(start.statusword)
+
+    def _prepare_frames(self) -> None:
+        """Create the frames that each cycle sends."""
+        self._set_period(self._period, process_data.traffic(axis.exchange for axis in self._axes))
+        self._setpoints = tuple(axis.exchange.setpoints.frame() for axis in self._axes)
+        guarded = (axis.node for axis in self._axes if axis.exchange.guarded)
+        self._beats[1:] = [Frame(canopen_frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
+        self._tables.end, self._lent_state = self._tables.end[:0], []
+
+    def _rejoin_drive(self, number: int, made: SetUp, start: Start) -> None:
+        """Let a drive take part in the cycle again after its set-up in the background."""
+        axis, drive = self._axes[number], self._drives.each[number]
+        axis.rejoin(made.exchange, made.units, self._clock(), homed=drive.homing is None)
+        self._apply_start(axis, start)
+        self._prepare_frames()
 
     def _listen(self, axis: Cia402Axis) -> None:
-        listen, way = self._wire.listen, axis.way
-        listen(way.feedback.identifier, axis, axis.on_position)
-        if way.status is not None:
-            listen(way.status, axis, axis.on_status)
-        listen(way.emergency, axis, axis.on_emergency)
+        listen, exchange = self._wire.listen, axis.exchange
+        listen(exchange.feedback.identifier, axis, axis.on_position)
+        if exchange.status is not None:
+            listen(exchange.status, axis, axis.on_status)
+        listen(exchange.emergency, axis, axis.on_emergency)
         listen(canopen_frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
         listen(canopen_frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
         self._other_masters.listen_to(axis)
 
     def sync(self) -> None:
-        """Send SYNC: the drives take up the setpoints written since the last one and sample positions.
+        """Send SYNC: the drives adopt the setpoints written since the last one, and sample their positions.
 
-        What has arrived is taken in before: positions among it answer the SYNC before.
+        Frames that have arrived are handled first: positions among them answer the previous SYNC.
         """
         self._stopped_in_this_cycle = False
-        self._wire.begin()
         now = self._synced = self._clock()
+        self._begin_cycle(now)
         self._wire.receive(now)
         if self._heartbeat_due is None:
-            # The drives' watchdogs and ours begin with the first cycle, however long ago the set-up was.
+            # The drives' watchdogs and ours start with the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
             for axis in self._axes:
                 axis.status_heard = now
-                axis.heard = now if axis.way.heard else math.inf
+                axis.heard = now if axis.exchange.heard else math.inf
         self._begin(now, self._heartbeat_due)
 
     def _begin(self, now: float, heartbeat_due: float, sent: int = 0) -> None:
-        """Send SYNC and, where they are due, the signs of life; somebody else has sent so many of these frames."""
+        """Send SYNC and due heartbeats, without the first `sent` of these frames, which are on the bus."""
         frames_due = [self._sync]
         if now >= heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
@@ -115,18 +159,22 @@ class Cia402(Driver[Cia402Axis]):
             axis.command_age += 1
 
     def read(self) -> Feedback:
-        """Take in every frame that has arrived."""
+        """Handle every frame that has arrived; return the feedback."""
         now = self._clock()
         self._wire.receive(now)
         for axis in self._axes:
-            mistaken = axis.cycle_over()
+            if self._wire.down:
+                axis.lose(stopping=self._off_deadline != math.inf)
+            mistaken = axis.end_cycle()
             axis.read_over()
+            if self._wire.fault is not None and axis.configured:
+                axis.watch_silence(now, self._period)
             if mistaken is not None and self._wire.fault is mistaken:
                 self._wire.fault = axis.event
-            fault = axis.fault(now, _asked_of(axis, self._wanted)) if self._wire.fault is None else None
+            fault = axis.find_fault(now, _target_of(axis, self._wanted)) if self._wire.fault is None else None
             if fault is not None:
                 self._wire.fail(fault)
-        self._watch_stopping(now)
+        self._check_stopped(now)
         if self._wire.fault is None:
             fault = self._homing.step(now)
             if fault is not None:
@@ -147,64 +195,72 @@ class Cia402(Driver[Cia402Axis]):
             self._homing.under_way,
             (a.follows, b.follows, c.follows),
             (a.homed, b.homed, c.homed),
+            self._unready,
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints [m] and velocity feed-forward [m/s], to be taken up at the next SYNC.
+        """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC.
 
-        Setpoints that are not finite or beyond 32-bit counts are not sent but a fault, of cause "setpoint".
-        Powering up goes on here, after the setpoints: no drive gets power without one.
+        Setpoints that are not finite or beyond 32-bit counts latch a fault of cause "setpoint" instead. The next
+        controlwords of powering up follow the setpoints, so that no drive gets power without one.
         """
         if self._stopped_in_this_cycle:
             return
         late = self._clock() - self._synced > self._period
         if self._wanted is not PowerState.OPERATION_ENABLED:
-            self._command()  # where frames have to wait, those that stop go before setpoints
+            self._command()  # if frames have to wait, stop commands go first
         for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
+            if not axis.configured:
+                continue
             try:
                 if axis.holds is not None:
                     setpoint = axis.holds, 0
                 else:
-                    offset = axis.units.velocity(rate) if axis.way.setpoints.has_velocity else 0
+                    offset = axis.units.velocity(rate) if axis.exchange.setpoints.has_velocity else 0
                     setpoint = axis.scale.counts(metres), offset
-                axis.way.setpoints.fill(frame, *setpoint, axis.controlword)
+                axis.exchange.setpoints.fill(frame, *setpoint, axis.controlword)
             except (ValueError, OverflowError, struct.error):
                 self._refuse_setpoint(axis, metres, rate)
                 return
-            axis.aim(*setpoint)
+            axis.note_setpoint(*setpoint)
         for axis, frame in zip(self._axes, self._setpoints, strict=True):
+            if not axis.configured:
+                continue
             if not self._wire.send(frame):
                 axis.setpoints_lost += 1
             elif late:
                 axis.setpoints_late += 1
         self._command()
+        self._recover()
 
     def lend(self) -> Cyclic | None:
-        """The tables of a cycle, where every drive rests in what it was asked for and nothing else is to be done."""
+        """Return the tables of a cycle; None unless every drive is in its target state and nothing else is pending."""
         due = self._heartbeat_due
-        if due is None or not (self._wire.calm and self._homing.idle) or self._period == 0.0:
+        if due is None or not (self._wire.is_healthy and self._homing.idle) or self._period == 0.0:
             return None
-        if self._stopped_in_this_cycle or not all(axis.rests(_asked_of(axis, self._wanted)) for axis in self._axes):
+        if self._stopped_in_this_cycle or not all(
+            axis.is_steady(_target_of(axis, self._wanted)) for axis in self._axes
+        ):
             return None
         lent, beats = self._tables, len(self._beats)
         if not len(lent.end):
             lent.begin, lent.beats, lent.setpoints = map(packed_frames, ([self._sync], self._beats, self._setpoints))
             lent.end = lent.setpoints.headers
-        lent.times[0] = self._off_by, due, self._drives.heartbeat, beats, 0, NOWHERE, lent.times[0]["traffic"]
+        lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NOWHERE, lent.times[0]["traffic"]
         words = [(axis.controlword, axis.statusword) for axis in self._axes]
-        if words != self._lent_with:
-            self._lent_with = words
+        if words != self._lent_state:
+            self._lent_state = words
             for axis, frame in zip(self._axes, self._setpoints, strict=True):
-                axis.way.setpoints.fill(frame, *axis.setpoint, axis.controlword)
+                axis.exchange.setpoints.fill(frame, *axis.setpoint, axis.controlword)
             lent.setpoints.fill(self._setpoints)
-            lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected(number)])
+            lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected_rows(number)])
         return lent
 
-    def take_back(self, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
-        """Go on from what the tables hold: see trirail_drivers.driver.cyclic.Lender."""
+    def take_back(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
+        """Continue from the tables: see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._heartbeat_due = float(times["beat_due"])
-        self._wire.hand_in(self._tables.arrived, arrived, error)
+        self._wire.hand_in(self._tables.arrived, handled, arrived, error)
         feedback = self._feedback()
         if synced is not None:
             self._synced = synced
@@ -213,69 +269,72 @@ class Cia402(Driver[Cia402Axis]):
         return feedback
 
     def send_on(self, first: int) -> None:
-        """Send the setpoints in the tables that the bus has not taken, one at a time."""
+        """Send the setpoints in the tables that the bus has refused, one at a time."""
         for axis, packed in zip(self._axes[first:], self._tables.setpoints.frames[first:], strict=True):
-            axis.setpoints_lost += not self._wire.send(Frame.of(packed.tobytes()))
+            axis.setpoints_lost += not self._wire.send(Frame.from_packed(packed.tobytes()))
 
     def enable(self, alone: str | None = None) -> None:
-        """Begin to power up, all drives or one `alone`; the following writes carry it out, the states tell when.
+        """Begin to power up all drives, or one `alone`; the following writes carry it out, as the states show.
 
-        Does nothing while a fault is latched, or while drives are to have power.
+        Does nothing while a fault is latched, or while the drives are enabled.
         """
         if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
         self._wanted = PowerState.OPERATION_ENABLED
-        self._off_by = math.inf
+        self._off_deadline = math.inf
         for axis in self._axes:
             axis.powered_up = axis.has_followed = False
-            axis.mode.shown = axis.way.mode_shown
+            axis.mode.shown = axis.exchange.mode_shown
             axis.left_out = alone not in (None, axis.name)
         self._homing.restore()
 
     def home(self) -> None:
-        """Begin to home the drives that have a homing method, one after the other: see homing402.
+        """Begin to home the drives that have a homing method, one after the other: see cia402.homing.
 
-        Does nothing unless all drives that were enabled have power and no fault is latched.
+        Does nothing unless all enabled drives have power and no fault is latched.
         """
         ready = (axis.left_out or axis.state is PowerState.OPERATION_ENABLED for axis in self._axes)
         if self._wire.fault is None and self._wants_power() and all(ready):
             self._homing.start()
 
     def stop_homing(self) -> None:
-        """Halt the drive that is being homed; in the end it follows setpoints again, where it stands."""
+        """Halt the drive that is being homed; then it follows setpoints again, at its present position."""
         self._homing.stop()
 
     def disable(self) -> None:
-        """Take power off; meant for a robot at standstill. A drive that keeps it is a fault, of cause "timeout"."""
+        """Take the power off, at standstill. A drive that keeps it latches a fault of cause "timeout"."""
         self._power_off(PowerState.SWITCH_ON_DISABLED, "disable")
         self._command()
 
     def quick_stop(self) -> None:
-        """Make every drive stop by its own quick-stop ramp, in this cycle, and end without power.
+        """Begin every drive's own quick-stop ramp in this cycle; the power is off at its end.
 
-        A drive that has it after `stop_timeout` is told to lose it at once, and is a fault, of cause "timeout", that
-        takes the place of the one that stopped it.
+        A drive that still has power after `stop_timeout` gets "disable voltage"; its fault of cause "timeout" replaces
+        the one that caused the stop.
         """
         self._power_off(PowerState.QUICK_STOP_ACTIVE, "quick stop")
         self._stopped_in_this_cycle = True
         self._command()
 
     def reset(self) -> None:
-        """Forget the fault and clear the drives' own; never powers them up. What persists is found again."""
+        """Clear the latched fault and the drives' faults, without powering up. Lasting conditions are found again."""
         self._wire.reset()
         now = self._clock()
         if self._wanted is not PowerState.OPERATION_ENABLED:
-            self._give_time_to_stop("reset")
+            self._start_stop_timer("reset")
         for axis in self._axes:
-            if axis.left_operational:  # its set-up is still there: only a restarted drive needs a new one
+            if not axis.configured:
+                continue
+            if axis.left_operational:  # its set-up is still valid: only a restarted drive needs a new one
                 self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
-            axis.forgive(now)
+            axis.clear_faults(now)
             if axis.register_wanted:
                 axis.register_wanted = False
-                self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, canopen_frames.ERROR_REGISTER_UPLOAD))
+                self._ask(axis, canopen_frames.ERROR_REGISTER_UPLOAD)
         self._command()
 
-    def _leave(self) -> None:
+    def _cut_power(self) -> None:
+        # By PDO and SDO: an operational node gets both, a pre-operational one only the SDO (CiA 301).
         for axis in self._axes:
             self._send_word(axis, canopen_frames.DISABLE_VOLTAGE)
             self._send_word_by_sdo(axis, canopen_frames.DISABLE_VOLTAGE)
@@ -283,58 +342,68 @@ class Cia402(Driver[Cia402Axis]):
             self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
 
     def _poll_by_sdo(self, axis: Cia402Axis, now: float) -> None:
-        """Ask for what no PDO tells, without waiting: one request at a time."""
-        if axis.sdo_asked is not None:
+        """Request values that no PDO carries, without waiting: one request at a time."""
+        if axis.sdo_asked is not None or self._is_being_configured(axis):
             return
-        if axis.mute or ((axis.way.polled or axis.awaits_mode) and now >= axis.poll_due):
-            self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, axis.request()))
-            axis.mute = False
+        if axis.pdo_silent or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
+            self._ask(axis, axis.request())
+            axis.pdo_silent = False
             axis.poll_due = now + canopen_frames.POLL_PERIOD
 
     def _command(self) -> None:
-        """Send the controlwords that are due: one transition per drive at a time."""
+        """Send the due controlwords: one transition per drive at a time."""
         now = self._clock()
         for axis in self._axes:
-            wanted = _asked_of(axis, self._next)
+            if self._is_being_configured(axis):
+                continue
+            wanted = _target_of(axis, self._next)
             word = axis.word(now, wanted)
-            deaf = axis.may_be_deaf and _asked_of(axis, self._wanted) is not PowerState.OPERATION_ENABLED
+            deaf = axis.may_miss_pdos and _target_of(axis, self._wanted) is not PowerState.OPERATION_ENABLED
             repeat = axis.command_age >= REPEAT_AFTER and (deaf or axis.is_not_followed(word, wanted))
             if not (word != axis.controlword or repeat):
                 continue
             if deaf:
-                # PDOs are heard in NMT operational only (CiA 301): what stops it goes both process_data.
+                # PDOs are received in NMT operational only (CiA 301): stop commands are sent by PDO and SDO.
                 self._send_word_by_sdo(axis, word)
             if self._send_word(axis, word):
                 axis.controlword = word
                 axis.command_age = 0
 
+    def _is_being_configured(self, axis: Cia402Axis) -> bool:
+        return self._recovery is not None and self._recovery.is_configuring(axis)
+
     def _send_word(self, axis: Cia402Axis, word: int) -> bool:
-        """Send a controlword by PDO; where it goes with the setpoint, with the last one or with where the drive is."""
-        if axis.way.controlword is not None:
-            return self._wire.send(Frame(axis.way.controlword, canopen_frames.CONTROLWORD.pack(word)))
-        frame = axis.way.setpoints.frame()
-        axis.way.setpoints.fill(frame, *axis.setpoint, word)
+        """Send a controlword by PDO; if it is mapped beside the setpoint, with the last setpoint."""
+        if axis.exchange.controlword is not None:
+            return self._wire.send(Frame(axis.exchange.controlword, canopen_frames.CONTROLWORD.pack(word)))
+        frame = axis.exchange.setpoints.frame()
+        axis.exchange.setpoints.fill(frame, *axis.setpoint, word)
         return self._wire.send(frame)
 
     def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:
-        """Send a controlword by SDO, which is heard in pre-operational too; a stopped node is first brought there."""
+        """Send a controlword by SDO, which works in pre-operational too; a stopped node is first switched to that."""
         if axis.stopped:
             self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
         data = canopen_frames.CONTROLWORD_DOWNLOAD + canopen_frames.CONTROLWORD.pack(word) + bytes(2)
-        self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, data))
+        self._ask(axis, data)
+
+    def _ask(self, axis: Cia402Axis, request: bytes) -> None:
+        """Send a request by SDO."""
+        if self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, request)):
+            axis.note_request(self._clock())
 
     @property
-    def _next(self) -> canopen_frames.Wanted:
-        """What drives are asked for now: none gets power while one of them may not follow setpoints."""
+    def _next(self) -> canopen_frames.TargetState:
+        """State to command now: no drive gets power while one of them may not follow setpoints."""
         return PowerState.QUICK_STOP_ACTIVE if self._homing.restoring else self._wanted
 
-    def _power_off(self, wanted: canopen_frames.Wanted, asked: str) -> None:
+    def _power_off(self, wanted: canopen_frames.TargetState, reason: str) -> None:
         if self._wanted is not wanted:
-            self._give_time_to_stop(asked)
+            self._start_stop_timer(reason)
         self._wanted = wanted
         self._homing.abandon()
 
-    def _give_up_stopping(self) -> None:
+    def _abandon_stop(self) -> None:
         self._wanted = PowerState.SWITCH_ON_DISABLED
 
     def _wants_power(self) -> bool:
@@ -344,11 +413,15 @@ class Cia402(Driver[Cia402Axis]):
         while self._powered() and (left := deadline - self._clock()) > 0:
             self._wire.wait(left, self._clock)
 
+    @staticmethod
+    def _describe_protection(protection: str) -> str:
+        return describe_protection(protection)
+
     def _powered(self) -> bool:
         return any(axis.state in HAS_POWER for axis in self._axes)
 
 
-def _asked_of(axis: Cia402Axis, wanted: canopen_frames.Wanted) -> canopen_frames.Wanted:
-    """What a drive is asked for where the drives are `wanted` in a state: one that is left out gets no power."""
+def _target_of(axis: Cia402Axis, wanted: canopen_frames.TargetState) -> canopen_frames.TargetState:
+    """Return the target state of a drive if that of the drives is `wanted`: one that is left out gets no power."""
     left_off = axis.left_out and wanted is PowerState.OPERATION_ENABLED
     return PowerState.SWITCH_ON_DISABLED if left_off else wanted

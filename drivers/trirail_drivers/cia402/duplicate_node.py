@@ -1,6 +1,7 @@
-"""Whether two nodes have one node id, which CiA 301 has no means against.
+"""Detection of two nodes with the same node id, which CiA 301 does not prevent.
 
-Then each SYNC has two positions; or one node boots, or is not operational, and the other goes on with its positions.
+Either each SYNC is answered by two positions, or one node boots or is not operational while the other still sends
+positions.
 """
 
 from __future__ import annotations
@@ -10,79 +11,79 @@ from typing import Final
 from trirail_drivers.driver.axis_row import AxisRow
 from trirail_drivers.interface import DriveFault
 
-FAR: Final = 0.005
-"""Positions that answer one SYNC and are so far apart [m] are those of two sliders."""
-FAR_IN_A_ROW: Final = 3
-"""So many SYNCs in a row that have such positions are answered by two nodes."""
-COUNTED: Final = 20
-"""SYNCs over which those with two positions are counted, however near these are."""
-MOST: Final = 15
-"""Of them one node's may be so many: where every other answer comes a cycle late, every other SYNC has two."""
+FAR_APART_M: Final = 0.005
+"""Distance of two positions after one SYNC from which they are those of two sliders."""
+FAR_SYNCS: Final = 3
+"""Number of consecutive SYNCs with such positions that prove two nodes."""
+COUNT_WINDOW_SYNCS: Final = 20
+"""SYNCs over which those with two positions are counted, at any distance."""
+MAX_DOUBLE_ANSWERS: Final = 15
+"""Largest number of them from a single node: if every other answer is a cycle late, every other SYNC has two."""
 ANSWERS_AFTER: Final = 3
-"""So many SYNCs that are answered after a node was heard to be not operational are answered by another: the PDOs of the
-one have ended, but for one that was on its way."""
+"""Number of positions after a node reported that it is not operational that prove another node: its own PDOs have
+ended, except one that was on its way."""
 
 
 def warning(node: int, by: str) -> str:
-    """What people are to know of it."""
+    """Return the warning for people."""
     return f"a second node with id {node} on the bus: {by}; give each its own node id"
 
 
-class AnswersAfter:
-    """Whether positions go on after a boot-up message, or a heartbeat of a node that sends none (CiA 301, NMT)."""
+class AnswersAfterStop:
+    """Detection of positions after a boot-up message or a heartbeat of a node that sends none (CiA 301, NMT)."""
 
-    __slots__ = ("_answers", "_said")
+    __slots__ = ("_answers", "_fault")
 
     def __init__(self) -> None:
-        self._said: DriveFault | None = None
+        self._fault: DriveFault | None = None
         self._answers = 0
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is looked for."""
-        return self._said is None
+        """Whether nothing is being counted."""
+        return self._fault is None
 
-    def begin(self, said: DriveFault | None) -> None:
-        """Count from now on; `said` is what was told of the node."""
-        if self._said is None:
-            self._said, self._answers = said, 0
+    def begin(self, fault: DriveFault | None) -> None:
+        """Begin to count; `fault` is the one attributed to the node."""
+        if self._fault is None:
+            self._fault, self._answers = fault, 0
 
     def forget(self) -> None:
-        """Look no more: the node may be started again."""
-        self._said = None
+        """Stop counting: the node may be started again."""
+        self._fault = None
 
-    def of_another(self, *, came: bool) -> DriveFault | None:
-        """After a cycle in which a position came or not: what was told of a node, where another one has gone on."""
-        said = self._said
-        if said is None:
+    def end_cycle(self, *, came: bool) -> DriveFault | None:
+        """Count a cycle with a position, if one `came`; return the fault once another node is proved, else None."""
+        fault = self._fault
+        if fault is None:
             return None
         self._answers += came
         if self._answers < ANSWERS_AFTER:
             return None
-        self._said = None
-        return said
+        self._fault = None
+        return fault
 
 
 class AnswersPerSync:
-    """Looks at the positions that come with one identifier, cycle by cycle.
+    """Detection of two positions per SYNC with one identifier.
 
-    A frame, or a SYNC, that the bus doubles brings the same position again or, in motion, one further on. Two sliders'
-    positions go to and fro, but for motion that is faster than they are apart.
+    A frame or SYNC that the bus repeats brings the same position again or, in motion, a later one. The positions of two
+    sliders alternate, except in a motion that is faster than their distance per cycle.
     """
 
     __slots__ = ("_counted_from", "_counts_far", "_far", "_far_in_a_row", "_row", "_two", "_with_two")
 
     def __init__(self, row: AxisRow) -> None:
-        """`row` is where the positions that come are noted."""
+        """`row` holds the newest positions."""
         self._row = row
-        self._counts_far = abs(row.counts_per_metre) * FAR
+        self._counts_far = abs(row.counts_per_metre) * FAR_APART_M
         self._two = self._far = False
         self._far_in_a_row = self._with_two = 0
         self._counted_from = 0
-        """The number of a SYNC."""
+        """Number of the SYNC at which counting began."""
 
-    def come(self, counts: int) -> None:
-        """A position comes."""
+    def add_position(self, counts: int) -> None:
+        """Handle a received position [counts]."""
         row = self._row
         step, before = counts - row.newest, row.step
         if row.came:
@@ -91,18 +92,18 @@ class AnswersPerSync:
         row.newest, row.step = counts, step or before
 
     @property
-    def calm(self) -> bool:
-        """Whether no SYNC has had two positions lately."""
+    def is_clear(self) -> bool:
+        """Whether no recent SYNC had two positions."""
         return not (self._far_in_a_row or self._with_two or self._two or self._far)
 
     def from_two_nodes(self) -> bool:
-        """Whether the positions of the cycle that is over, with those before it, are two nodes'."""
+        """End a cycle; return whether its positions and the earlier ones prove two nodes."""
         self._far_in_a_row = self._far_in_a_row + 1 if self._far else 0
         self._with_two += self._two
-        found = self._far_in_a_row >= FAR_IN_A_ROW or self._with_two > MOST
-        if found:
+        two_nodes = self._far_in_a_row >= FAR_SYNCS or self._with_two > MAX_DOUBLE_ANSWERS
+        if two_nodes:
             self._far_in_a_row = 0
-        if found or (self._row.syncs - self._counted_from) % COUNTED == 0:
+        if two_nodes or (self._row.syncs - self._counted_from) % COUNT_WINDOW_SYNCS == 0:
             self._counted_from, self._with_two = self._row.syncs, 0
         self._two = self._far = False
-        return found
+        return two_nodes

@@ -1,12 +1,13 @@
-"""What objects a drive has, by its EDS: the file that its maker gives with it (CiA 306)."""
+"""Object dictionary of a drive from its EDS, the maker's file (CiA 306)."""
 
 from __future__ import annotations
 
 import configparser
 import io
 import logging
+import re
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import canopen
 from canopen.objectdictionary import ObjectDictionary
@@ -14,33 +15,170 @@ from canopen.objectdictionary import ObjectDictionary
 from trirail_drivers import files
 from trirail_drivers.errors import DriveError, FileError
 
-# What canopen would say of a file is in the DriveError; standard error is for that one line.
+_OBJECT = re.compile(r"([0-9A-Fa-f]{4})((?:[Ss]ub[0-9A-Fa-f]+)|Name)?")
+_PADDED_DIGIT = re.compile(r"0+([0-7])")
+"""Digit with leading zeros: the same number in decimal and octal."""
+_VERBATIM = ("parametervalue", "defaultvalue")
+"""Keys whose digits may be an octet string, in which zeros count."""
+_AFTER = "\x1a\0"
+"""Characters that old editors wrote after the end of a text."""
+
+
+class Section(NamedTuple):
+    """A section, its line in the file, and its keys."""
+
+    name: str
+    line: int
+    values: dict[str, str]
+
+    @property
+    def object(self) -> int | None:
+        """Index of the object that it describes or belongs to."""
+        match = _OBJECT.fullmatch(self.name)
+        return int(match[1], 16) if match else None
+
+    @property
+    def parent(self) -> str:
+        """Name of the section that it depends on, or ""."""
+        match = _OBJECT.fullmatch(self.name)
+        return match[1].upper() if match and match[2] else ""
+
+    def __str__(self) -> str:
+        values = "\n".join(f"{key}={value}" for key, value in self.values.items())
+        return f"[{self.name}]\n{values}\n"
+
+
+def sections_of(text: str) -> tuple[list[Section], list[str]]:
+    """Return a text's sections, and notes on skipped lines: those without a value, and duplicates.
+
+    Comments are dropped. A key without a value counts as absent, since many tools write such keys.
+    """
+    sections: dict[str, Section] = {}
+    notes: list[str] = []
+    now: Section | None = None
+    twice: list[Section] = []
+    for number, line in enumerate(text.rstrip(_AFTER + " \r\n\t").splitlines(), 1):
+        stripped = line.strip()
+        if not stripped or stripped[0] in ";#":
+            continue
+        if stripped[0] == "[" and "]" in stripped:
+            now = Section(stripped[1 : stripped.index("]")].strip(), number, {})
+            if now.name.upper() in sections:
+                twice.append(now)
+            else:
+                sections[now.name.upper()] = now
+            continue
+        if now is None:
+            notes.append(f"line {number}: before the first section")
+        elif now.name.casefold() != "comments":
+            reason = _parse_line(now.values, stripped)
+            notes += [f"[{now.name}] line {number}: {reason}"] if reason else []
+    differing = [again for again in twice if again.values != sections[again.name.upper()].values]
+    notes += [f"[{again.name}] in line {again.line}: for the second time" for again in differing]
+    sections.pop("COMMENTS", None)
+    return list(sections.values()), notes
+
+
+def _parse_line(values: dict[str, str], line: str) -> str:
+    """Add a line to a section's values; return the reason for which it is skipped, or ""."""
+    key, equals, value = (part.strip() for part in line.partition("="))
+    if not equals:
+        return "no value"
+    small = _PADDED_DIGIT.fullmatch(value) if key.casefold() not in _VERBATIM else None
+    value = small[1] if small else value
+    if values.get(key, value) != value:
+        return f"{key} for the second time"
+    if value:
+        values[key] = value
+    return ""
+
+
+def sort_sections(sections: list[Section]) -> list[Section]:
+    """Return the sections sorted such that each follows the one that it depends on."""
+    return sorted(sections, key=lambda section: section.parent != "")
+
+
+# The DriveError has canopen's reason; standard error shows only that one line.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 SERVO: Final = Path(__file__).with_name("servo.eds")
-"""Object dictionary of the simulated CiA 402 servo drive: names and types of objects where no maker's EDS is given."""
+"""Object dictionary of the simulated CiA 402 servo drive: names and types of objects without a maker's EDS."""
+REQUIRED: Final = frozenset((0x1000, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064))
+"""Objects needed in every mode: a file in which one cannot be read is refused."""
+MAX_SHOWN_NOTES: Final = 3
+"""Number of skipped sections and lines that a warning names."""
+_UNREADABLE = configparser.Error, ValueError, KeyError, AttributeError
 
 
-def load(drive: str, file: Path, node: int) -> ObjectDictionary:
-    """The objects of the drive called `drive`; DriveError if the file cannot be used."""
+def load(drive: str, file: Path, node: int) -> tuple[ObjectDictionary, str]:
+    """Return the objects of the drive called `drive`, and one warning of skipped lines, or "".
+
+    Raises DriveError if the file cannot be used.
+    """
     try:
-        return read(file, node)
+        objects, notes = _read(file, node)
     except DriveError as error:
         raise DriveError(f"drive {drive}: {error}") from error
+    more = f"; and {len(notes) - MAX_SHOWN_NOTES} more" if len(notes) > MAX_SHOWN_NOTES else ""
+    return objects, f"skipped in {file}: {'; '.join(notes[:MAX_SHOWN_NOTES])}{more}" if notes else ""
 
 
 def read(file: Path, node: int) -> ObjectDictionary:
-    """The objects of a device with this node id. Raises DriveError if the file is no EDS."""
+    """Return the objects of a device with this node id. Raises DriveError if the file is no EDS."""
+    return _read(file, node)[0]
+
+
+def open_text(file: Path) -> io.StringIO:
+    """Open a maker's file as text that canopen can read: unreadable lines are repaired or left out."""
+    return _text(file, sort_sections(sections_of(_content(file))[0]))
+
+
+def _content(file: Path) -> str:
+    """Read a maker's file, whose encoding may be any: numbers are ASCII in all of them."""
     try:
-        with open_text(file) as text:
-            return canopen.import_od(text, node)
+        with files.open_regular(file) as source:
+            return source.read().decode("utf-8-sig", errors="replace")
     except (FileError, OSError) as error:
         raise DriveError(f"cannot read EDS {error}") from error
-    except (configparser.Error, ValueError, KeyError, AttributeError) as error:
-        reason = " ".join(str(error).split())
-        raise DriveError(f"{file} is not an EDS as CiA 306 has it: {reason}") from error
 
 
-def open_text(file: Path) -> io.TextIOWrapper:
-    """Open a file of a maker's, who writes names in whatever encoding he has: numbers are ASCII in all of them."""
-    return io.TextIOWrapper(files.open_regular(file), encoding="utf-8", errors="replace")
+def _text(file: Path, sections: list[Section]) -> io.StringIO:
+    lacks = not any(section.name == "DeviceInfo" for section in sections)  # canopen refuses a file without it
+    text = io.StringIO("".join(map(str, [Section("DeviceInfo", 0, {}), *sections] if lacks else sections)))
+    text.name = str(file)  # canopen recognises an EDS by its name
+    return text
+
+
+def _read(file: Path, node: int) -> tuple[ObjectDictionary, list[str]]:
+    """Return the readable objects of a file, and notes on skipped lines. Raises DriveError."""
+    sections, notes = sections_of(_content(file))
+    sections = sort_sections(sections)
+    try:
+        objects = canopen.import_od(_text(file, sections), node)
+    except _UNREADABLE:
+        sound = _readable(file, sections, node, notes)
+        objects = canopen.import_od(_text(file, sound), node)
+    if not len(objects):
+        reason = notes[0] if notes else "it has no objects"
+        raise DriveError(f"{file} is not an EDS as CiA 306 has it: {reason}")
+    return objects, notes
+
+
+def _readable(file: Path, sections: list[Section], node: int, notes: list[str]) -> list[Section]:
+    """Return the sections that canopen can read, each tried with the one that it depends on; note the others."""
+    sound: dict[str, Section] = {}
+    for section in sections:
+        parent = sound.get(section.parent) if section.parent else None
+        reason = f"there is no section [{section.parent}] that can be read" if section.parent and not parent else ""
+        if not reason:
+            try:
+                canopen.import_od(_text(file, [parent, section] if parent else [section]), node)
+            except _UNREADABLE as error:
+                reason = " ".join(str(error).split())
+        if not reason:
+            sound[section.name.upper()] = section
+            continue
+        notes.append(f"[{section.name}] in line {section.line}: {reason}")
+        if section.object in REQUIRED:
+            raise DriveError(f"{file}: {notes[-1]}; every drive needs this object")
+    return list(sound.values())

@@ -1,10 +1,9 @@
-"""Homing of CiA 402 drives, from within the cycle: homing mode (CiA 402-2, mode 6).
+"""Homing of CiA 402 drives within the cycle: homing mode (CiA 402-2, mode 6).
 
-One drive after the other, while the others hold their positions in the mode that they follow setpoints in. The three
-sliders together place the platform, so each of them moves it, and before homing nobody knows where it is. With one
-slider moving, slowly, the platform follows it alone, on a path that a person can foresee and watch; a wrong
-direction or a missing switch moves one slider; and the two that hold report a following error when the platform is
-jammed. With all three at once the platform would go where three unknown distances take it, and jam unnoticed.
+The drives are homed one after the other, while the others hold their positions in their setpoint mode. All three
+sliders move the platform, and before homing its pose is unknown. With a single slow slider, the platform moves on a
+path that a person can foresee and watch, a wrong direction or a missing switch concerns one slider, and the two drives
+that hold report a following error if the platform jams. If all three moved, it could go anywhere, and jam unnoticed.
 
 The home offset 607Ch is 0: makers differ in its sign. The position at home is the `offset` of [drives.X].
 """
@@ -24,11 +23,11 @@ from trirail_drivers.interface import DriveFault, PowerState
 HOMING = 6
 _MODE, _MODE_DISPLAY, _STATUSWORD = 0x6060, 0x6061, 0x6041
 
-FRESH: Final = 4
-"""So many answers to SYNCs after homing, a position is surely counted from home: one is on its way, and one may be
-taken for its neighbour."""
-TAKEN_UP: Final = 2
-"""So many SYNCs after it was written, a setpoint has been taken up."""
+FRESH_ANSWERS: Final = 4
+"""Number of answers to SYNCs after homing from which a position certainly counts from home: one may be on its way, and
+one may be assigned to the wrong SYNC."""
+SETPOINT_SYNCS: Final = 2
+"""Number of SYNCs after which a written setpoint is adopted."""
 
 _SDO: Final = Struct("<BHB4s")
 _WRITE_BYTE: Final = 0x2F
@@ -36,21 +35,21 @@ _READ: Final = 0x40
 _ABORTED: Final = 0x80
 """SDO commands: expedited download of one byte, upload, abort (CiA 301)."""
 
-_REACHED: Final = 1 << 10
-_ATTAINED: Final = 1 << 12
+_TARGET_REACHED: Final = 1 << 10
+_HOMING_ATTAINED: Final = 1 << 12
 _ERROR: Final = 1 << 13
-"""Statusword bits in homing mode; in other modes they mean other things."""
+"""Statusword bits in homing mode; they differ in other modes."""
 
 Steps = Generator[None, None, None]
-"""What is to be done, a cycle at each yield."""
+"""Steps of a sequence, one per cycle."""
 
 
 class HomingFailedError(Exception):
-    """Homing cannot go on; the text says why."""
+    """Homing has failed; the text is the reason."""
 
 
 class HomingSequence:
-    """Homes the drives that have a homing method, one step at each `step`."""
+    """Homing of the drives that have a homing method, one step at each `step`."""
 
     def __init__(self, axes: tuple[Cia402Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
         self._plan = [
@@ -66,29 +65,29 @@ class HomingSequence:
         self._stopping = False
         self._now = 0.0
         self.under_way = False
-        """Drives are being homed."""
+        """Whether drives are being homed."""
         self.restoring = False
-        """Drives are being brought back to following setpoints, before they get power."""
+        """Whether drives are switched back to their setpoint mode before they get power."""
         self._forget_homes()
 
     def start(self) -> None:
-        """Begin to home all drives with a homing method and power; until each is done it does not count as homed."""
+        """Begin to home all drives with a homing method and power; none of them counts as homed until it is done."""
         self._forget_homes()
         self.under_way, self._stopping = True, False
         self._steps = self._home_all()
 
     def stop(self) -> None:
-        """Halt the drive that moves and bring it back to following setpoints; home no other."""
+        """Halt the moving drive, switch it back to its setpoint mode, and home no other."""
         self._stopping = True
 
     def restore(self) -> None:
-        """Bring drives that a quick stop left in homing mode back to following setpoints."""
+        """Switch drives that a quick stop left in homing mode back to their setpoint mode."""
         if not all(axis.cyclic for axis, _ in self._plan):
             self.restoring = True
             self._steps = self._restore_all()
 
     def abandon(self) -> None:
-        """Leave it as it is: the drives are losing their power."""
+        """Abort the sequence: the drives are losing their power."""
         self._end()
         for axis, _ in self._plan:
             axis.mode_bits = 0
@@ -96,11 +95,11 @@ class HomingSequence:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to be done, cycle by cycle."""
+        """Whether no sequence is under way."""
         return self._steps is None
 
     def step(self, now: float) -> DriveFault | None:
-        """Go on, when every frame of this cycle is in; return why that is impossible."""
+        """Continue after the frames of a cycle; return a fault if homing fails."""
         self._now = now
         axis = self._axis
         if self._steps is None:
@@ -140,12 +139,12 @@ class HomingSequence:
         axis.cyclic = False
         yield from self._change_mode(axis, HOMING)
         axis.follows = False
-        # The newest statusword may be from before, and its bits mean other things in other modes.
+        # The newest statusword may be from another mode, in which its bits have other meanings.
         yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword
         if not self._stopping:
             axis.mode_bits = canopen_frames.HOMING_START
-            yield from self._until(lambda: self._stopping or _attained(axis), timeout, "home was not attained")
+            yield from self._wait_until(lambda: self._stopping or _attained(axis), timeout, "home was not attained")
         attained = _attained(axis)
         if not attained:
             yield from self._halt(axis)
@@ -155,53 +154,53 @@ class HomingSequence:
 
     def _halt(self, axis: Cia402Axis) -> Steps:
         axis.mode_bits = canopen_frames.HALT
-        answered = axis.sampled + FRESH
-        yield from self._until(
-            lambda: axis.sampled >= answered and bool(axis.statusword & _REACHED),
+        answered = axis.sampled + FRESH_ANSWERS
+        yield from self._wait_until(
+            lambda: axis.sampled >= answered and bool(axis.statusword & _TARGET_REACHED),
             self._stop_timeout,
-            "the slider did not stand still",
+            "the slider did not stop",
         )
 
     def _follow_setpoints(self, axis: Cia402Axis) -> Steps:
-        """Back to the mode of setpoints, when the drive's setpoint is where it stands."""
-        answered = axis.sampled + FRESH
-        yield from self._until(lambda: axis.sampled >= answered, self._sdo_timeout, "there was no new position")
+        """Switch back to the setpoint mode, once the drive's setpoint is its actual position."""
+        answered = axis.sampled + FRESH_ANSWERS
+        yield from self._wait_until(lambda: axis.sampled >= answered, self._sdo_timeout, "there was no new position")
         standing = axis.actual
         yield
-        # Whoever gives setpoints has seen that position, and from now on holds it, as is done here meanwhile.
+        # The control has seen this position, and holds it from now on, as is done here meanwhile.
         axis.held = standing
         axis.follows = True
-        taken_up = axis.syncs + TAKEN_UP
-        yield from self._until(lambda: axis.syncs >= taken_up, self._sdo_timeout, "there was no SYNC")
-        yield from self._change_mode(axis, axis.way.mode)
+        taken_up = axis.syncs + SETPOINT_SYNCS
+        yield from self._wait_until(lambda: axis.syncs >= taken_up, self._sdo_timeout, "there was no SYNC")
+        yield from self._change_mode(axis, axis.exchange.mode)
         axis.cyclic = True
         axis.held = None
 
     def _change_mode(self, axis: Cia402Axis, mode: int) -> Steps:
         yield from self._sdo(axis, _WRITE_BYTE, _MODE, mode)
         deadline = self._now + self._sdo_timeout
-        while (found := (yield from self._sdo(axis, _READ, _MODE_DISPLAY))[4]) != mode:
-            if found == 0 and not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
-                return  # it shows its mode with power
+        while (shown := (yield from self._sdo(axis, _READ, _MODE_DISPLAY))[4]) != mode:
+            if shown == 0 and not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
+                return  # it shows its mode only with power
             if self._now >= deadline:
-                raise HomingFailedError(f"object 6061:00 (Modes of operation display): wanted {mode}, found {found}")
+                raise HomingFailedError(f"object 6061:00 (Modes of operation display): wanted {mode}, found {shown}")
 
     def _sdo(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
-        """One SDO, without waiting: the cycle goes on, and a later one has the answer."""
+        """Do one SDO transfer across cycles, without blocking; return the answer."""
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
         self._send(Frame(canopen_frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
         deadline = self._now + self._sdo_timeout
         while (answer := axis.sdo_answer) is None:
             if self._now >= deadline:
                 axis.sdo_asked = None
-                raise HomingFailedError(f"no answer about object {index:04X}:00 within {self._sdo_timeout:g} s")
+                raise HomingFailedError(f"no answer for object {index:04X}:00 within {self._sdo_timeout:g} s")
             yield
         if answer[0] == _ABORTED:
             code = int.from_bytes(answer[4:], "little")
             raise HomingFailedError(f"object {index:04X}:00 was refused (SDO abort {code:08X})")
         return answer
 
-    def _until(self, reached: Callable[[], bool], seconds: float, otherwise: str) -> Steps:
+    def _wait_until(self, reached: Callable[[], bool], seconds: float, otherwise: str) -> Steps:
         deadline = self._now + seconds
         while not reached():
             if self._now >= deadline:
@@ -210,8 +209,8 @@ class HomingSequence:
 
 
 def _attained(axis: Cia402Axis) -> bool:
-    """Whether home is attained: bit 12 may still be set by an earlier homing, so it must have been clear since."""
+    """Whether homing is attained; bit 12 may be left from an earlier homing, so it must have been clear since."""
     if axis.statusword & _ERROR:
         raise HomingFailedError(f"the drive reports a homing error (statusword {axis.statusword:04X})")
-    both = _ATTAINED | _REACHED
-    return axis.statusword & both == both and bool(axis.seen_clear & _ATTAINED)
+    both = _HOMING_ATTAINED | _TARGET_REACHED
+    return axis.statusword & both == both and bool(axis.seen_clear & _HOMING_ATTAINED)

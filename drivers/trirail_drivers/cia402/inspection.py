@@ -1,4 +1,4 @@
-"""Who is on the bus and what its set-up would change, as plain values: what `trirail drives` prints."""
+"""Description of the drives on the bus and the changes of their set-up, for `trirail drives`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import can
 
 from trirail_drivers.cia402 import canopen_frames, setup
 from trirail_drivers.cia402.one_drive import SetUp
-from trirail_drivers.cia402.sdo import together
+from trirail_drivers.cia402.sdo import run_setups
 from trirail_drivers.config import Drives
-from trirail_drivers.driver.refusals import raise_all
+from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, DriveError
 from trirail_drivers.interface import NAMES, Clock
@@ -20,51 +20,51 @@ from trirail_drivers.interface import NAMES, Clock
 def inspect(
     bus: can.BusABC, drives: Drives, period: float, clock: Clock, fastest: float | None = None, *, apply: bool
 ) -> list[dict[str, Any]]:
-    """What each drive is, and the differences between what it holds and what the cycle needs.
+    """Return a description of each drive, with the differences between its values and those that the cycle needs.
 
-    `fastest` is the sliders' limit of velocity [m/s], which their units must be able to say.
+    `fastest` is the sliders' velocity limit [m/s], which must fit the drives' units.
 
-    With `apply` the differences are written, to all three or none of them, without power and never stored in a drive;
-    else nothing is written. A drive that does not answer, or is refused, is told of in "refused". Raises DriveError
-    where `apply` fails.
+    With `apply` the differences are written to all three drives or none, without power, and not stored in the drives;
+    otherwise nothing is written. "refused" has the reason for a drive that does not answer or is refused. Raises
+    DriveError if `apply` fails.
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     if apply:
-        found = inspect(bus, drives, period, clock, fastest, apply=False)
-        refused = dict.fromkeys(each["refused"] for each in found if each["refused"])
-        raise_all([DriveError(text) for text in refused])
-        done = setup.configure(bus, drives, scales, period, clock, fastest)
+        results = inspect(bus, drives, period, clock, fastest, apply=False)
+        refused = dict.fromkeys(each["refused"] for each in results if each["refused"])
+        raise_combined([DriveError(text) for text in refused])
+        done = setup.configure(bus, drives, setup.setup_tasks(bus, drives, scales, period, clock), fastest)
         for drive in drives.each:
             bus.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node).message())
-        return [_as_json(made) for made, _ in done]
+        return [_as_json(result[0]) for result in done if result is not None]
     ends = setup.survey(bus, drives, scales, period, clock, fastest)
     looked = [end for end in ends if not isinstance(end, DriveError)]
-    found = [
+    results = [
         {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _as_json(end)
         for name, drive, end in zip(NAMES, drives.each, ends, strict=True)
     ]
     try:
         setup.check_identifiers(looked)
     except DriveError as error:
-        for each in found:
+        for each in results:
             each["refused"] = each["refused"] or str(error)
-    return found
+    return results
 
 
 def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int | None]:
-    """Return what reads the digital inputs 60FDh of the drive of a name; None where it has none to tell.
+    """Return a function that reads the digital inputs 60FDh of a named drive, or None if they cannot be read.
 
-    It waits for the answer and lets other frames go: for drives without power, between two cycles.
+    It waits for the answer and drops other frames: only for drives without power, between two cycles.
     """
     remotes = {remote.name: remote for remote in setup.remotes(bus, drives, clock)}
 
     def read(name: str) -> int | None:
         remote = remotes[name]
         try:
-            (found,) = together(bus, clock, [remote], "reading", [remote.read(0x60FD)])
+            (value,) = run_setups(bus, clock, [remote], "reading", [remote.read(0x60FD)])
         except BusError:
             return None
-        return None if isinstance(found, DriveError) else found
+        return None if isinstance(value, DriveError) else value
 
     return read
 
@@ -80,11 +80,11 @@ def _as_json(made: SetUp) -> dict[str, Any]:
         "revision": who.revision,
         "serial": who.serial,
         "modes": None if who.modes is None else f"{who.modes & 0xFFFF_FFFF:08X}",
-        "way": made.way.name,
+        "way": made.exchange.name,
         "velocity_unit": made.units.velocity_name,
         "acceleration_unit": made.units.acceleration_name,
         "differences": [difference._asdict() for difference in made.differences],
         "notes": list(made.notes),
-        "lacking": list(made.lacking),
+        "lacking": list(made.missing_protections),
         "refused": made.refused,
     }

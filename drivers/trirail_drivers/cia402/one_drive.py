@@ -1,4 +1,4 @@
-"""Sets one CiA 402 drive up over SDO: waits for it, reads first, writes the differences, reads them back."""
+"""Set-up of one CiA 402 drive over SDO: wait for it, read, write the differences, read them back."""
 
 from __future__ import annotations
 
@@ -6,33 +6,38 @@ from typing import Final, NamedTuple
 
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames
-from trirail_drivers.cia402.conversations import LOG
 from trirail_drivers.cia402.differences import Difference, Differences
 from trirail_drivers.cia402.drive_units import read_units
 from trirail_drivers.cia402.dry_run import DryRun
-from trirail_drivers.cia402.guarding import give_watchdogs
-from trirail_drivers.cia402.makers_objects import give_makers_objects
+from trirail_drivers.cia402.guarding import configure_watchdogs
+from trirail_drivers.cia402.makers_objects import write_makers_objects
 from trirail_drivers.cia402.objects import FOLLOWING_BIT
-from trirail_drivers.cia402.operation_mode import choose_modes, give_mode
+from trirail_drivers.cia402.operation_mode import choose_modes, configure_mode
 from trirail_drivers.cia402.pdos import Pdos
 from trirail_drivers.cia402.process_data import Exchange
 from trirail_drivers.cia402.sdo import Remote, RestartedError, SdoRefused
-from trirail_drivers.cia402.settings import give_cycle, give_homing, give_reactions, heartbeat_of
+from trirail_drivers.cia402.settings import (
+    configure_cycle_period,
+    configure_homing,
+    configure_reactions,
+    heartbeat_period_ms,
+)
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drive, Drives
+from trirail_drivers.driver.conversations import LOG
 from trirail_drivers.driver.scaling import Scale
-from trirail_drivers.errors import DriveError, DriveTimeout
+from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""
 
-BOOTS_WITHIN: Final = 10
-"""How long a drive may take to boot, in times of `sdo_timeout`."""
+BOOT_TIMEOUTS: Final = 10
+"""Longest boot of a drive, as a multiple of `sdo_timeout`."""
 
 
 class Identity(NamedTuple):
-    """Who a drive says it is."""
+    """Identity of a drive, from its own objects."""
 
     device_type: int
     """1000h."""
@@ -46,25 +51,27 @@ class Identity(NamedTuple):
 
 
 class SetUp(NamedTuple):
-    """What is known of a drive once it was looked at, or set up."""
+    """Result of a drive's set-up or its dry run."""
 
     name: str
     node: int
     identity: Identity
-    way: Exchange
+    exchange: Exchange
     units: Units
     differences: tuple[Difference, ...]
-    """What was written, or would be."""
+    """Values that were written, or would be."""
     notes: tuple[str, ...]
-    """What is done otherwise than usual, and the protections that it lacks: lines for people."""
-    lacking: tuple[str, ...]
+    """Deviations from the usual set-up, and missing protections: lines for people."""
+    missing_protections: tuple[str, ...]
     """Protections that it lacks, as `accept_without` names them."""
     refused: str
-    """Why it is refused for those; "" where it is not."""
+    """Refusal for missing protections, or ""."""
+    home_offset: int | None = None
+    """607Ch: zero of its positions."""
 
 
 class Start(NamedTuple):
-    """What a drive says of itself once it is set up."""
+    """State of a drive at the end of its set-up."""
 
     counts: int
     """Actual position 6064h."""
@@ -74,43 +81,43 @@ class Start(NamedTuple):
     """603Fh if the drive is in fault, else 0."""
 
 
-class OneDrive(NamedTuple):
-    """A drive that is to be set up."""
+class SetupTask(NamedTuple):
+    """Inputs of one drive's set-up."""
 
     remote: Remote
     drive: Drive
     drives: Drives
     scale: Scale
     period: float
-    """Of the cycle [s]."""
+    """Cycle period [s]."""
 
 
-async def look_over(one: OneDrive, *, asks: bool = False) -> SetUp:
-    """Wait for a drive and go through its whole set-up without writing, but for taking its power off.
+async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
+    """Wait for a drive and do a dry run of its whole set-up, after taking its power off.
 
-    Where it `asks`, not even that is done: the drive tells what it would take.
+    With `read_only`, its power is not changed either, and the drive is asked which objects may be written.
     """
-    await greet(one.remote, one.drive.node, wakes=not asks)
-    dry_run = DryRun(one.remote, asks=asks)
-    await _take_power_off(dry_run if asks else one.remote, one.drives.stop_timeout)
-    made = await bring(one, dry_run)
-    await start(dry_run)
+    await wait_for_drive(one.remote, one.drive.node, to_pre_operational=not read_only)
+    dry_run = DryRun(one.remote, read_only=read_only)
+    await _switch_off(dry_run if read_only else one.remote, one.drives.stop_timeout)
+    made = await configure_drive(one, dry_run)
+    await read_start(dry_run)
     return made
 
 
-async def bring(one: OneDrive, remote: Remote) -> SetUp:
-    """Bring one drive to what the cycle needs, or a dry run of it."""
+async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
+    """Configure one drive, or its dry run, for the cycle."""
     drive, drives = one.drive, one.drives
     differences = Differences(remote)
     modes = await choose_modes(remote, homes=drive.homing is not None)
-    await give_makers_objects(differences, drive.write)
+    await write_makers_objects(differences, drive.write)
     units = await read_units(differences, drive, one.scale)
-    await give_cycle(differences, one.period)
-    watched = await give_watchdogs(differences, drives, heartbeat_of(drives), drive.node)
-    await give_reactions(differences, drives, units)
-    mode, shown = await give_mode(differences, modes)
+    await configure_cycle_period(differences, one.period)
+    watched = await configure_watchdogs(differences, drives, heartbeat_period_ms(drives), drive.node)
+    await configure_reactions(differences, drives, units)
+    mode, shown = await configure_mode(differences, modes)
     if drive.homing is not None:
-        await give_homing(differences, drive.homing, units)
+        await configure_homing(differences, drive.homing, units)
     pdos = Pdos(differences, drive.node)
     setpoints, controlword = await pdos.setpoints(mode)
     feedback, status, polled = await pdos.feedback()
@@ -119,8 +126,8 @@ async def bring(one: OneDrive, remote: Remote) -> SetUp:
         if not await remote.has(*key):
             differences.lack(key, "it has no such object")
     if FOLLOWING_BIT in drive.accept_without:
-        differences.lacking[FOLLOWING_BIT] = "the configuration says so"
-    way = Exchange(
+        differences.missing_protections[FOLLOWING_BIT] = "the configuration says so"
+    exchange = Exchange(
         mode,
         setpoints,
         controlword,
@@ -141,19 +148,20 @@ async def bring(one: OneDrive, remote: Remote) -> SetUp:
         remote.name,
         drive.node,
         identity,
-        way,
+        exchange,
         units,
-        tuple(differences.found),
-        tuple(differences.notes),
-        tuple(differences.lacking),
+        tuple(differences.changes),
+        tuple(filter(None, (one.remote.skipped, *differences.notes))),
+        tuple(differences.missing_protections),
         refused,
+        await remote.peek(0x607C),
     )
 
 
-async def greet(remote: Remote, node: int, *, wakes: bool) -> None:
-    """Wait until the node answers, as long as it may take to boot, and see that it is a CiA 402 drive.
+async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool) -> None:
+    """Wait until the node answers, for as long as a boot may take; check that it is a CiA 402 drive.
 
-    It is asked again once its boot-up message comes, and where it `wakes`, brought to NMT pre-operational then.
+    After its boot-up message it is asked again and, with `to_pre_operational`, first switched to NMT pre-operational.
     """
     client = remote.client
     begun = client.clock()
@@ -163,37 +171,38 @@ async def greet(remote: Remote, node: int, *, wakes: bool) -> None:
             break
         except DriveTimeout as error:
             waited = client.clock() - begun
-            if waited >= BOOTS_WITHIN * client.timeout:
-                raise DriveTimeout(remote.name, "answer about object 1000:00 (Device type)", waited) from error
-            if not remote.boots:
+            if waited >= BOOT_TIMEOUTS * client.timeout:
+                raise DriveAbsentError(remote.name, "answer for object 1000:00 (Device type)", waited) from error
+            if remote.logs and not remote.boots:
                 LOG.warning("waiting for drive %s to boot", remote.name)
             remote.boots = True
         except RestartedError:
-            if wakes:
-                send_in_setup(client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
+            pass
+        if to_pre_operational:
+            send_in_setup(client.bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
     remote.boots = False
     if device_type & 0xFFFF != 402:
         raise DriveError(
             f"drive {remote.name}: object 1000:00 (device type) is {device_type:08X}, of CiA profile "
-            f"{device_type & 0xFFFF}; wanted a drive, profile 402"
+            f"{device_type & 0xFFFF}; expected a drive, profile 402"
         )
 
 
-async def _take_power_off(remote: Remote, seconds: float) -> None:
-    """Tell a drive to lose its power, and wait until it has: a brake takes its time to close."""
+async def _switch_off(remote: Remote, seconds: float) -> None:
+    """Take a drive's power off, and wait until its state shows that: a brake takes time to close."""
     await remote.write(0x6040, 0, canopen_frames.DISABLE_VOLTAGE)
-    found, waited = await remote.becomes(
+    statusword, waited = await remote.wait_until(
         (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in HAS_POWER, seconds
     )
-    statusword = await remote.read(0x6041) if found is None else found
+    statusword = await remote.read(0x6041) if statusword is None else statusword
     if not remote.rehearsed and canopen_frames.power_state(statusword) in HAS_POWER:
         raise DriveError(
-            f"drive {remote.name}: keeps its power on when told off, after {waited:.3g} s (statusword {statusword:04X})"
+            f"drive {remote.name}: does not take its power off within {waited:.3g} s (statusword {statusword:04X})"
         )
 
 
-async def start(remote: Remote) -> Start:
-    """What a drive says of itself now."""
+async def read_start(remote: Remote) -> Start:
+    """Read the present state of a drive."""
     statusword = await remote.read(0x6041)
     in_fault = canopen_frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
     error_code = 0

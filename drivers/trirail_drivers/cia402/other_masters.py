@@ -1,4 +1,4 @@
-"""Frames that only this service may send: who else sends them is another master, and the robot stops (CiA 301)."""
+"""Frames that only this service may send: any other sender is another master, and the robot stops (CiA 301)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _COMMANDS: Final = {
     0x81: "reset node",
     0x82: "reset communication",
 }
-_STARTS: Final = 0x01
-_STOPS: Final = 0x02
+_NMT_START: Final = 0x01
+_NMT_STOP: Final = 0x02
 
 
 class OtherMasters:
-    """Hears on the bus what other masters send to the drives: NMT commands, SYNC, PDOs, this service's heartbeat."""
+    """Detection of other masters by their frames: NMT commands, SYNC, PDOs, this service's heartbeat."""
 
     def __init__(self, wire: Wire, axes: Sequence[Cia402Axis], master_node: int) -> None:
         self._wire = wire
@@ -38,31 +38,31 @@ class OtherMasters:
             self.listen_to(axis)
 
     def listen_to(self, axis: Cia402Axis) -> None:
-        """Hear who else sends an axis its setpoints and controlwords."""
-        for identifier in {axis.way.setpoints.identifier, axis.way.controlword} - {None}:
+        """Listen for setpoints and controlwords of another sender to a drive."""
+        for identifier in {axis.exchange.setpoints.identifier, axis.exchange.controlword} - {None}:
             self._wire.listen(identifier or 0, self, self._sends(f"sends drive {axis.name} PDOs ({identifier:03X})"))
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
-        """A frame of a stranger's that is malformed is a stranger's all the same."""
+        """Latch a fault for a malformed frame of another master."""
         self._wire.fail(DriveFault("", "bus", code, f"CAN bus: another master is on it: {text} ({cause})"))
 
     def _sends(self, text: str) -> Handler:
         return lambda data, now: self._warn(text)  # noqa: ARG005  one signature for all
 
     def _warn(self, text: str) -> None:
-        self._wire.fail(DriveFault("", "bus", 0, f"CAN bus: another master is on it: it {text}; only one may be"))
+        self._wire.fail(DriveFault("", "bus", 0, f"CAN bus: another master is on it: it {text}; only one is allowed"))
 
     def _on_nmt(self, data: bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
         command, node = canopen_frames.NMT_COMMAND.unpack(data)
-        meant = [axis for each, axis in self._axes.items() if node in (0, each)]
-        if not meant:
+        addressed = [axis for each, axis in self._axes.items() if node in (0, each)]
+        if not addressed:
             return
-        if command != _STARTS:
-            for axis in meant:
+        if command != _NMT_START:
+            for axis in addressed:
                 axis.leave_operational()
-                axis.stopped = command == _STOPS
+                axis.stopped = command == _NMT_STOP
         name = _COMMANDS.get(command, f"{command:02X}h")
-        whom = "all nodes" if node == 0 else f"drive {meant[0].name}"
+        whom = "all nodes" if node == 0 else f"drive {addressed[0].name}"
         self._warn(f'commands {whom} by NMT "{name}"')
 
     def _on_heartbeat(self, data: bytearray, now: float) -> None:  # noqa: ARG002
@@ -70,11 +70,8 @@ class OtherMasters:
         self._warn(f"has this service's node id {self._master_node}")
 
 
-class NoOtherMaster(can.BusABC):
-    """A bus that is used as long as nobody else commands its drives: what a master sends ends it with DriveError.
-
-    It is left open when this is closed.
-    """
+class ExclusiveBus(can.BusABC):
+    """A bus that raises DriveError on the first frame of another master. Closing it leaves the inner bus open."""
 
     def __init__(self, bus: can.BusABC, nodes: Sequence[int], master_node: int) -> None:
         self.inner = bus
@@ -95,7 +92,7 @@ class NoOtherMaster(can.BusABC):
         self.inner.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Receive a frame; DriveError where it is another master's."""
+        """Receive a frame; DriveError if another master sent it."""
         frame = self.inner.recv(timeout)
         if frame is None or frame.is_error_frame or frame.is_extended_id:
             return frame
@@ -105,6 +102,6 @@ class NoOtherMaster(can.BusABC):
         if text:
             raise DriveError(
                 f"another master is on the bus: it {text} (identifier {frame.arbitration_id:03X}); "
-                "stop the service, trirail run, or what else it is"
+                "stop the service (trirail run) or the other program"
             )
         return frame

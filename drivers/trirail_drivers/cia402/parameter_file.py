@@ -1,38 +1,52 @@
-"""A drive's parameters in a file: one TOML a drive, with who the drive is."""
+"""A drive's parameters in a file: a DCF (CiA 306), or the TOML file that earlier versions saved."""
 
 from __future__ import annotations
 
-import json
-import math
+import configparser
+import io
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
+import canopen
 import msgspec
+from canopen.objectdictionary import INTEGER_TYPES, SIGNED_TYPES, ObjectDictionary, ODVariable
+from canopen.objectdictionary.datatypes import OCTET_STRING, REAL32, REAL64, VISIBLE_STRING
+from canopen.objectdictionary.eds import export_dcf
 from msgspec import Meta, Struct
 
 from trirail_drivers import files
+from trirail_drivers.cia402 import eds
 from trirail_drivers.cia402.objects import Key
-from trirail_drivers.cia402.parameters import KINDS, Parameter, Value, encoded, named
+from trirail_drivers.cia402.parameters import Parameter, Value, decode, encode, is_parameter, named, variables
 from trirail_drivers.errors import DriveError, FileError
 
-_HEAD: Final = "# The parameters of one drive, as trirail drives save has read them; for compare and restore."
-_KEY: Final = re.compile(r"[0-9A-F]{4}:[0-9A-F]{2}")
-_Number = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+IDENTITY: Final[Mapping[str, Key]] = {
+    "device_type": (0x1000, 0),
+    "vendor": (0x1018, 1),
+    "product": (0x1018, 2),
+    "revision": (0x1018, 3),
+    "serial": (0x1018, 4),
+}
+_UNUSED: Final = re.compile("FileInfo|Comments|DummyUsage|DeviceComm?issioning", re.IGNORECASE)
+"""Sections that describe no object: canopen refuses some that other programs write."""
+_KEYWORDS: Final = {each.lower(): each for each in ("ParameterValue", "NodeID", "LSS_SerialNumber")}
+_COMPACT: Final = re.compile("([0-9a-f]{4})value", re.IGNORECASE)
+_TOML_TYPES: Final = {
+    f"{'i' if each in SIGNED_TYPES else 'u'}{8 * ODVariable.STRUCT_TYPES[each].size}": each for each in INTEGER_TYPES
+} | {"f32": REAL32, "f64": REAL64, "text": VISIBLE_STRING, "bytes": OCTET_STRING}
+
+_Number = Annotated[int, Meta(ge=1)]
 
 
-class Origin(Struct, frozen=True, forbid_unknown_fields=True):
-    """Which drive it is. None is what a drive does not tell (1018h)."""
+class Origin(Struct, frozen=True):
+    """Identity of a file's drive. None is unknown, and so is 0, which matches every drive (CiA 302-2)."""
 
-    axis: Annotated[str, Meta(pattern="^[ABC]$")]
-    node: Annotated[int, Meta(ge=1, le=127)]
-    device_type: _Number
-    saved: str
-    """When, by the wall clock (ISO 8601)."""
-    dictionary: str
-    """Which EDS has named its objects."""
+    node: Annotated[int, Meta(ge=1, le=127)] | None = None
+    device_type: _Number | None = None
     vendor: _Number | None = None
     product: _Number | None = None
     revision: _Number | None = None
@@ -40,17 +54,25 @@ class Origin(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Saved:
-    """What a drive held."""
+class SavedParameters:
+    """Parameters of a drive at one time."""
 
     origin: Origin
     parameters: Mapping[Key, Parameter]
     unread: Mapping[Key, str]
-    """What it did not tell, and why."""
+    """Parameters without a value, each with the reason."""
+    objects: ObjectDictionary = field(default_factory=ObjectDictionary, compare=False, repr=False)
+    """All objects of the drive, for other programs that open the file."""
+    complete: bool = field(default=True, compare=False)
+    """Whether the drive lacks every object that is not listed; a DCF may list only some objects."""
+
+    def knows(self, key: Key) -> bool:
+        """Whether it has an object's value, or the drive lacks that object."""
+        return key in self.parameters or (self.complete and key not in self.unread)
 
 
-class Different(NamedTuple):
-    """A parameter that two drives, or files, do not have alike."""
+class ParameterDifference(NamedTuple):
+    """A parameter that differs between two drives or files."""
 
     key: Key
     name: str
@@ -59,85 +81,173 @@ class Different(NamedTuple):
     other: Parameter | None
 
 
-class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    type: str
-    value: int | float | str
-    name: str = ""
+def comparable(one: SavedParameters, other: SavedParameters) -> list[Key]:
+    """Return the objects that both know, in order."""
+    return [key for key in sorted({*one.parameters, *other.parameters}) if one.knows(key) and other.knows(key)]
 
 
-class _Content(Struct, frozen=True, forbid_unknown_fields=True):
-    drive: Origin
-    parameters: dict[str, _Entry]
-    unread: dict[str, str] = {}
-
-
-def compare(one: Saved, other: Saved) -> list[Different]:
-    """What differs, in the order of the objects; what one of them was not told of is not compared."""
-    found = []
-    for key in sorted({*one.parameters, *other.parameters} - {*one.unread, *other.unread}):
+def compare(one: SavedParameters, other: SavedParameters) -> list[ParameterDifference]:
+    """Return the differences, in the order of the objects."""
+    differences = []
+    for key in comparable(one, other):
         mine, theirs = one.parameters.get(key), other.parameters.get(key)
         if mine is None or theirs is None or mine.data != theirs.data:
             known = mine or theirs
-            found.append(Different(key, known.name if known else "", mine, theirs))
-    return found
+            differences.append(ParameterDifference(key, known.name if known else "", mine, theirs))
+    return differences
 
 
-def told(value: int | None) -> str:
-    """A number of an origin for people."""
-    return "not told" if value is None else f"{value:08X}h"
+def format_number(value: int | None) -> str:
+    """Return a number of an origin for people."""
+    return "unknown" if value is None else f"{value:08X}h"
 
 
-def write(path: Path, saved: Saved) -> None:
-    """Write a file whole or not at all; FileError where it cannot be."""
+def origin(numbers: Mapping[str, Any]) -> Origin:
+    """Return the origin from numbers by its field names, without zeros. Raises ValueError."""
+    return msgspec.convert({name: number for name, number in numbers.items() if number}, Origin)
+
+
+def write(path: Path, saved: SavedParameters, bitrate: int | None = None) -> None:
+    """Write a DCF atomically. Raises FileError if it cannot be written."""
+    objects, numbers = saved.objects, saved.origin
+    for _, each in variables(objects):  # the drive's EDS may be a DCF itself
+        vars(each).update(value=None, value_raw=None)
+    info = objects.device_information
+    info.vendor_number, info.product_number, info.revision_number = numbers.vendor, numbers.product, numbers.revision
+    for name, key in IDENTITY.items():
+        if (variable := objects.get_variable(*key)) is not None:
+            number = getattr(numbers, name)
+            text = None if number is None else f"0x{number:08X}"
+            vars(variable).update(default=None, default_raw=None, value_raw=text)
+    for (index, subindex), parameter in saved.parameters.items():
+        value = decode(parameter.data_type, parameter.data)
+        item = objects[index]
+        variable = item if isinstance(item, ODVariable) else item[subindex]
+        # canopen would write -5 as 0x-5, which it cannot read.
+        vars(variable).update(value_raw=value.hex() if isinstance(value, bytes) else str(value))
+        if variable.data_type != parameter.data_type or not _is_within_limits(variable, value):
+            vars(variable).update(data_type=parameter.data_type, min=None, max=None, default=None, default_raw=None)
+    objects.node_id, objects.bitrate = numbers.node, bitrate
+    date, time = datetime.now().astimezone().strftime("%m-%d-%Y %I:%M%p").split()
+    head = {"FileName": path.name, "ModifiedBy": "trirail", "ModificationDate": date, "ModificationTime": time}
+    commissioning = f"[DeviceComissioning]\nLSS_SerialNumber={numbers.serial or 0}\n"
+    output = io.StringIO()
+    # Not canopen.export_od: it shares one head among all files of a process.
+    export_dcf(objects, output, head)  # type: ignore[no-untyped-call]
     try:
-        files.replace(path, ("\n".join(_lines(saved)) + "\n").encode())
+        files.replace(path, output.getvalue().replace("[DeviceComissioning]\n", commissioning, 1).encode())
     except OSError as error:
         raise FileError(f"{path}: {error.strerror}") from error
 
 
-def read(path: Path) -> Saved:
-    """What a file has; FileError where it cannot be read, DriveError where it is none of a drive's parameters."""
-    text = files.text(path)
+def read(path: Path, node: int | None = None) -> SavedParameters:
+    """Return the parameters in a file: a DCF by its suffix, else a TOML file.
+
+    Values relative to the node id use `node`, or else the file's. Raises FileError if the file cannot be read,
+    DriveError if any of its values is wrong.
+    """
     try:
-        content = msgspec.toml.decode(text, type=_Content)
-        parameters = {_key(at): _parameter(at, entry) for at, entry in content.parameters.items()}
-        return Saved(content.drive, parameters, {_key(at): why for at, why in content.unread.items()})
-    except ValueError as error:  # msgspec's own among them
+        return _read_dcf(path, node) if path.suffix.lower() in (".dcf", ".eds") else _read_toml(path)
+    except (configparser.Error, ValueError, LookupError, AttributeError, TypeError) as error:  # canopen's, too
         raise DriveError(f"{path} is no file of a drive's parameters: {' '.join(str(error).split())}") from error
 
 
-def _lines(saved: Saved) -> Iterator[str]:
-    yield from (_HEAD, "", "[drive]")
-    for field, told in msgspec.structs.asdict(saved.origin).items():
-        if told is not None:
-            yield f"{field} = {_literal(told) if field == 'node' or isinstance(told, str) else f'0x{told:08X}'}"
-    yield from ("", "[parameters]")
-    for key, parameter in sorted(saved.parameters.items()):
-        value, name = _literal(parameter.value), _literal(parameter.name)
-        yield f'"{named(key)}" = {{ type = "{parameter.kind}", value = {value}, name = {name} }}'
-    yield from ("", "[unread]")
-    for key, why in sorted(saved.unread.items()):
-        yield f'"{named(key)}" = {_literal(why)}'
+def _read_toml(path: Path) -> SavedParameters:
+    content = msgspec.toml.decode(files.text(path))
+    parameters = {}
+    for key, entry in ((_key(name), entry) for name, entry in content["parameters"].items()):
+        value = bytes.fromhex(entry["value"]) if entry["type"] == "bytes" else entry["value"]
+        data_type = _TOML_TYPES[entry["type"]]
+        parameters[key] = Parameter(data_type, encode(data_type, value, f"object {named(key)}: "), entry["name"])
+    return SavedParameters(
+        origin(content["drive"]), parameters, {_key(name): why for name, why in content["unread"].items()}
+    )
 
 
-def _literal(value: Value) -> str:
-    if isinstance(value, str):
-        return json.dumps(value).replace("\x7f", "\\u007f")  # as TOML's basic strings have them
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)  # TOML has inf, -inf and nan
-    return repr(value)
+def _read_dcf(path: Path, node: int | None) -> SavedParameters:
+    sections, numbers = _sections(path)
+    node = node or numbers.get("node")
+    file = io.StringIO()
+    file.name = "parameters.dcf"
+    sections.write(file)
+    file.seek(0)
+    objects = canopen.import_od(file, node)
+    texts = {key: raw for key, each in variables(objects) if (raw := getattr(each, "value_raw", None))}
+    if len(texts) != sum("ParameterValue" in section for section in sections.values()) or not texts:
+        raise ValueError("a ParameterValue belongs to no object" if texts else "no object has a ParameterValue")
+    info = objects.device_information
+    numbers |= {"vendor": info.vendor_number, "product": info.product_number, "revision": info.revision_number}
+    for name, key in IDENTITY.items():
+        if (variable := objects.get_variable(*key)) is not None:
+            default = variable.default if name != "serial" else None
+            numbers[name] = _parse(variable, texts[key]).value if key in texts else numbers.get(name) or default
+    parameters: dict[Key, Parameter] = {}
+    unread: dict[Key, str] = {}
+    for key, variable in variables(objects):
+        if not is_parameter(variable):
+            continue
+        if key not in texts:
+            unread[key] = "the file has no value"
+        elif node is None and "$NODEID" in texts[key].upper():
+            unread[key] = "its value follows the node id, which the file does not have"
+        else:
+            parameters[key] = _parse(variable, texts[key])
+    return SavedParameters(origin(numbers), parameters, unread, objects, complete=False)
 
 
-def _key(text: str) -> Key:
-    if not _KEY.fullmatch(text):
-        raise ValueError(f'"{text}" is no object; as in "6065:00"')
-    return int(text[:4], 16), int(text[5:], 16)
+def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]:
+    """Return the sections that describe objects, in a form that canopen reads, and the node id and serial number."""
+    sections = configparser.RawConfigParser(inline_comment_prefixes=(";",))
+    sections.optionxform = lambda optionstr: _KEYWORDS.get(optionstr.lower(), optionstr)  # type: ignore[method-assign]
+    # Strict, unlike an EDS: which of two duplicate values to write into a drive cannot be guessed.
+    strict = configparser.RawConfigParser(allow_no_value=True)
+    strict.read_string(path.read_text(encoding="utf-8-sig", errors="replace").rstrip("\x1a\0 \r\n\t"))
+    with eds.open_text(path) as text:
+        sections.read_file(text)
+    commissioned: dict[str, int] = {}
+    for name in sections.sections():
+        for option, content in sections.items(name):
+            if not content and option != "ParameterName":
+                sections.remove_option(name, option)
+            elif content.startswith("0x-"):  # as canopen writes a negative number, and cannot read it
+                sections[name][option] = f"-0x{content[3:]}"
+        if _UNUSED.fullmatch(name):
+            commissioned |= {key: int(sections[name][key], 0) for key in _KEYWORDS.values() if key in sections[name]}
+            sections.remove_section(name)
+        elif compact := _COMPACT.fullmatch(name):
+            _expand(sections, compact[1], sections[name])
+    return sections, {"node": commissioned.get("NodeID"), "serial": commissioned.get("LSS_SerialNumber")}
 
 
-def _parameter(at: str, entry: _Entry) -> Parameter:
-    if entry.type not in KINDS:
-        raise ValueError(f'parameters.{at}: type "{entry.type}" is unknown; known are {", ".join(KINDS)}')
-    try:
-        return Parameter(entry.type, encoded(entry.type, entry.value), entry.name)
-    except ValueError as error:
-        raise ValueError(f"parameters.{at}: {error}") from error
+def _expand(sections: configparser.RawConfigParser, index: str, values: Mapping[str, str]) -> None:
+    """Expand the values of an array in one section, [1234Value], into a section for each element."""
+    for number in filter(str.isdigit, values):
+        element = f"{index}sub{int(number):X}"
+        if element not in sections:
+            sections[element] = sections[index]
+        sections[element]["ParameterValue"] = values[number]
+
+
+def _parse(variable: ODVariable, raw: str) -> Parameter:
+    """Return an object with its ParameterValue. Raises ValueError if that is invalid."""
+    where = f"object {named((variable.index, variable.subindex))}: "
+    value, bits, data_type = variable.value, len(variable), variable.data_type or 0
+    if data_type in SIGNED_TYPES and raw.lower().startswith("0x") and value is not None and value >> bits - 1 == 1:
+        value -= 1 << bits  # a negative number in two's complement
+    data = encode(data_type, raw if value is None else value, where)
+    if not _is_within_limits(variable, value):
+        raise ValueError(f"{where}{value} is not within its limits, {variable.min} to {variable.max}")
+    return Parameter(data_type, data, variable.qualname)
+
+
+def _is_within_limits(variable: ODVariable, value: Value | None) -> bool:
+    """Whether the EDS allows a value; limits that exclude every value, as in some files, are ignored."""
+    low, high = variable.min, variable.max
+    if low is None or high is None or low > high or not isinstance(value, int | float):
+        return True
+    return low <= value <= high
+
+
+def _key(name: str) -> Key:
+    index, subindex = name.split(":")
+    return int(index, 16), int(subindex, 16)

@@ -1,134 +1,136 @@
-"""Which of a drive's objects are its parameters, and their values as people read them."""
+"""Choice of the objects that are a drive's parameters, and their values for people."""
 
 from __future__ import annotations
 
 import math
-import struct
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary import ObjectDictionary, ODVariable
+from canopen.objectdictionary.datatypes import (
+    BOOLEAN,
+    DOMAIN,
+    FLOAT_TYPES,
+    OCTET_STRING,
+    SIGNED_TYPES,
+    UNSIGNED_TYPES,
+)
 
 from trirail_drivers.cia402.objects import Key
 
-Value = int | float | str
-
-_UNSIGNED: Final = {0x01: 1, 0x05: 1, 0x06: 2, 0x16: 3, 0x07: 4, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
-_SIGNED: Final = {0x02: 1, 0x03: 2, 0x10: 3, 0x04: 4, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8}
-_FLOATS: Final = {"f32": "<f", "f64": "<d"}
-_KINDS: Final = (
-    {code: f"u{8 * size}" for code, size in _UNSIGNED.items()}
-    | {code: f"i{8 * size}" for code, size in _SIGNED.items()}
-    | {0x08: "f32", 0x11: "f64", 0x09: "text"}
-)
-"""By CiA 301's data types; what is none of them is told as its bytes."""
-BYTES: Final = "bytes"
-KINDS: Final = (*dict.fromkeys(_KINDS.values()), BYTES)
-_DOMAIN: Final = 0x0F
-_LARGEST: Final = 2**63 - 1
-"""Of TOML's integers."""
+Value = int | float | str | bytes
 
 _COMMANDS: Final = frozenset((0x1003, 0x1010, 0x1011, 0x1013, 0x1020, *range(0x1023, 0x1027)))
-"""Of CiA 301: the error field, store and restore, the time stamp, what any write sets to 0, and the OS command."""
+"""Commands of CiA 301: error field, store and restore, time stamp, objects that any write clears, OS command."""
 _PROGRAMS: Final = range(0x1F50, 0x1F60)
 _NMT_REQUESTS: Final = (0x1F82, 0x1F83)
-"""Of CiA 302: program download and control; a master's requests."""
+"""Commands of CiA 302: program download and control; a master's requests."""
 _PROCESS: Final = frozenset(
     (0x603F, *range(0x6040, 0x6046), *range(0x6060, 0x6065), 0x6069, 0x606B, 0x606C, 0x6071, 0x6074,
      *range(0x6077, 0x607B), *range(0x60B0, 0x60B3), *range(0x60B8, 0x60BE), 0x60C1, *range(0x60D1, 0x60DA),
      0x60E4, 0x60E5, 0x60F4, 0x60FA, 0x60FC, 0x60FD, 0x60FF)
 )  # fmt: skip
-"""Of CiA 402-2: control- and statuswords, modes, targets, offsets, demands, actual values, touch probes, inputs."""
+"""Process data of CiA 402-2: control- and statuswords, modes, targets, offsets, demands, actual values, touch probes,
+inputs."""
 _OUTPUTS: Final[Key] = 0x60FE, 1
-"""The digital outputs themselves; 60FE:02, which of them may be set, is a parameter."""
+"""Digital outputs; their mask 60FE:02 is a parameter."""
 _MAKERS: Final = range(0x2000, 0x6000)
 _PROFILE: Final = range(0x6000, 0xA000)
 _NEXT_AXIS: Final = 0x800
-"""CiA 402-2: a second axis has its objects so much higher."""
+"""Offset of the objects of a second axis (CiA 402-2)."""
 
 
 class Parameter(NamedTuple):
-    """What a drive holds in one object."""
+    """Content of one object of a drive."""
 
-    kind: str
-    """One of KINDS."""
+    data_type: int
+    """CiA 301 data type."""
     data: bytes
-    """As it travels."""
+    """Value as SDO transfers it."""
     name: str
 
     @property
-    def value(self) -> Value:
-        """For people: a number, a text, or bytes in hexadecimal."""
-        return decoded(self.kind, self.data)
+    def value(self) -> int | float | str:
+        """Value for people: a number, a text, or bytes in hexadecimal."""
+        value = decode(self.data_type, self.data)
+        return value.hex(" ") if isinstance(value, bytes) else value
+
+    @property
+    def fixed_size(self) -> bool:
+        """Whether every value of its type has the same length."""
+        return self.data_type in ODVariable.STRUCT_TYPES
 
 
 def named(key: Key) -> str:
-    """An object as files and tables write it: 6065:00."""
+    """Return an object's index and subindex as in files and tables: 6065:00."""
     return f"{key[0]:04X}:{key[1]:02X}"
 
 
+def variables(objects: ObjectDictionary) -> Iterator[tuple[Key, ODVariable]]:
+    """Yield every object and sub-object of a dictionary, in their order."""
+    for index, item in objects.items():
+        members = [item] if isinstance(item, ODVariable) else item.subindices.values()
+        yield from sorted(((index, each.subindex), each) for each in members)
+
+
 def is_parameter(variable: ODVariable) -> bool:
-    """Whether an object is what a drive is given and keeps: read and written, no process data and no command."""
+    """Whether an object is a parameter: readable and writable, neither process data nor a command."""
     index, access = variable.index, variable.access_type
-    if not (variable.readable and variable.writable) or variable.data_type == _DOMAIN:
+    if not (variable.readable and variable.writable) or variable.data_type == DOMAIN:
         return False
     if index in _COMMANDS or index in _PROGRAMS or index in _NMT_REQUESTS:
         return False
     if index in _PROFILE:
         index = 0x6000 + index % _NEXT_AXIS
         return index not in _PROCESS and (index, variable.subindex) != _OUTPUTS
-    # CiA 306: rwr is a value that a TPDO can carry, so one that the drive itself gives.
+    # CiA 306: rwr is a value that a TPDO can carry, so the drive itself sets it.
     return not (index in _MAKERS and access == "rwr" and variable.pdo_mappable)
 
 
-def parameter(variable: ODVariable, data: bytes) -> Parameter:
-    """What a drive answered of an object."""
-    return of_kind(_KINDS.get(variable.data_type or 0, BYTES), data, str(variable.qualname))
+def parameter(data_type: int | None, data: bytes, name: str) -> Parameter:
+    """Return bytes as a parameter of a type, or of one that fits their length if the EDS' type does not."""
+    sign = next((types for types in (SIGNED_TYPES, (BOOLEAN, *UNSIGNED_TYPES)) if data_type in types), ())
+    for each in (data_type or OCTET_STRING, *sign):
+        if _is_exact(each, data):
+            return Parameter(each, data, name)
+    return Parameter(OCTET_STRING, data, name)
 
 
-def of_kind(kind: str, data: bytes, name: str) -> Parameter:
-    """Bytes as a value of a kind, or of one that they are: their length counts, whatever an EDS says."""
-    if kind[0] in "ui":
-        kind = f"{kind[0]}{8 * len(data)}"
-    return Parameter(kind if kind in KINDS and _says_all(kind, data) else BYTES, data, name)
+def decode(data_type: int, data: bytes) -> Value:
+    """Decode bytes by a data type of CiA 301."""
+    value = _variable(data_type).decode_raw(data)
+    return int(value) if isinstance(value, bool) else bytes(value) if isinstance(value, bytearray) else value
 
 
-def decoded(kind: str, data: bytes) -> Value:
-    """A value of one of KINDS."""
-    if kind == BYTES:
-        return data.hex(" ")
-    if kind == "text":
-        return data.decode("ascii")
-    if kind in _FLOATS:
-        return float(struct.unpack(_FLOATS[kind], data)[0])
-    return int.from_bytes(data, "little", signed=kind[0] == "i")
-
-
-def encoded(kind: str, value: Value) -> bytes:
-    """A value as it travels; ValueError where it is none of its kind."""
+def encode(data_type: int, value: Value, where: str = "") -> bytes:
+    """Encode a value as SDO transfers it. Raises ValueError if the type cannot hold it."""
     try:
-        if kind == BYTES:
-            return bytes.fromhex(str(value))
-        if kind == "text":
-            return str(value).encode("ascii")
-        if kind in _FLOATS:
-            return struct.pack(_FLOATS[kind], value)
-        if isinstance(value, int):
-            return value.to_bytes(int(kind[1:]) // 8, "little", signed=kind[0] == "i")
-    except (OverflowError, struct.error) as error:
-        raise ValueError(f"{value} is no {kind}") from error
-    raise ValueError(f"{value} is no {kind}")
+        data = bytes(_variable(data_type).encode_raw(value))
+        if data_type in FLOAT_TYPES or decode(data_type, data) == value:
+            return data
+    except (AttributeError, OverflowError, TypeError, ValueError):
+        pass
+    raise ValueError(f"{where}{value!r} is no value of data type {data_type:04X}h")
 
 
-def _says_all(kind: str, data: bytes) -> bool:
-    """Whether the bytes come back from the value that a file has for them."""
+def _variable(data_type: int) -> ODVariable:
+    variable = ODVariable("", 0)
+    variable.data_type = data_type
+    return variable
+
+
+def _is_exact(data_type: int, data: bytes) -> bool:
+    """Whether a file can hold the bytes exactly as a value of a type."""
+    codec = ODVariable.STRUCT_TYPES.get(data_type)
+    if codec is not None and codec.size != len(data):
+        return False
+    value = decode(data_type, data)
+    if isinstance(value, bytes) or (isinstance(value, float) and math.isnan(value)):  # no text keeps the bits of a NaN
+        return data_type == OCTET_STRING
+    # An entry of a DCF is one line, without spaces around it, and ends before a comment.
+    if isinstance(value, str) and (not value.isprintable() or value != value.strip() or ";" in value):
+        return False
     try:
-        value = decoded(kind, data)
-        if isinstance(value, str):
-            fits = kind == BYTES or value.isprintable()
-        else:
-            fits = (isinstance(value, float) or value <= _LARGEST) and not math.isnan(
-                value
-            )  # no text keeps the bits of a NaN
-        return fits and encoded(kind, value) == data
-    except (ValueError, struct.error):
+        return encode(data_type, value) == data
+    except ValueError:
         return False

@@ -1,4 +1,4 @@
-"""How setpoints and feedback go between this service and one drive: mode, PDOs, statusword, watchdog."""
+"""Exchange of setpoints and feedback with one drive: mode, PDOs, statusword, supervision."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ INTERPOLATION_DATA: Final = 0x60C1_01_20
 """Entries of PDO mappings: index, subindex, bits (CiA 301, 1600h)."""
 
 POSITIONS: Final = {CYCLIC_SYNCHRONOUS_POSITION: TARGET_POSITION, INTERPOLATED_POSITION: INTERPOLATION_DATA}
-"""What takes the setpoint in each mode."""
+"""Object of the setpoint in each mode."""
 
 _FORMATS: Final = {8: "b", 16: "h", 32: "i", 64: "q"}
 
 
 class SetpointPdo:
-    """The RPDO that takes setpoints: an identifier, and its bytes of position, velocity and controlword."""
+    """RPDO of the setpoints: its identifier, and its layout of position, velocity and controlword."""
 
     __slots__ = ("_layout", "_order", "entries", "identifier", "size")
 
@@ -47,16 +47,16 @@ class SetpointPdo:
         self.size = self._layout.size
 
     def frame(self) -> Frame:
-        """A frame to be filled in each cycle."""
+        """Return a frame to fill in each cycle."""
         return Frame(self.identifier, bytes(self.size))
 
     def fill(self, frame: Frame, counts: int, velocity: int, controlword: int) -> None:
-        """Fill in a frame; struct.error where a number is too large."""
-        given = counts, velocity, controlword
-        frame.fill(self._layout, *[given[field] for field in self._order])
+        """Fill a frame; struct.error if a number is too large."""
+        values = counts, velocity, controlword
+        frame.fill(self._layout, *[values[field] for field in self._order])
 
-    def place(self, field: int) -> int:
-        """Where in a frame's data position (0) or velocity (1) stands; -1 where it has none."""
+    def offset(self, field: int) -> int:
+        """Return the offset of the position (0) or velocity (1) in a frame's data [bytes]; -1 for none."""
         if field not in self._order:
             return -1
         before = self.entries[: self._order.index(field)]
@@ -64,17 +64,17 @@ class SetpointPdo:
 
     @property
     def has_velocity(self) -> bool:
-        """Whether the drive is told the velocity beside the position."""
+        """Whether the setpoint includes a velocity."""
         return VELOCITY_OFFSET in self.entries
 
     @property
     def has_controlword(self) -> bool:
-        """Whether the controlword goes with the setpoint, for want of a PDO of its own."""
+        """Whether the controlword is mapped beside the setpoint, since it has no PDO of its own."""
         return CONTROLWORD in self.entries
 
 
 class FeedbackPdo:
-    """The TPDO that brings the position, and the statusword where it has one beside it."""
+    """TPDO of the position, and of the statusword if it is mapped beside it."""
 
     __slots__ = ("_layout", "_position", "_status", "entries", "has_status", "identifier", "size")
 
@@ -88,57 +88,57 @@ class FeedbackPdo:
         self._layout = Struct("<" + "".join(formats))
         self.size = self._layout.size
 
-    def place(self, entry: int) -> int:
-        """Where in a frame's data an entry stands; -1 where it has none."""
+    def offset(self, entry: int) -> int:
+        """Return the offset of an entry in a frame's data [bytes]; -1 for none."""
         if entry not in self.entries:
             return -1
         return sum((each & 0xFF) // 8 for each in self.entries[: self.entries.index(entry)])
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, int | None]:
-        """Position [counts] and statusword; struct.error where the length is wrong."""
+        """Return position [counts] and statusword, or None; struct.error for a wrong length."""
         values = self._layout.unpack(data)
         return values[self._position], values[self._status] if self.has_status else None
 
 
 def fits_setpoints(entries: tuple[int, ...], mode: int) -> bool:
-    """Whether a mapping that cannot be changed takes setpoints, and nothing that this service would write over."""
+    """Whether a fixed mapping takes setpoints, and nothing that this service does not provide."""
     known = {POSITIONS[mode], VELOCITY_OFFSET, CONTROLWORD}
     return POSITIONS[mode] in entries and set(entries) <= known
 
 
 def fits_feedback(entries: tuple[int, ...]) -> bool:
-    """Whether a mapping that cannot be changed brings the position."""
+    """Whether a fixed mapping has the position."""
     return ACTUAL_POSITION in entries and all(entry & 0xFF in _FORMATS for entry in entries)
 
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """How setpoints and feedback are exchanged with one drive."""
+    """Exchange of setpoints and feedback with one drive."""
 
     mode: int
     """6060h: cyclic synchronous position, or interpolated position."""
     setpoints: SetpointPdo
     controlword: int | None
-    """Identifier of the RPDO that has the controlword; None where it goes with the setpoint."""
+    """Identifier of the controlword's RPDO; None if it is mapped beside the setpoint."""
     feedback: FeedbackPdo
     status: int | None
-    """Identifier of the TPDO that has the statusword when it changes; None where that comes with the position."""
+    """Identifier of the event-driven TPDO of the statusword; None if it is mapped beside the position."""
     polled: bool = False
-    """The statusword is asked for by SDO: no PDO repeats it."""
+    """Whether the statusword is requested by SDO, since no PDO repeats it."""
     guarded: bool = False
-    """Node guarding, for want of a heartbeat consumer."""
+    """Whether node guarding is used, since it has no heartbeat consumer."""
     heard: bool = True
-    """It tells that it lives, by heartbeat or node guarding, beside its positions."""
+    """Whether it sends heartbeats or answers node guarding."""
     emergency: int = 0
     """Identifier of its EMCY."""
     tells_following: bool = True
-    """Bit 12 of its statusword is to say that it follows setpoints."""
+    """Whether bit 12 of its statusword must show that it follows setpoints."""
     mode_shown: bool = True
-    """6061h shows the mode also without power."""
+    """Whether 6061h shows the mode without power too."""
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Description in words."""
         mode = "interpolated position" if self.mode == INTERPOLATED_POSITION else "cyclic synchronous position"
         offset = " with velocity offset" if self.setpoints.has_velocity else ""
         status = "with the position" if self.feedback.has_status else "event-driven" if self.status else ""
@@ -146,8 +146,8 @@ class Exchange:
         return f"{mode}{offset}, statusword {status}{polled}, {'node guarding' if self.guarded else 'heartbeat'}"
 
 
-def usual(node: int) -> Exchange:
-    """The way of a drive that has all that CiA 301 and CiA 402-2 leave optional."""
+def default_exchange(node: int) -> Exchange:
+    """Return the exchange of a drive that has every optional object of CiA 301 and CiA 402-2."""
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
         SetpointPdo(canopen_frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
@@ -158,15 +158,17 @@ def usual(node: int) -> Exchange:
     )
 
 
-def traffic(ways: Iterable[Exchange]) -> Traffic:
-    """What drives that go these ways put on the bus, and the service with them."""
-    ways = tuple(ways)
-    cycle = frame_bits(0) + sum(frame_bits(way.setpoints.size) + frame_bits(way.feedback.size) for way in ways)
-    status = sum(frame_bits(2) for way in ways if way.status) / canopen_frames.STATUS_PERIOD
-    polls = sum(2 * frame_bits(8) for way in ways if way.polled) / canopen_frames.POLL_PERIOD
-    lives = frame_bits(1) * (1 + sum(1 + way.guarded for way in ways))
+def traffic(exchanges: Iterable[Exchange]) -> Traffic:
+    """Return the bus traffic of the service and of drives with these exchanges."""
+    exchanges = tuple(exchanges)
+    cycle = frame_bits(0) + sum(
+        frame_bits(exchange.setpoints.size) + frame_bits(exchange.feedback.size) for exchange in exchanges
+    )
+    status = sum(frame_bits(2) for exchange in exchanges if exchange.status) / canopen_frames.STATUS_PERIOD
+    polls = sum(2 * frame_bits(8) for exchange in exchanges if exchange.polled) / canopen_frames.POLL_PERIOD
+    lives = frame_bits(1) * (1 + sum(1 + exchange.guarded for exchange in exchanges))
     return Traffic(
         cycle_bits=cycle,
         background=lambda heartbeat: status + polls + lives / heartbeat,
-        most_sent=11 + sum(way.guarded + way.polled for way in ways),
+        most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
     )

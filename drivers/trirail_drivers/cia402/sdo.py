@@ -1,4 +1,4 @@
-"""A drive's object dictionary over SDO: reads, writes and checks that name what failed."""
+"""A drive's object dictionary over SDO: reads, writes and checks whose errors name drive and object."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import can
 from canopen.objectdictionary import INTEGER_TYPES
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from trirail_drivers.cia402.conversations import side_by_side, until
-from trirail_drivers.cia402.objects import Key, signed, use, width
+from trirail_drivers.cia402.objects import Key, find_use, signed, width
 from trirail_drivers.cia402.sdo_client import EXPEDITED, BootedError, Client, NoAnswerError, TwoNodesError
+from trirail_drivers.driver.conversations import read_until, run_concurrently
 from trirail_drivers.errors import BusError, DriveError, DriveTimeout
 from trirail_drivers.interface import Clock
 
@@ -24,11 +24,11 @@ READ_ONLY: Final = 0x0601_0002
 """SDO abort code: an attempt to write a read-only object."""
 TOO_LONG: Final = 0x0607_0012
 WRONG_LENGTH: Final = (0x0607_0010, TOO_LONG, 0x0607_0013)
-"""SDO abort codes: the value is of another length than the object, longer, shorter."""
+"""SDO abort codes: the value's length differs from the object's, is larger, is smaller."""
 INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID: the PDO is not used."""
 NO_REMOTE_REQUEST: Final = 1 << 30
-"""Bit of a TPDO's COB-ID; some drives report it always, some never."""
+"""Bit of a TPDO's COB-ID; some drives always report it, some never."""
 _BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x6502)
 
 
@@ -41,25 +41,30 @@ class SdoRefused(DriveError):
 
 
 class RestartedError(DriveError):
-    """A drive has restarted, and forgotten what it was told."""
+    """A drive has restarted and lost its set-up."""
 
 
 class Remote:
-    """A drive's object dictionary over SDO; every failure is told as this drive's and this object's.
+    """A drive's object dictionary over SDO; errors name the drive and the object.
 
-    What was read is kept until it is written: nobody else sets the drive up meanwhile.
+    Read values are cached until they are written: only this service sets the drive up meanwhile.
     """
 
     rehearsed = False
     """Whether nothing is written."""
-    asks = False
-    """Whether the drive is asked what it would take."""
+    read_only = False
+    """Whether the drive is only asked which objects may be written."""
 
     boots = False
-    """Whether its boot-up message is waited for."""
+    """Whether the drive's boot is awaited."""
 
-    def __init__(self, name: str, client: Client) -> None:
+    logs = True
+    """Whether that is logged; the cycle logs nothing."""
+
+    def __init__(self, name: str, client: Client, skipped: str = "") -> None:
         self.name = name
+        self.skipped = skipped
+        """Skipped parts of the drive's EDS, for people."""
         self.client = client
         self._read: dict[Key, bytes | None] = {}
         self._missing: set[Key] = set()
@@ -67,11 +72,11 @@ class Remote:
         self._described: dict[Key, tuple[int, bool]] = {}
 
     def describe(self, key: Key, size: int, *, signed: bool) -> None:
-        """Say how many bytes an object has that no standard knows, and whether it has a sign."""
+        """Set the size [bytes] and sign of an object that no standard defines."""
         self._described[key] = size, signed
 
     async def peek(self, index: int, subindex: int = 0) -> int | None:
-        """Value of an object; None where the drive has none to tell: it lacks the object, or cannot read it."""
+        """Return the value of an object, cached; None if the drive lacks the object or it cannot be read."""
         key = index, subindex
         if key not in self._read and key not in self._missing:
             try:
@@ -91,29 +96,29 @@ class Remote:
         return (index, subindex) not in self._missing
 
     async def read(self, index: int, subindex: int = 0) -> int:
-        """Value of an object, as it is now; SdoRefused where the drive has none to tell."""
+        """Return the present value of an object; SdoRefused if it cannot be read."""
         key = index, subindex
         return self._value(key, await self.content(key))
 
     async def content(self, key: Key) -> bytes:
-        """Bytes of an object, as they are now; SdoRefused where the drive has none to tell."""
+        """Return the present bytes of an object; SdoRefused if it cannot be read."""
         with self._as_drive_error("read", key):
             data = self._read[key] = await self.client.upload(*key)
         return self._own(key, data)
 
     async def write(self, index: int, subindex: int, value: int) -> None:
-        """Give an object a value; SdoRefused where the drive does not take it."""
+        """Write the value of an object; SdoRefused if the drive refuses it."""
         key = index, subindex
         await self.put(key, await self._encoded(key, value), shown(index, subindex, value))
 
     async def put(self, key: Key, data: bytes, value: str) -> None:
-        """Give an object these bytes, a `value` for people; SdoRefused where the drive does not take them."""
+        """Write the bytes of an object, shown to people as `value`; SdoRefused if the drive refuses them."""
         self._read.pop(key, None)
         with self._as_drive_error(f"write {value} to", key):
             await self.client.download(*key, data)
 
     async def may_be_written(self, index: int, subindex: int = 0) -> bool:
-        """Whether the drive lets an object be written, as far as it says so before it is."""
+        """Whether the drive allows writing an object, as far as it reports that before the write."""
         key = index, subindex
         if key not in self._writable:
             try:
@@ -125,9 +130,9 @@ class Remote:
         return self._writable[key]
 
     async def _try_to_write(self, attempt: str, key: Key, size: int) -> None:
-        """SdoRefused where the drive says that an object may not be written, or not with so many bytes.
+        """Begin and abort a write; SdoRefused if the drive refuses to write the object, or this size.
 
-        What else it says is no such word, as that it takes no segments.
+        Other refusals do not count, such as one of segmented transfers.
         """
         try:
             with self._as_drive_error(attempt, key):
@@ -138,42 +143,42 @@ class Remote:
                 raise
 
     async def bits(self, index: int, subindex: int = 0) -> int:
-        """How long an object is: as it was read, else by the drive's EDS, else by the standards."""
+        """Return the length of an object [bits]: as read, else by the drive's EDS, else by the standards."""
         key = index, subindex
         await self.peek(index, subindex)
         known = self._read.get(key)
         return 8 * (self._size(key) if known is None else len(self._own(key, known)))
 
     async def _encoded(self, key: Key, value: int) -> bytes:
-        """A value as it travels; SdoRefused where it is too long for the object."""
+        """Encode a value for an SDO; SdoRefused if it is too long for the object."""
         size = await self.bits(*key) // 8
         if not size or not -1 << 8 * size - 1 <= value < 1 << 8 * size:
             raise SdoRefused(
                 f"drive {self.name}: cannot write {shown(*key, value)} to {self._called(key)}: "
-                f"it has {8 * size} bits, and the standard's {8 * width(key)} are wanted",
+                f"it has {8 * size} bits; expected the standard's {8 * width(key)}",
                 TOO_LONG,
             )
         return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
 
-    async def becomes(
-        self, key: Key, so: Callable[[int], bool], seconds: float | None = None
+    async def wait_until(
+        self, key: Key, predicate: Callable[[int], bool], seconds: float | None = None
     ) -> tuple[int | None, float]:
-        """Read an object until it is `so`, for so long [s] at most, or as long as an answer may take.
+        """Read an object until `predicate` holds, for up to `seconds`, or the time of an answer.
 
-        Returns what it holds, None where the drive does not tell, and how long was waited [s]. A drive may take what
-        is written at once and show it later.
+        Return its value, None if it cannot be read, and the time waited [s]. A drive may accept a value immediately
+        and show it later.
         """
 
         async def read() -> int | None:
             self._read.pop(key, None)
             return await self.peek(*key)
 
-        def so_or_untold(found: int | None) -> bool:
-            return found is None or so(found)
+        def is_done(value: int | None) -> bool:
+            return value is None or predicate(value)
 
         client = self.client
-        return await until(
-            read, so_or_untold, client.pause, client.clock, client.timeout if seconds is None else seconds
+        return await read_until(
+            read, is_done, client.pause, client.clock, client.timeout if seconds is None else seconds
         )
 
     def _value(self, key: Key, data: bytes) -> int:
@@ -183,33 +188,33 @@ class Remote:
         return self._described[key][1] if key in self._described else signed(key)
 
     def _own(self, key: Key, data: bytes) -> bytes:
-        """The bytes of an answer that are the object's, by its EDS: some drives fill it up to four."""
+        """Return the bytes of an answer that belong to the object, by its EDS: some drives pad to four."""
         variable = self.client.od.get_variable(*key)
         if len(data) > EXPEDITED or variable is None or not variable.fixed_size:
             return data
         return data[: len(variable) // 8]
 
     def _size(self, key: Key) -> int:
-        """Bytes of an object that could not be read: as it was described, else by its EDS, else by the standards."""
+        """Return the size of an unreadable object [bytes]: as described, else by its EDS, else by the standards."""
         if key in self._described:
             return self._described[key][0]
         variable = self.client.od.get_variable(*key)
         return len(variable) // 8 if variable is not None and variable.data_type in INTEGER_TYPES else width(key)
 
     def name_of(self, key: Key) -> str:
-        """What people call an object."""
+        """Return the name of an object for people."""
         variable = self.client.od.get_variable(*key)
         if variable is not None:
             return str(variable.qualname)
-        found = use(key)
-        return found[1].name if found else "not in its EDS"
+        used = find_use(key)
+        return used[1].name if used else "not in its EDS"
 
     def _called(self, key: Key) -> str:
         return f"object {key[0]:04X}:{key[1]:02X} ({self.name_of(key)})"
 
     @contextmanager
     def _as_drive_error(self, attempt: str, key: Key) -> Iterator[None]:
-        """Turn what canopen and the bus raise into the one tree of errors."""
+        """Convert exceptions of canopen and the bus into DriveErrors."""
         called = self._called(key)
         try:
             yield
@@ -220,25 +225,23 @@ class Remote:
         except TwoNodesError as error:
             raise DriveError(f"drive {self.name}: {error}") from error
         except NoAnswerError as error:
-            raise DriveTimeout(self.name, f"answer about {called}", self.client.timeout) from error
+            raise DriveTimeout(self.name, f"answer for {called}", self.client.timeout) from error
         except BootedError as error:
-            raise RestartedError(
-                f"drive {self.name}: has restarted while it was set up; is its supply sound?"
-            ) from error
+            raise RestartedError(f"drive {self.name}: has restarted during its set-up; check its supply") from error
         except SdoCommunicationError as error:
             raise DriveError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
         except (can.CanError, OSError) as error:
             raise BusError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
 
 
-def together(
+def run_setups(
     bus: can.BusABC,
     clock: Clock,
     remotes: Sequence[Remote],
     doing: str,
     conversations: Sequence[Coroutine[Any, Any, T]],
 ) -> list[T | DriveError]:
-    """Lead a conversation with each drive, side by side, and log every second how far they are: see `side_by_side`."""
+    """Run a conversation with each drive concurrently, and log the progress every second: see `run_concurrently`."""
     over: set[str] = set()
 
     async def followed(remote: Remote, conversation: Coroutine[Any, Any, T]) -> T:
@@ -249,7 +252,7 @@ def together(
 
     def state(remote: Remote) -> str:
         if remote.boots:
-            return "is waited for, to boot"
+            return "booting"
         return f"{remote.client.answered} answers{', done' if remote.name in over else ''}"
 
     def progress() -> str:
@@ -257,15 +260,15 @@ def together(
 
     pairs = zip(remotes, conversations, strict=True)
     try:
-        return side_by_side(bus, clock, [followed(*pair) for pair in pairs], progress)
+        return run_concurrently(bus, clock, [followed(*pair) for pair in pairs], progress)
     finally:
         for conversation in conversations:
             conversation.close()
 
 
 def reason(code: int) -> str:
-    """What an SDO abort code means."""
-    return f"{SdoAbortedError.CODES.get(code, 'for a reason of its own')} (SDO abort {code:08X})"
+    """Return the meaning of an SDO abort code."""
+    return f"{SdoAbortedError.CODES.get(code, 'unknown reason')} (SDO abort {code:08X})"
 
 
 def is_pdo(index: int) -> bool:
@@ -274,14 +277,14 @@ def is_pdo(index: int) -> bool:
 
 
 def shown(index: int, subindex: int, value: int) -> str:  # noqa: ARG001
-    """A value as people read it: bit fields as the standards write them."""
+    """Return a value for people; bit fields in hexadecimal, as in the standards."""
     if is_pdo(index) or index in _BIT_FIELDS:
         return f"{value & 0xFFFF_FFFF:08X}h"
     return str(value)
 
 
 def same(index: int, subindex: int, one: int, other: int) -> bool:
-    """Whether two values are the same to this service."""
-    # Bit 30 of a PDO's COB-ID tells whether remote requests are answered: unused here, so either will do.
+    """Whether two values are equivalent for this service."""
+    # Bit 30 of a PDO's COB-ID, whether remote requests are answered, does not matter here.
     ignored = NO_REMOTE_REQUEST if is_pdo(index) and not index & 0x200 and subindex == 1 else 0
     return one | ignored == other | ignored

@@ -1,4 +1,4 @@
-"""An SDO client that asks one node and awaits its answers (CiA 301, 7.2.4)."""
+"""SDO client of one node (CiA 301, 7.2.4)."""
 
 from __future__ import annotations
 
@@ -9,34 +9,35 @@ import can
 from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus import canerrors
+from trirail_drivers.bus.frames import Frame, FrameSender
 from trirail_drivers.cia402 import canopen_frames, duplicate_node
-from trirail_drivers.cia402.conversations import Wait
+from trirail_drivers.driver.conversations import Wait
 from trirail_drivers.interface import Clock
 
-SECOND_ANSWERS: Final = 10
-"""So many requests of one set-up that are answered twice are answered by two nodes."""
+MAX_SECOND_ANSWERS: Final = 10
+"""Number of requests with a second answer, in one set-up, that prove two nodes."""
 EXPEDITED: Final = 4
-"""So many bytes travel with the first frame."""
-PAUSE: Final = 0.002
-"""What a drive is given to take an abort in [s]."""
+"""Largest value in an expedited transfer [bytes]."""
+ABORT_PAUSE_S: Final = 0.002
+"""Pause after an abort, for the drive to handle it."""
 
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)
-"""The client's command specifiers: the first byte's top bits."""
+"""Command specifiers of the client: the top bits of the first byte."""
 _ANSWERS: Final = {_DOWNLOAD_SEGMENT: 1, _DOWNLOAD: 3, _UPLOAD: 2, _UPLOAD_SEGMENT: 0, _ABORT: 4}
-"""Those of the server's answers."""
+"""Command specifiers of the server's answers."""
 _SEGMENTS: Final = (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT)
-"""Those whose frames name no object."""
+"""Command specifiers of frames without index and subindex."""
 _IS_EXPEDITED, _HAS_SIZE, _TOGGLE, _LAST = 0x02, 0x01, 0x10, 0x01
-"""Bits of a first byte; the toggle bit and the last segment's are those of segments."""
+"""Bits of a first byte; the last two are those of segments."""
 _TIMED_OUT: Final = 0x0504_0000
 _NOT_ALTERNATED: Final = 0x0503_0000
-_GIVEN_UP: Final = 0x0800_0000
+_GENERAL_ABORT: Final = 0x0800_0000
 """SDO abort codes: timed out, toggle bit not alternated, general."""
 
 
 class TwoNodesError(SdoCommunicationError):
-    """Requests are answered twice."""
+    """Requests get two answers."""
 
     def __init__(self, node: int) -> None:
         super().__init__(duplicate_node.warning(node, "both answer"))
@@ -47,24 +48,24 @@ class NoAnswerError(SdoCommunicationError):
 
 
 class BootedError(SdoCommunicationError):
-    """In place of an answer the drive has sent its boot-up message."""
+    """The drive has sent its boot-up message instead of an answer."""
 
 
 class Client:
-    """Asks one node, whose answers and boot-up message it hears among all frames.
+    """SDO requests to one node, whose answers and boot-up message are picked out of all received frames.
 
-    A drive may still answer what somebody asked before, this service's last run or an attempt that was given up.
-    So what is taken for the answer to a request is of its kind, and names the same object.
+    A drive may still answer an earlier request, of this service's last run or of an aborted attempt. So the answer to
+    a request must have its command specifier and object.
     """
 
-    def __init__(self, bus: can.BusABC, node: int, objects: ObjectDictionary, timeout: float, clock: Clock) -> None:
+    def __init__(self, bus: FrameSender, node: int, objects: ObjectDictionary, timeout: float, clock: Clock) -> None:
         self.bus = bus
         self.node = node
         self.od = objects
         self.timeout = timeout
         self.clock = clock
         self.answered = 0
-        """Requests that were answered so far."""
+        """Number of answered requests."""
         self._asked: bytes | None = None
         self._last = bytes(8)
         self._again = 0
@@ -75,9 +76,9 @@ class Client:
         await Wait(self._is_awaited, self.clock() + seconds)
 
     async def upload(self, index: int, subindex: int) -> bytes:
-        """All bytes that the drive has for an object: some tell four of one that is shorter.
+        """Read an object; some drives pad a shorter value to four bytes.
 
-        Raises SdoAbortedError where the drive refuses, NoAnswerError, and SdoCommunicationError for what else fails.
+        Raises SdoAbortedError if the drive refuses, NoAnswerError, and SdoCommunicationError for other failures.
         """
         answer = await self._request(struct.pack("<BHBI", _UPLOAD << 5, index, subindex, 0))
         if answer[0] & _IS_EXPEDITED:
@@ -110,10 +111,10 @@ class Client:
             toggle ^= _TOGGLE
 
     async def try_download(self, index: int, subindex: int, size: int) -> None:
-        """Begin to write so many bytes and give it up before the first; SdoAbortedError where the drive refuses.
+        """Begin to write `size` bytes and abort before the first; SdoAbortedError if the drive refuses.
 
-        A segmented download, whose first frame has the length only (CiA 301, SDO download initiate). A drive that
-        answers none is not asked again: it takes expedited ones alone, and each would be waited for.
+        This is a segmented download, whose first frame has only the size (CiA 301, SDO download initiate). A drive that
+        does not answer one only takes expedited transfers, and is not asked again: each request would time out.
         """
         if self._knows_no_segments:
             return
@@ -122,16 +123,16 @@ class Client:
         except NoAnswerError:
             self._knows_no_segments = True
             return
-        self._abort(index, subindex, code=_GIVEN_UP)
-        # An abort is not answered, and the next request could overtake it in a drive that has room for one frame.
-        await self.pause(PAUSE)
+        self._abort(index, subindex, code=_GENERAL_ABORT)
+        # An abort has no answer, and the next request could overwrite it in a drive with a buffer of one frame.
+        await self.pause(ABORT_PAUSE_S)
 
     async def _request(self, request: bytes) -> bytes:
         self._asked = request
         self._send(request)
         frame = await Wait(self._is_awaited, self.clock() + self.timeout)
         self._asked, self._last = None, request
-        if self._again >= SECOND_ANSWERS:
+        if self._again >= MAX_SECOND_ANSWERS:
             raise TwoNodesError(self.node)
         if frame is None:
             self._abort(*struct.unpack_from("<HB", request, 1), code=_TIMED_OUT)
@@ -148,12 +149,17 @@ class Client:
         self._send(struct.pack("<BHBI", _ABORT << 5, index, subindex, code))
 
     def _send(self, data: bytes) -> None:
-        self.bus.send(Frame(canopen_frames.SDO_REQUEST + self.node, data).message())
+        try:
+            self.bus.send(Frame(canopen_frames.SDO_REQUEST + self.node, data).message())
+        except (can.CanError, OSError) as error:
+            # While all drives are off no node acknowledges, so the queue fills; the request then times out.
+            if not canerrors.queue_is_full(error):
+                raise
 
     def _is_awaited(self, message: can.Message) -> bool:
-        """Whether a frame ends the waiting: the answer, a boot-up message in its place, an answer once too often.
+        """Whether a frame ends the wait: the answer, a boot-up message instead, or one second answer too many.
 
-        A request that was answered already may be once more by chance; so many are two servers.
+        A single second answer may be a late one; MAX_SECOND_ANSWERS of them prove two servers.
         """
         if message.is_error_frame or message.is_remote_frame:
             return False
@@ -165,7 +171,7 @@ class Client:
         if self._asked is not None and answers(self._asked, data):
             return True
         self._again += answers(self._last, data)
-        return self._asked is not None and self._again >= SECOND_ANSWERS
+        return self._asked is not None and self._again >= MAX_SECOND_ANSWERS
 
 
 def answers(request: bytes, data: bytes) -> bool:

@@ -1,57 +1,71 @@
-"""Sets three CiA 402 drives up side by side before the cycle runs, and refuses what cannot be on one bus."""
+"""Concurrent set-up of three CiA 402 drives before the cycle runs, and checks that they can share a bus."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import can
 
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames, eds
-from trirail_drivers.cia402.one_drive import OneDrive, SetUp, Start, bring, look_over, start
-from trirail_drivers.cia402.sdo import Remote, together
+from trirail_drivers.cia402.one_drive import SetUp, SetupTask, Start, configure_drive, read_start, rehearse_setup
+from trirail_drivers.cia402.sdo import Remote, run_setups
 from trirail_drivers.cia402.sdo_client import Client
-from trirail_drivers.cia402.settings import check_nodes, heartbeat_of, interpolation_periods
+from trirail_drivers.cia402.settings import check_nodes, heartbeat_period_ms, interpolation_periods
 from trirail_drivers.config import Drives
-from trirail_drivers.driver.refusals import raise_all
+from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import Scale
-from trirail_drivers.errors import DriveError
+from trirail_drivers.errors import DriveAbsentError, DriveError
 from trirail_drivers.interface import NAMES, Clock
 
 
 def configure(
-    bus: can.BusABC,
-    drives: Drives,
-    scales: tuple[Scale, ...],
-    period: float,
-    clock: Clock,
-    fastest: float | None = None,
-) -> tuple[tuple[SetUp, Start], ...]:
-    """Set the three drives up for a cycle of `period` seconds; without power, and NMT operational at the end.
+    bus: can.BusABC, drives: Drives, each: Sequence[SetupTask], fastest: float | None = None, *, awaits: bool = False
+) -> tuple[tuple[SetUp, Start] | None, ...]:
+    """Set three drives up concurrently, without power; at the end they are NMT operational.
 
-    `fastest` is the sliders' limit of velocity [m/s]: where it is given, the drives' units must be able to say it.
+    `fastest` is the sliders' velocity limit [m/s]; if given, it must fit the drives' units. With `awaits`, the result
+    of a drive that does not answer is None.
 
-    Raises DriveError; of its kinds, ConfigurationRefused for a value that reads back differently and
-    DriveTimeout for a drive that does not answer.
+    Raises DriveError: ConfigurationRefused for a value that reads back differently, DriveTimeout for a drive that does
+    not answer.
     """
-    check_nodes(drives)
-    heartbeat_of(drives)
-    interpolation_periods(period)
-    each = _drives(bus, drives, scales, period, clock)
+    clock = each[0].remote.client.clock
     for drive in drives.each:
         send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
-    # Everything is refused that can be told by reading, of every drive, before the first value is written.
-    _accepted(together(bus, clock, [one.remote for one in each], "reading", [look_over(one) for one in each]))
+    # Every check that needs only reading is done for all drives before the first value is written.
+    looked = run_setups(bus, clock, [one.remote for one in each], "reading", [rehearse_setup(one) for one in each])
+    absent = [awaits and isinstance(end, DriveAbsentError) for end in looked]
+    _accepted([end for end, away in zip(looked, absent, strict=True) if not away])
+    each = [one for one, away in zip(each, absent, strict=True) if not away]
     done = _accepted(
-        together(bus, clock, [one.remote for one in each], "writing", [bring(one, one.remote) for one in each])
+        run_setups(
+            bus, clock, [one.remote for one in each], "writing", [configure_drive(one, one.remote) for one in each]
+        )
     )
-    raise_all([found for found in (_velocity_refused(made, fastest) for made in done) if found is not None])
-    for drive in drives.each:
-        send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_START, drive.node))
-    starts = together(bus, clock, [one.remote for one in each], "starting", [start(one.remote) for one in each])
-    raise_all([each for each in starts if isinstance(each, DriveError)])
-    return tuple((made, each) for made, each in zip(done, starts, strict=True) if isinstance(each, Start))
+    raise_combined([error for error in (_velocity_refused(made, fastest) for made in done) if error is not None])
+    for one in each:
+        send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_START, one.drive.node))
+    starts = run_setups(bus, clock, [one.remote for one in each], "starting", [read_start(one.remote) for one in each])
+    raise_combined([each for each in starts if isinstance(each, DriveError)])
+    pairs = iter([(made, each) for made, each in zip(done, starts, strict=True) if isinstance(each, Start)])
+    return tuple(None if away else next(pairs) for away in absent)
+
+
+async def configure_one(one: SetupTask, fastest: float | None, check: Callable[[SetUp], None]) -> tuple[SetUp, Start]:
+    """Set one drive up as `configure` does; `check` raises for the wrong drive, after the dry run."""
+    bus, node = one.remote.client.bus, one.drive.node
+    send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
+    looked = await rehearse_setup(one)
+    _accepted([looked])
+    check(looked)
+    made = await configure_drive(one, one.remote)
+    _accepted([made])
+    if (refused := _velocity_refused(made, fastest)) is not None:
+        raise refused
+    send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_START, node))
+    return made, await read_start(one.remote)
 
 
 def survey(
@@ -62,31 +76,44 @@ def survey(
     clock: Clock,
     fastest: float | None = None,
 ) -> list[SetUp | DriveError]:
-    """Read what the drives are and what their set-up would change; nothing is written, no state changes."""
+    """Read the drives' identities and the changes of their set-up; nothing is written, and no state changes."""
     each = _drives(bus, drives, scales, period, clock)
-    conversations = [look_over(one, asks=True) for one in each]
-    ends = together(bus, clock, [one.remote for one in each], "reading", conversations)
+    conversations = [rehearse_setup(one, read_only=True) for one in each]
+    ends = run_setups(bus, clock, [one.remote for one in each], "reading", conversations)
     return [end if isinstance(end, DriveError) else _velocity_refused(end, fastest) or end for end in ends]
 
 
-def _drives(bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock) -> list[OneDrive]:
+def setup_tasks(
+    bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock
+) -> list[SetupTask]:
+    """Return the set-up tasks of the three drives, for a cycle of `period` seconds.
+
+    Raises DriveError for settings that no drive can take.
+    """
+    check_nodes(drives)
+    heartbeat_period_ms(drives)
+    interpolation_periods(period)
+    return _drives(bus, drives, scales, period, clock)
+
+
+def _drives(bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock) -> list[SetupTask]:
     asked = remotes(bus, drives, clock)
     each = zip(asked, drives.each, scales, strict=True)
-    return [OneDrive(remote, drive, drives, scale, period) for remote, drive, scale in each]
+    return [SetupTask(remote, drive, drives, scale, period) for remote, drive, scale in each]
 
 
 def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
-    """Refuse drives that are, all in one, and those that cannot be on one bus."""
+    """Raise the errors and refusals of all drives as one; otherwise check that the drives can share a bus."""
     refused = [end if isinstance(end, DriveError) else DriveError(end.refused) if end.refused else None for end in ends]
-    raise_all([error for error in refused if error is not None])
+    raise_combined([error for error in refused if error is not None])
     accepted = [end for end in ends if not isinstance(end, DriveError)]
     check_identifiers(accepted)
     return accepted
 
 
 def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
-    """Why a unit of velocities is refused: not known, or unfit. A drive may refuse to map any: then it is no matter."""
-    if made.way.setpoints.has_velocity:
+    """Return an error if the velocity unit is unknown or does not fit; it is irrelevant without a mapped velocity."""
+    if made.exchange.setpoints.has_velocity:
         try:
             made.units.check_velocity(made.name, fastest)
         except DriveError as error:
@@ -95,11 +122,16 @@ def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
 
 
 def check_identifiers(done: Sequence[SetUp]) -> None:
-    """Refuse two drives that hear or send frames of one identifier, as fixed ones of drives with one default do."""
+    """Raise DriveError if two drives have PDOs of one identifier, as drives with fixed, equal defaults do."""
     owners: dict[int, str] = {}
     for made in done:
-        way = made.way
-        for identifier in (way.setpoints.identifier, way.controlword, way.feedback.identifier, way.status):
+        exchange = made.exchange
+        for identifier in (
+            exchange.setpoints.identifier,
+            exchange.controlword,
+            exchange.feedback.identifier,
+            exchange.status,
+        ):
             if identifier is None:
                 continue
             if identifier in owners:
@@ -111,9 +143,9 @@ def check_identifiers(done: Sequence[SetUp]) -> None:
 
 
 def remotes(bus: can.BusABC, drives: Drives, clock: Clock) -> list[Remote]:
-    """The three drives' dictionaries over SDO."""
+    """Return the object dictionaries of the three drives over SDO."""
     made = []
     for name, drive in zip(NAMES, drives.each, strict=True):
-        objects = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node)
-        made.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock)))
+        objects, skipped = eds.load(name, Path(drive.eds) if drive.eds else eds.SERVO, drive.node)
+        made.append(Remote(name, Client(bus, drive.node, objects, drives.sdo_timeout, clock), skipped))
     return made

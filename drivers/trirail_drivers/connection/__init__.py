@@ -1,1 +1,1 @@
-"""Makes drives on a bus out of a configuration, and refuses settings that no drive could carry out."""
+"""Drives on a bus, from a configuration, and checks of its settings."""

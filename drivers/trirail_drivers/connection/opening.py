@@ -1,4 +1,4 @@
-"""Opens the configured CAN bus, and the drives on it."""
+"""Opening of the configured CAN bus and its drives."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ import can
 from trirail_drivers import config
 from trirail_drivers.bus import adapters, canerrors
 from trirail_drivers.bus.capture import Capture, CapturedBus
+from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.unixbus import UnixBus
-from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.errors import BusAbsentError, BusError, DriveError
 from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.carriages import Mounted
 from trirail_drivers.simulated.faults import Faults
 
-# What python-can would say of a failure is in the BusError; standard error is for that one line.
+# The BusError has python-can's reason; standard error shows only that one line.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 NETWORK_INTERFACES = Path("/sys/class/net")
@@ -31,9 +32,9 @@ IFF_UP = 0x1
 
 
 def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> can.BusABC:
-    """The bus that section [can] names; BusError with the remedy if there is none.
+    """Return the bus that section [can] names; BusError with the remedy if it cannot be opened.
 
-    `drives` and `clock` make the simulated drives, where the bus is "simulated".
+    `drives` and `clock` are used for the simulated drives of a "simulated" bus.
     """
     if section.interface == "simulated":
         return simulated_bus(section, drives, clock)
@@ -44,7 +45,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
         raise BusError(f'can.interface "{section.interface}" is unknown; known are {known}')
     options: dict[str, Any] = dict(section.options)
     try:
-        # Our configuration alone decides: none of python-can's own files and environment variables.
+        # Only our configuration counts, not python-can's own files and environment variables.
         bus = can.Bus(
             interface=section.interface,
             channel=section.channel,
@@ -52,12 +53,21 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
             ignore_config=True,
             **options,
         )
-    except Exception as error:  # makers' libraries raise what they like: Kvaser's, where it is missing, NameError
-        raise BusError(_explained(section, error)) from error
-    if section.interface == "socketcan" and _is_down(section.channel):
+    except Exception as error:  # makers' libraries raise anything: a missing CANlib of Kvaser's NameError
+        kind = BusAbsentError if _may_appear(section, error) else BusError
+        raise kind(_opening_error(section, error)) from error
+    if section.interface == "socketcan" and (problem := _problem(section)):
         bus.shutdown()
-        raise BusError(f'CAN interface "{section.channel}" is down; {_bring_up(section)}')
+        raise BusAbsentError(problem)
     return bus
+
+
+def _may_appear(section: config.Can, error: Exception) -> bool:
+    """Whether a bus that cannot be opened now may be opened later, with the same configuration and packages."""
+    of_the_bus = isinstance(error, (can.CanError, OSError)) and not isinstance(
+        error, can.CanInterfaceNotImplementedError
+    )
+    return of_the_bus and not adapters.missing_support(section.interface)
 
 
 def connect(
@@ -65,26 +75,44 @@ def connect(
     drives: config.Drives,
     clock: Clock = time.monotonic,
     capture: Capture | None = None,
+    *,
+    awaits: bool = False,
 ) -> DriveGroup:
-    """The three drives on their bus, not set up yet; DriveError if there is no bus. `capture` notes every frame."""
-    bus = open_bus(section, drives, clock)
-    if capture is not None:
-        bus = CapturedBus(bus, capture)
+    """Return the three drives on their bus, not set up yet; `capture` captures every frame.
+
+    With `awaits`, a lost bus is reopened in the background of the cycle, and a missing bus is opened when it appears.
+
+    Raises DriveError if there is no bus; with `awaits`, only if none can appear.
+    """
+    protocol = PROTOCOLS[drives.protocol]
+
+    def opened() -> can.BusABC:
+        bus = open_bus(section, drives, clock)
+        return CapturedBus(bus, capture) if capture is not None else bus
+
+    reopening = Reopening(section.channel or section.interface, opened) if awaits else None
+    bus: can.BusABC
     try:
-        return PROTOCOLS[drives.protocol].driver(bus, section.bitrate, drives, clock)
+        bus = opened()
+    except BusAbsentError as error:
+        if reopening is None:
+            raise
+        bus = AbsentBus(reopening.name, str(error))
+    try:
+        return protocol.driver(bus, section.bitrate, drives, clock, reopening)
     except DriveError:
         bus.shutdown()
         raise
 
 
 def simulated_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> SimulatedBus:
-    """The three drives of a configuration on a bus of their own, at rest where `can.simulated.start` says."""
+    """Return the three simulated drives of a configuration on a bus of their own, at rest at `can.simulated.start`."""
     devices, faults = simulated_drives(section, drives)
     return SimulatedBus(devices, clock, faults)
 
 
 def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequence[SimulatedDevice], Faults]:
-    """The three drives of a configuration, on no bus yet, and their faults."""
+    """Return the three simulated drives of a configuration, without a bus, and their faults."""
     protocol = PROTOCOLS[drives.protocol]
     starts = zip(drives.each, section.simulated.start, strict=True)
     devices = [protocol.simulated_drive(section.simulated, drives, drive, start) for drive, start in starts]
@@ -93,37 +121,46 @@ def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequen
     return devices, Faults(devices, scales, protocol.fault_frames, mounted=mounted)
 
 
-def _mounted(built: Sequence[config.Built] | None, index: int, drive: config.Drive) -> Mounted:
-    """What a simulated drive really moves: by its node id, or what is configured where nobody says."""
+def _mounted(built: Sequence[config.SimulatedSlider] | None, index: int, drive: config.Drive) -> Mounted:
+    """Return the true axis of a simulated drive, by its node id; without one, the configured axis."""
     for slider, each in enumerate(built or ()):
         if each.node == drive.node:
             return Mounted(slider, each.direction * each.counts_per_metre)
     return Mounted(index, drive.direction * drive.counts_per_metre)
 
 
-def _explained(section: config.Can, error: Exception) -> str:
-    """One line that says why the bus did not open and what to do about it."""
+def _opening_error(section: config.Can, error: Exception) -> str:
+    """Return one line with the reason for which the bus did not open, and the remedy."""
     number = canerrors.error_number(error)
     if number == errno.EAFNOSUPPORT:
         return "this kernel has no SocketCAN (address family AF_CAN); load it with: modprobe can_raw"
     if section.interface == "socketcan" and number == errno.ENODEV:
-        return f'there is no CAN interface "{section.channel}"; {_bring_up(section)}'
-    if lacking := adapters.lacking(section.interface):
+        return f'there is no CAN interface "{section.channel}"; {_interface_up_hint(section)}'
+    if lacking := adapters.missing_support(section.interface):
         return f"CAN interface {section.interface} needs {lacking}"
     reason = " ".join(str(error).split())
     return f'cannot open CAN interface {section.interface}, channel "{section.channel}": {reason}'
 
 
-def _bring_up(section: config.Can) -> str:
+def _interface_up_hint(section: config.Can) -> str:
     if section.channel.startswith("vcan"):
         return f"make it with: ip link add {section.channel} type vcan && ip link set {section.channel} up"
     return f"bring it up with: ip link set {section.channel} up type can bitrate {section.bitrate}"
 
 
-def _is_down(interface: str) -> bool:
-    """Whether Linux knows the interface and has it down; frames could not be sent."""
+def _problem(section: config.Can) -> str:
+    """Return the reason for which Linux' interface cannot send, with the remedy, or ""."""
+    folder = NETWORK_INTERFACES / section.channel
     try:
-        flags = int((NETWORK_INTERFACES / interface / "flags").read_text(), 16)
+        flags = int((folder / "flags").read_text(), 16)
+        carrier = int((folder / "carrier").read_text()) if flags & IFF_UP else 0
     except (OSError, ValueError):
-        return False
-    return not flags & IFF_UP
+        return ""
+    if not flags & IFF_UP:
+        return f'CAN interface "{section.channel}" is down; {_interface_up_hint(section)}'
+    if not carrier:  # a CAN controller is without it in bus-off alone: drivers/net/can/dev/dev.c, can_bus_off
+        return (
+            f'CAN interface "{section.channel}" is in bus-off; check cable, termination and bitrate, then restart it: '
+            f"ip link set {section.channel} down && ip link set {section.channel} up"
+        )
+    return ""

@@ -1,6 +1,6 @@
 """Simulated drives for one master in another process, on a bus between processes: trirail_drivers.bus.unixbus.
 
-One call waits for a frame or the time, and python-can has no part: at 1 kHz seven frames pass in every millisecond.
+A single system call waits for a frame or the timer, without python-can: at 1 kHz seven frames pass per millisecond.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from pathlib import Path
 
 from trirail_drivers import config
 from trirail_drivers.bus.can_frame import CAN_FRAME
-from trirail_drivers.bus.frame_io import SO_TIMESTAMPNS, TIME, TIME_SPACE
-from trirail_drivers.bus.unixbus import widen
+from trirail_drivers.bus.frame_io import SO_TIMESTAMPNS, TIMESPEC, TIMESPEC_SPACE
+from trirail_drivers.bus.unixbus import widen_send_buffer
 from trirail_drivers.connection.opening import simulated_drives
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated.exchange import SimulatedExchange
 
-WAIT = 0.01
-"""How often the drives' timers are looked at that no frame of theirs has looked at [s]."""
+POLL_PERIOD_S = 0.01
+"""Period of polling the drives' timers when no frame arrives [s]."""
 
 
 def serve(
@@ -30,9 +30,9 @@ def serve(
     ready: Callable[[], None],
     connected: Callable[[], None],
 ) -> None:
-    """Serve the drives of a configuration to the first who connects to the socket at `path`, until it has gone.
+    """Serve the drives of a configuration to the first client of the socket at `path`, until it disconnects.
 
-    The path is there once it can be connected to. `ready` is called just before, `connected` when somebody has.
+    The path appears once it accepts connections. `ready` is called just before, `connected` after the connection.
     """
     devices, faults = simulated_drives(section, drives)
     states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
@@ -51,26 +51,26 @@ def serve(
 
 
 class _Master:
-    """The other end of the bus. A stall of this process is none of the drives: they live by the arrival of frames.
+    """The other end of the bus. The drives' time is that of arriving frames, so a stall of this process is not theirs.
 
-    What waits is brought to them as of when it came. What they say of their states in that time only the newest of is
-    said, once nothing waits any more: else a position of before the stall would pass for one of now.
+    After a stall, waiting frames are handled at their arrival times. Of the state frames that the drives send in
+    answer only the newest is sent, at the end: an old position would look like a current one.
     """
 
     def __init__(self, connection: socket.socket, states: Collection[int]) -> None:
-        """`states` are the identifiers of frames that a newer one of the same makes worthless."""
+        """`states` are the identifiers of frames that a newer frame of the same identifier replaces."""
         self._socket = connection
         self._states = states
         self._held: dict[int, bytes] = {}
         self._now = time.monotonic()
-        widen(connection)
+        widen_send_buffer(connection)
         connection.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        # The kernel's own timeout of a receive: no call beside that.
-        seconds, rest = divmod(WAIT, 1.0)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, TIME.pack(int(seconds), round(rest * 1e6)))
+        # The kernel's receive time-out saves a separate call to poll.
+        seconds, rest = divmod(POLL_PERIOD_S, 1.0)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, TIMESPEC.pack(int(seconds), round(rest * 1e6)))
 
     def clock(self) -> float:
-        """The time as the drives have it [s]: when what they are brought arrived, by the monotonic clock."""
+        """Return the drives' time [s]: arrival of the frame being handled, by the monotonic clock."""
         return self._now
 
     def emit(self, identifier: int, data: bytes) -> None:
@@ -82,27 +82,27 @@ class _Master:
             self._send(frame)
 
     def exchange(self, drives: SimulatedExchange) -> None:
-        """Bring frames and the time to the drives until the master has gone."""
+        """Pass frames and time to the drives until the master disconnects."""
         packet = bytearray(CAN_FRAME.size)
         receive, buffers, unpack = self._socket.recvmsg_into, [packet], CAN_FRAME.unpack
         due = self._now
         while True:
             try:
-                size, stamped, _, _ = receive(buffers, TIME_SPACE, socket.MSG_DONTWAIT if self._held else 0)
-            except BlockingIOError:  # nothing is left, or has come for so long
+                size, stamped, _, _ = receive(buffers, TIMESPEC_SPACE, socket.MSG_DONTWAIT if self._held else 0)
+            except BlockingIOError:  # no frame is left, or none came within the time-out
                 self._send_held()
                 now = time.monotonic()
             else:
                 if size != CAN_FRAME.size:
                     return
-                seconds, nanoseconds = TIME.unpack(stamped[0][2])
+                seconds, nanoseconds = TIMESPEC.unpack(stamped[0][2])
                 waited = time.time() - seconds - nanoseconds * 1e-9
                 now = max(self._now, time.monotonic() - max(0.0, waited))
                 identifier, length, data = unpack(packet)
                 self._now = now
                 drives.receive(identifier, data[:length], now)
             if now >= due:
-                due = now + WAIT
+                due = now + POLL_PERIOD_S
                 self._now = now
                 drives.poll(now)
 

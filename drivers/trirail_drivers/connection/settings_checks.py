@@ -1,4 +1,4 @@
-"""Refuses settings of drives that no drive could carry out, before one is asked: which, and what would be right."""
+"""Checks of the settings of bus and drives, before any drive is contacted."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
-_OWN = ("simulated", "unix")
+_OWN_INTERFACES = ("simulated", "unix")
 """Interfaces that are not python-can's."""
-_ELSEWHERE = ("interface", "channel", "bitrate", "ignore_config", "config_context")
-"""What `can.Bus` is given from elsewhere, or not at all."""
-_CLASSICAL = 1_000_000
+_RESERVED_OPTIONS = ("interface", "channel", "bitrate", "ignore_config", "config_context")
+"""Arguments of `can.Bus` that are set from other keys or must not be set."""
+MAX_CLASSICAL_BITRATE = 1_000_000
 """The highest bitrate of classical CAN (ISO 11898-2) [bit/s]."""
 
 
 def bus_rules(section: Can) -> Iterator[Rule]:
-    """Yield what refuses a bitrate that no wire has, and options that python-can cannot take."""
+    """Yield checks for a bitrate beyond classical CAN, and for options that python-can does not take."""
     yield Rule("can.bitrate", ("can.interface",), partial(_check_bitrate, section))
     for name in section.options:
         yield Rule(f"can.options.{name}", ("can.interface",), partial(_check_option, section, name))
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield what refuses settings that a drive cannot be told, take or resolve."""
+    """Yield checks for settings that a drive does not have, or whose values it cannot take or resolve."""
     yield Rule("drives.heartbeat", ("loop.rate_hz",), partial(_check_heartbeat, drives, required))
     for name, drive in zip(NAMES, drives.each, strict=True):
         for protection in drive.accept_without:
@@ -38,23 +38,23 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
 
 
 def files(drives: Drives) -> Iterator[Rule]:
-    """Yield what refuses files that the settings name, by reading them."""
+    """Yield checks that read the files that the settings name."""
     return PROTOCOLS[drives.protocol].files(drives)
 
 
 def _check_bitrate(section: Can) -> None:
-    if section.bitrate > _CLASSICAL and section.interface not in _OWN:
+    if section.bitrate > MAX_CLASSICAL_BITRATE and section.interface not in _OWN_INTERFACES:
         raise DriveError(
-            f"can.bitrate = {section.bitrate}: classical CAN ends at {_CLASSICAL} bit/s; "
-            f"only {' and '.join(_OWN)}, which have no wire, go beyond"
+            f"can.bitrate = {section.bitrate}: classical CAN ends at {MAX_CLASSICAL_BITRATE} bit/s; "
+            f"only {' and '.join(_OWN_INTERFACES)}, which have no wire, go beyond"
         )
 
 
 def _check_option(section: Can, name: str) -> None:
-    if section.interface in _OWN:
+    if section.interface in _OWN_INTERFACES:
         raise DriveError(f'can.options.{name}: "{section.interface}" has no options, python-can\'s interfaces have')
-    if name in _ELSEWHERE:
-        raise DriveError(f"can.options.{name}: interface, channel and bitrate stand in [can]; the rest is fixed")
+    if name in _RESERVED_OPTIONS:
+        raise DriveError(f"can.options.{name}: not an option; set interface, channel and bitrate in [can]")
 
 
 def _check_heartbeat(drives: Drives, required: Requirements) -> None:

@@ -1,1 +1,1 @@
-"""What the drivers of all protocols share."""
+"""Common parts of the drivers of all protocols."""

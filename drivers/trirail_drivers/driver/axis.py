@@ -1,25 +1,75 @@
-"""What is kept of any drive, whatever it speaks: its newest feedback and what is wrong with it."""
+"""State of a drive of any protocol: the SYNC that its newest position answers, its feedback and its fault."""
 
 from __future__ import annotations
 
 import math
-from typing import Self
+from collections.abc import Callable
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from trirail_drivers.config import Drives
-from trirail_drivers.driver.answers import Answers
-from trirail_drivers.driver.axis_row import AXIS
+from trirail_drivers.driver.axis_row import AXIS, AxisRow
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Counts, DriveFault
 
+
+class Answers(AxisRow):
+    """Counts of SYNCs, and of the positions that answer them.
+
+    An answer takes less than a cycle, so a position received before the next SYNC is sent answers the last one. A
+    position received just after a SYNC answers that SYNC if the previous one is answered, or if the drive's last
+    answer was as prompt; otherwise it is the late answer to the previous one.
+    """
+
+    @property
+    def age(self) -> int:
+        """Number of SYNCs sent since the one at which the position was sampled."""
+        return self.syncs - self.sampled
+
+    @property
+    def missed(self) -> int:
+        """Number of SYNCs without an answer, except one whose answer is not due yet."""
+        return self.syncs - self.sampled - (not self.prompt)
+
+    def sync_sent(self) -> None:
+        """Count a SYNC that was sent."""
+        self.syncs += 1
+        self.between = False
+
+    def read_over(self) -> None:
+        """Note that this cycle's frames have been read: later positions answer its SYNC late."""
+        self.between, self.came = True, False
+
+    def answer(self) -> None:
+        """Assign a received position to the SYNC that it answers."""
+        self.came = True
+        between, prompt, before, syncs = self.between, self.prompt, self.sampled, self.syncs
+        answers_previous = not between and not prompt and before < syncs - 1
+        sampled = syncs - answers_previous
+        if sampled - before > 1:
+            self.lost += sampled - before - 1
+        # Late only compared with the drive's last answer: one that always answers after the read is not late.
+        if prompt and between and sampled > before:
+            self.late += 1
+        self.sampled = sampled
+        self.prompt = not between and not answers_previous
+
+    def clear_missed(self) -> None:
+        """Forget SYNCs without an answer."""
+        self.sampled = self.syncs
+
+
 MISSED_HEARTBEATS = 3
+"""Number of missed heartbeats that are the loss of a drive."""
+SILENT_AFTER: Final = 0.15
+"""Silence [s] after which a drive may have lost its supply, so that its set-up is checked again."""
 
 
 class Axis(Answers):
-    """One drive's name, node, numbers and first event since faults were last reset."""
+    """State of one drive, and its first event since the last reset."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__()
@@ -28,13 +78,21 @@ class Axis(Answers):
         self.scale = scale
         self.position = math.nan
         self.setpoints_late = self.setpoints_lost = 0
-        """Setpoints written after the next cycle was due, and those that the bus did not take."""
+        """Setpoints written after the next cycle was due, and setpoints that the bus refused."""
         self.left_out = False
-        """It stays without power where others are to have it."""
+        """Whether it stays without power while others are enabled."""
         self.powered_up = False
-        """It has followed setpoints since that was asked for."""
+        """Whether it has followed setpoints since it was enabled."""
         self.event: DriveFault | None = None
-        """A fault that a frame told of, rather than a state that lasts."""
+        """Fault that a frame reported, as opposed to a lasting state."""
+        self.restarted = self.silent = False
+        """Whether it has restarted, or was silent for long, since it was configured."""
+        self.boots = 0
+        """Number of observed restarts."""
+        self.setup_listener: Callable[[int, bytes | bytearray], None] | None = None
+        """Receiver of the identifier and data of its answers during a set-up in the background."""
+        self.homed = True
+        """Whether its position is counted from a known place."""
         self.heard = math.inf
         self.heard_within = MISSED_HEARTBEATS * drives.heartbeat
         self.status_within = self.follows_within = math.inf
@@ -42,34 +100,56 @@ class Axis(Answers):
         self._missed_positions = drives.missed_positions
 
     @classmethod
-    def placed(cls, rows: NDArray[np.void], number: int, name: str, node: int, scale: Scale, drives: Drives) -> Self:
-        """Return the drive whose numbers are in a row of AXIS."""
+    def in_row(cls, rows: NDArray[np.void], number: int, name: str, node: int, scale: Scale, drives: Drives) -> Self:
+        """Return a drive whose numbers are in row `number` of an array of AXIS."""
+        # The array's memory becomes the object's own, so that Python and compiled code share one copy.
         axis = cls.from_buffer(rows.data, number * AXIS.itemsize)
         axis.__init__(name, node, scale, drives)  # type: ignore[misc]
         return axis
 
     @property
     def counts(self) -> Counts:
-        """What of its cyclic traffic went wrong."""
+        """Numbers of late and lost positions and setpoints."""
         return Counts(self.late, self.lost, self.setpoints_late, self.setpoints_lost)
 
-    def note_fault(self, cause: str, code: int, text: str) -> None:
-        """Keep the first event since faults were last reset."""
-        if self.event is None:
-            self.event = self.made(cause, code, text)
+    @property
+    def configured(self) -> bool:
+        """Whether its set-up is still valid; only then it gets setpoints."""
+        return not (self.restarted or self.silent)
 
-    def made(self, cause: str, code: int, text: str) -> DriveFault:
-        """A fault of this drive."""
-        return DriveFault(self.name, cause, code, shortened(f"drive {self.name}: {text}"))
+    @property
+    def last_heard(self) -> float:
+        """Time of its last sign of life other than a position [s]."""
+        return -math.inf if self.heard == math.inf else self.heard
 
-    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
-        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not."""
+    def watch_silence(self, now: float, period: float) -> None:
+        """Mark the drive as silent after SILENT_AFTER; `period` is that of the cycle [s]."""
+        within = max(SILENT_AFTER, self._missed_positions * period)
+        # Both, since a drive that is not operational sends heartbeats but no positions.
+        if self.missed * period > within and now - self.last_heard > within:
+            self.silent = True
+
+    def forget_power_state(self) -> None:
+        """Forget the last reported power state; the set-up requests it."""
         raise NotImplementedError
 
-    def silence(self, now: float) -> DriveFault | None:
-        """The fault that the drive is not heard any more, at time `now`."""
+    def note_fault(self, cause: str, code: int, text: str) -> None:
+        """Latch a fault as the drive's event, unless one is latched since the last reset."""
+        if self.event is None:
+            self.event = self.make_fault(cause, code, text)
+
+    def make_fault(self, cause: str, code: int, text: str) -> DriveFault:
+        """Return a fault of this drive."""
+        return DriveFault(self.name, cause, code, shortened(f"drive {self.name}: {text}"))
+
+    def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
+        """Return the fault of a drive that still has power `seconds` [s] after `wanted`, as "quick stop"."""
+        raise NotImplementedError
+
+    def silence_fault(self, now: float) -> DriveFault | None:
+        """Return a fault if positions or heartbeats are missing at time `now` [s]."""
         if (missed := self.missed) >= self._missed_positions:
-            return self.made("silent", 0, f"no position for {missed} cycles in a row")
+            return self.make_fault("silent", 0, f"no position for {missed} cycles in a row")
         if now - self.heard > self.heard_within:
-            return self.made("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
+            return self.make_fault("heartbeat", 0, f"no heartbeat for {now - self.heard:.3g} s")
         return None

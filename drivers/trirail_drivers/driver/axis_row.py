@@ -1,4 +1,4 @@
-"""What is kept of one drive in memory that compiled code shares: a row of trirail_drivers.driver.cyclic.Cyclic.axes."""
+"""State of one drive in memory shared with compiled code: a row of trirail_drivers.driver.cyclic.Cyclic.axes."""
 
 from __future__ import annotations
 
@@ -9,93 +9,93 @@ from typing import Any, Final
 import numpy as np
 
 NOWHERE: Final = -1
-"""Of a place in a frame: it has no such number."""
+"""Offset of a number that a frame does not have."""
 
 
 class AxisRow(ctypes.Structure):
-    """One drive's numbers, each in this one place: Python's attributes are the memory of the array."""
+    """State of one drive; the Python attributes are the memory of the array."""
 
     position: float
     """Newest position [m]."""
     actual: int
-    """Likewise [counts]."""
+    """Newest position [counts]."""
     heard: float
-    """When a frame said last that the drive lives [s]."""
+    """Time of its last sign of life [s]."""
     status_heard: float
-    """When it told its state last [s]."""
+    """Time of its last statusword [s]."""
     statusword: int
-    """The newest one."""
+    """Newest statusword."""
     seen_clear: int
-    """Its bits that have been 0 since somebody began to watch."""
+    """Bits of the statusword that have been 0 since the driver cleared this."""
     syncs: int
-    """How many SYNCs were sent."""
+    """Number of SYNCs sent."""
     sampled: int
-    """The number of the SYNC at which the position was sampled."""
+    """Number of the SYNC at which the position was sampled."""
     late: int
-    """Answers that came a cycle later than the one before: a drive that always takes so long is not late."""
+    """Answers that came a cycle later than the previous one did: a constant delay is not late."""
     lost: int
     """SYNCs that were never answered, as far as later answers show."""
     between: bool
-    """This cycle's frames have been read, and the next SYNC was not sent."""
+    """Whether this cycle's frames have been read, and the next SYNC was not sent."""
     prompt: bool
-    """The last position came before the cycle of its SYNC had read."""
+    """Whether the last position came before the frames of its SYNC's cycle were read."""
     came: bool
-    """A position has come in this cycle."""
+    """Whether a position has come in this cycle."""
     newest: int
-    """Counts that came last."""
+    """Position received last [counts]."""
     step: int
-    """How far these were from those before, where they differed."""
+    """Last difference between consecutive positions that was not 0 [counts]."""
     stands_at: int
-    """Counts where the slider has been."""
+    """Position at which the slider stands [counts]."""
     stands_since: float
-    """And since when [s]."""
+    """Time since which it stands there [s]."""
     command_age: int
-    """SYNCs since it was sent a command."""
+    """SYNCs since its last command."""
     target: int
-    """Position that was sent last, in its units, where these are whole."""
+    """Position sent last, in the drive's units, if these are integers."""
     offset: int
-    """Velocity likewise."""
+    """Velocity sent last, in the drive's units, if these are integers."""
     wanted: float
-    """Position that was written last [m]; NaN where none is to be sent."""
+    """Position written last [m]; NaN if none waits to be sent."""
     wanted_rate: float
-    """Velocity likewise [m/s]."""
+    """Velocity written last [m/s]."""
     sent: float
-    """Position that the last SYNC has sent, where setpoints wait for one [m]; NaN where it has sent none."""
+    """Position sent by the last SYNC, if setpoints wait for one [m]; NaN if none was sent."""
     sent_rate: float
-    """Velocity likewise [m/s]."""
+    """Velocity sent by the last SYNC, if setpoints wait for one [m/s]."""
     in_force: float
-    """Position that the bus has taken last [m]; NaN where it has taken none."""
+    """Position that the bus took last [m]; NaN if it took none."""
 
-    # What stays as it is while cycles are quiet.
+    # Constant while cycles are quiet.
     floats: bool
-    """Whether positions are 32-bit floats; else whole counts."""
+    """Whether positions are 32-bit floats; otherwise integers."""
     waits: bool
-    """Whether setpoints go with the next SYNC; else at once."""
+    """Whether setpoints are sent with the next SYNC; otherwise immediately."""
     follows_within: float
-    """How far it may be from where it is to be [m]; infinite where nobody watches that."""
+    """Window of the following error that the driver monitors [m]; infinite if it does not."""
     counts_per_metre: float
     """Negative where counts fall as the slider position rises."""
     zero: float
     """Slider position at zero counts [m]."""
     velocity_per_metre: float
-    """What velocities are multiplied with."""
+    """Drive units of velocity per m/s, before the division by `velocity_step`."""
     velocity_step: float
-    """And then divided by."""
+    """Resolution of velocities in those units."""
     velocity_bytes: int
-    """So many bytes a velocity has."""
+    """Size of a velocity in the setpoint's frame [bytes]."""
     still: float
-    """Counts within which a slider stands."""
+    """Largest movement of a slider that counts as standing [counts]."""
     heard_within: float
-    """How old that may be [s]."""
+    """Largest age of `heard` [s]."""
     status_within: float
-    """Likewise."""
+    """Largest age of `status_heard` [s]."""
     position_at: int
-    """Where in its setpoint's frame the position goes."""
+    """Offset of the position in the setpoint's frame [bytes]."""
     velocity_at: int
-    """Where the velocity goes; NOWHERE for none."""
+    """Offset of the velocity in the setpoint's frame [bytes]; NOWHERE for none."""
 
 
 _KINDS: Final[dict[str, Any]] = {"float": ctypes.c_double, "int": ctypes.c_int64, "bool": ctypes.c_bool}
 AxisRow._fields_ = [(name, _KINDS[kind]) for name, kind in inspect.get_annotations(AxisRow).items()]
 AXIS: Final = np.dtype(AxisRow)
-"""The same for compiled code."""
+"""AxisRow as a numpy type, for compiled code."""

@@ -1,4 +1,4 @@
-"""What the drivers of all protocols share: bus, axes, the load of the bus, the time that a stop may take, closing."""
+"""Base of the drivers of all protocols: bus, axes, bus load, time limit of a stop, closing."""
 
 from __future__ import annotations
 
@@ -6,27 +6,30 @@ import contextlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import can
 
 from trirail_drivers import config
 from trirail_drivers.bus import load
+from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.cyclic import Cyclic
-from trirail_drivers.driver.refusals import SetUpDrive, lines_by_drive
+from trirail_drivers.driver.recovery import AnyAxis, Recovery
+from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
 from trirail_drivers.driver.scaling import scale_of
-from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection
+from trirail_drivers.errors import BusError
+from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection, Unready, UnreadyDrives
 
-AnyAxis = TypeVar("AnyAxis", bound=Axis)
+Result = TypeVar("Result")
 
 
 class Driver(ABC, Generic[AnyAxis]):
-    """Three drives on one CAN bus, whatever they speak; see trirail_drivers.interface.DriveGroup.
+    """Three drives of one protocol on one CAN bus; see trirail_drivers.interface.DriveGroup.
 
-    A fault of one drive is a fault of the robot: what is latched takes all three down their quick-stop ramps
-    beginning in the same cycle, and `enable` does nothing until `reset`.
+    A fault of one drive is a fault of the robot: all three begin their quick-stop ramps in the cycle that latches it,
+    and `enable` does nothing until `reset`.
     """
 
     def __init__(
@@ -37,50 +40,92 @@ class Driver(ABC, Generic[AnyAxis]):
         clock: Clock,
         axis: type[AnyAxis],
         history: int = 0,
+        reopening: Reopening | None = None,
     ) -> None:
-        """`history`: so many setpoints are kept of those that were sent."""
+        """`history`: number of sent setpoints to keep. `reopening` reopens a lost bus."""
         self.bus_load = 0.0
-        self.missing_protections: tuple[MissingProtection, ...] = ()
-        self._wire = Wire(bus, self._stop)
+        self._wire = Wire(bus, self._stop, reopening)
         self._bitrate = bitrate
         self._drives = drives
         self._clock = clock
         self._tables = Cyclic(self._wire.access, history)
         self._axes = tuple(
-            axis.placed(self._tables.axes, number, name, drive.node, scale_of(name, drive), drives)
+            axis.in_row(self._tables.axes, number, name, drive.node, scale_of(name, drive), drives)
             for number, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True))
         )
+        self._recovery: Recovery[AnyAxis, Any, Any] | None = None
         self._period = 0.0
         self._synced = 0.0
-        """When the cycle began [s]."""
-        self._off_by = math.inf
-        """When the drives must have lost their power [s]; inf where that was not asked for, or has been told of."""
-        self._asked = ""
-        """By what that was asked for."""
+        """Start of the cycle [s]."""
+        self._off_deadline = math.inf
+        """Time by which the drives must have lost their power [s]; inf if none is pending."""
+        self._stop_reason = ""
+        """Command that set `_off_deadline`."""
         self._closed = False
 
-    def _warn_of_setup(self, made: Sequence[SetUpDrive], means: Callable[[str], str]) -> None:
-        """Warn of what is done otherwise, and keep which protections drives do without; `means` words one."""
-        for line in lines_by_drive((each.name, each.notes) for each in made):
+    def _warn_of_setup(self, made: Sequence[SetUpDrive]) -> None:
+        """Warn of everything in which the set-ups deviate."""
+        for line in merge_notes((each.name, each.notes) for each in made):
             self._wire.warn(line)
-        self.missing_protections = tuple(
-            MissingProtection(each.name, name, means(name)) for each in made for name in each.lacking
+
+    @property
+    def missing_protections(self) -> tuple[MissingProtection, ...]:
+        """Protections that the configured drives lack."""
+        made = self._recovery.setups if self._recovery is not None else ()
+        return tuple(
+            MissingProtection(each.name, name, self._describe_protection(name))
+            for each in made
+            for name in each.missing_protections
         )
+
+    def _set_up(
+        self, configure: Callable[[], Sequence[Result | None]], *, awaits: bool
+    ) -> tuple[Sequence[Result | None], str]:
+        """Configure the drives at the start.
+
+        Return their set-ups, None for an absent drive, and the reason for which the bus is lost, or "".
+        """
+        if isinstance(self._wire.bus, AbsentBus):
+            return (None, None, None), self._wire.bus.reason
+        try:
+            return configure(), ""
+        except BusError as error:
+            if not (awaits and self._wire.reopens):
+                raise
+            return (None, None, None), str(error)
+
+    def _report_absent(self, lost: str) -> None:
+        """Latch a fault with the reason for a `lost` bus, or with the drives that did not answer at the start."""
+        if lost:
+            self._wire.lose(lost)
+        elif away := [axis.name for axis in self._axes if axis.silent]:
+            one, *more = away
+            text = f"drives {', '.join(away)} do not answer" if more else f"drive {one} does not answer"
+            self._wire.fail(DriveFault("" if more else one, "silent", 0, f"{text}; switch the supply on"))
+
+    def _recover(self) -> None:
+        """Continue the recovery of drives; on a bus on trial too, since some drives only answer requests."""
+        if self._recovery is None:
+            return
+        if self._wire.carries:
+            self._recovery.step(self._synced, stopping=self._off_deadline != math.inf)
+        else:
+            self._recovery.abandon()
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames sent and heard since the start, each with worst-case stuffing."""
+        """Bits of all frames sent and received since the start, each with worst-case stuffing."""
         return self._wire.traffic + int(self._tables.times[0]["traffic"])
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
-        """Of each drive the first fault that it has told of by itself since the last reset, whichever came first."""
+        """First fault that each drive itself has reported since the last reset, or None."""
         return tuple(axis.event for axis in self._axes)
 
     def close(self) -> None:
-        """Leave the drives without power, and let go of the bus.
+        """Take the drives' power off, and close the bus.
 
-        Drives that still have power are first brought to a standstill by their ramps.
+        Drives that have power first stop by their ramps.
         """
         if self._closed:
             return
@@ -89,13 +134,17 @@ class Driver(ABC, Generic[AnyAxis]):
             if self._powered():
                 self.quick_stop()
                 self._wait_for_standstill(self._clock() + self._drives.stop_timeout)
-        self._leave()
-        with contextlib.suppress(can.CanError, OSError):
-            self._wire.bus.shutdown()
+        self._cut_power()
+        self._wire.close()
 
     @abstractmethod
     def quick_stop(self) -> None:
-        """Make every drive stop by its quick-stop ramp, beginning in this cycle."""
+        """Begin the quick-stop ramp of every drive in this cycle."""
+
+    @staticmethod
+    @abstractmethod
+    def _describe_protection(protection: str) -> str:
+        """Return the purpose of a protection in words."""
 
     @abstractmethod
     def _powered(self) -> bool:
@@ -103,49 +152,62 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @abstractmethod
     def _wants_power(self) -> bool:
-        """Whether the drives have been asked to have power."""
+        """Whether the drives are commanded to have power."""
 
     @abstractmethod
     def _wait_for_standstill(self, deadline: float) -> None:
-        """Stay with the drives, which are stopping, until they have lost their power, or until `deadline` [s]."""
+        """Run cycles until the stopping drives have lost their power, or until `deadline` [s]."""
 
     @abstractmethod
-    def _leave(self) -> None:
-        """Send what leaves the drives without power, whatever they do."""
+    def _cut_power(self) -> None:
+        """Send the frames that take the drives' power off, in any state."""
 
     @abstractmethod
-    def _give_up_stopping(self) -> None:
-        """From now on ask drives that were to stop for nothing but to lose their power."""
+    def _abandon_stop(self) -> None:
+        """End the ramps of drives that are stopping: from now on only take their power off."""
 
     def _set_period(self, period: float, traffic: load.Traffic) -> None:
-        """Note the cycle's period [s]; BusError if it does not fit on the bus, a warning if it does so hardly."""
+        """Set the cycle period [s]; BusError if its frames do not fit on the bus, a warning if they hardly fit."""
         rate = 1.0 / period
-        self.bus_load = traffic.checked(rate, self._bitrate, self._drives.heartbeat)
+        self.bus_load = traffic.check_bus_load(rate, self._bitrate, self._drives.heartbeat)
         self._period = period
         if warning := load.warning(rate, self.bus_load):
             self._wire.warn(warning)
 
+    def _begin_cycle(self, now: float) -> None:
+        """Begin a cycle on the bus, even a lost or reopened one."""
+        self._wire.begin(now, stopping=self._off_deadline != math.inf)
+        self._tables.bus[:] = self._wire.access
+
+    @property
+    def _unready(self) -> UnreadyDrives:
+        """Reason for which each drive cannot be reset yet; the same for all while the bus is lost."""
+        if self._wire.down:
+            lost = Unready(self._wire.down)
+            return lost, lost, lost
+        return self._recovery.unready if self._recovery is not None else (None, None, None)
+
     def _stop(self) -> None:
-        """Drives that have power, or are getting it, are stopped with the first fault."""
+        """Stop the drives on a fault, if they have power or are getting it."""
         if self._wants_power():
             self.quick_stop()
 
-    def _give_time_to_stop(self, asked: str) -> None:
-        self._off_by, self._asked = self._clock() + self._drives.stop_timeout, asked
+    def _start_stop_timer(self, reason: str) -> None:
+        self._off_deadline, self._stop_reason = self._clock() + self._drives.stop_timeout, reason
 
-    def _watch_stopping(self, now: float) -> None:
-        """Tell of a drive that has not lost its power in time, once; its brake is what remains."""
-        if now < self._off_by:
+    def _check_stopped(self, now: float) -> None:
+        """Latch a fault, once, for a drive that still has power after `stop_timeout`; only its brake can stop it."""
+        if now < self._off_deadline:
             return
-        self._off_by = math.inf
-        self._give_up_stopping()
+        self._off_deadline = math.inf
+        self._abandon_stop()
         for axis in self._axes:
-            fault = axis.late_for(self._asked, self._drives.stop_timeout)
+            fault = axis.stop_overdue_fault(self._stop_reason, self._drives.stop_timeout)
             if fault is not None:
                 self._wire.fault = fault
                 return
 
     def _refuse_setpoint(self, axis: Axis, position: float, velocity: float) -> None:
-        """A setpoint [m], [m/s] that no frame can hold is a fault."""
+        """Latch a fault for a setpoint [m], [m/s] that no frame can hold."""
         text = f"drive {axis.name}: cannot take setpoint {position * 1e3:g} mm, {velocity * 1e3:g} mm/s"
         self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 
-def braked(position: float, velocity: float, deceleration: float, step: float) -> tuple[float, float]:
-    """Position and velocity after braking for `step` seconds with `deceleration`, at most to standstill."""
+def brake(position: float, velocity: float, deceleration: float, step: float) -> tuple[float, float]:
+    """Return position and velocity after braking for `step` seconds with `deceleration`, at most to standstill."""
     moving = min(step, abs(velocity) / deceleration)
     lost = math.copysign(deceleration * moving, velocity)
     position += (velocity - 0.5 * lost) * moving

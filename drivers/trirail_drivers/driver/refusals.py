@@ -1,81 +1,107 @@
-"""Why drives are refused: one that lacks protections, and the three of them told together."""
+"""Refusals of drives: for missing protections, for a replaced drive, and of all three drives combined."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Final, Protocol
 
-from trirail_drivers.errors import LONGEST, DriveError, shortened
+from trirail_drivers.errors import MAX_MESSAGE_LENGTH, DriveError, shortened
 
 _NAMED: Final = re.compile(r"\b(drive |drives\.)([ABC])\b")
 
 
-class Purpose(Protocol):
-    """What a protection is for, and what is so where a drive lacks it."""
+class ProtectionText(Protocol):
+    """Purpose of a protection, and the consequence of lacking it."""
 
     @property
     def purpose(self) -> str:
-        """In words for people."""
+        """Purpose, for people."""
 
     @property
     def without(self) -> str:
-        """Likewise."""
+        """Consequence, for people."""
 
 
 class SetUpDrive(Protocol):
-    """What a protocol tells of a drive that is set up."""
+    """Result of a drive's set-up in any protocol."""
 
     @property
     def name(self) -> str:
-        """A, B or C."""
+        """Name of the drive."""
 
     @property
     def notes(self) -> Sequence[str]:
-        """Lines for people."""
+        """Notes for people, a line each."""
 
     @property
-    def lacking(self) -> Sequence[str]:
-        """Protections that it does without."""
+    def missing_protections(self) -> Sequence[str]:
+        """Protections that the drive lacks."""
 
 
-def judged(
-    drive: str, lacking: Mapping[str, str], accepted: Sequence[str], protections: Mapping[str, Purpose]
+def review_protections(
+    drive: str,
+    missing_protections: Mapping[str, str],
+    accepted: Sequence[str],
+    protections: Mapping[str, ProtectionText],
+    remedy: str = "",
 ) -> tuple[str, list[str]]:
-    """Return why a drive is refused that lacks protections, "" where it is not, and what is told of those accepted.
+    """Return the refusal of a drive that lacks protections, or "", and notes on those it may lack.
 
-    `lacking` has why each is said to lack, `accepted` is its `accept_without`.
+    `missing_protections` has the reason for each, `accepted` is its `accept_without`, `remedy` a way to set them.
     """
-    refused = [name for name in lacking if name not in accepted]
-    told = []
-    for name, reason in lacking.items():
+    refused = [name for name in missing_protections if name not in accepted]
+    notes = []
+    for name, reason in missing_protections.items():
         if name in accepted:
             used = protections[name]
-            told.append(f"lacks {name} ({used.purpose}): {reason}; accepted, so {used.without}")
+            notes.append(f"lacks {name} ({used.purpose}): {reason}; accepted, so {used.without}")
     if not refused:
-        return "", told
-    what = "; ".join(f"{name}, {protections[name].purpose}: {lacking[name]}" for name in refused)
+        return "", notes
+    what = "; ".join(f"{name}, {protections[name].purpose}: {missing_protections[name]}" for name in refused)
     listed = ", ".join(f'"{name}"' for name in sorted({*refused, *accepted}))
     return (
-        f"drive {drive} lacks protections: {what}. To drive it all the same say "
+        f"drive {drive} lacks protections: {what}{remedy and f'; {remedy}'}. To use it without them, set "
         f"drives.{drive}.accept_without = [{listed}]"
-    ), told
+    ), notes
 
 
-def raise_all(errors: Sequence[DriveError]) -> None:
-    """Raise what was found of each drive: none hides another's, and what is so of several is said once."""
+def replacement_refusal(
+    drive: str, numbers: Mapping[str, tuple[object, object]], may_differ: Collection[str], *, allowed: bool
+) -> str:
+    """Return the refusal of a drive that is not the one before; "" if it is, or is an allowed replacement.
+
+    `numbers` has the identity of the drive, before and now, by the names of its parts. If a replacement is `allowed`,
+    the parts in `may_differ` may differ.
+    """
+    differing = [
+        f"{name} {now}, was {before}"
+        for name, (before, now) in numbers.items()
+        if now != before and not (allowed and name in may_differ)
+    ]
+    if not differing:
+        return ""
+    remedy = "" if allowed else f", or set drives.{drive}.allow_replacement = true"
+    return (
+        f"drive {drive}: another drive is in its place: {', '.join(differing)}; "
+        f"restart the service to accept it{remedy}"
+    )
+
+
+def raise_combined(errors: Sequence[DriveError]) -> None:
+    """Raise the errors of all drives as one; the same error of several drives appears once."""
     if len(errors) == 1:
         raise errors[0]
     alike: dict[str, list[str]] = {}
     for error in errors:
         alike.setdefault(_NAMED.sub(r"\1_", str(error)), []).append(str(error))
-    told = [first + "".join(f"; drive {_name(text)}: the same" for text in more) for first, *more in alike.values()]
-    if told:
-        raise DriveError("; ".join(shortened(text, LONGEST // len(told) - 2) for text in told))
+    texts = [first + "".join(f"; drive {_name(text)}: the same" for text in more) for first, *more in alike.values()]
+    if texts:
+        raise DriveError("; ".join(shortened(text, MAX_MESSAGE_LENGTH // len(texts) - 2) for text in texts))
 
 
-def lines_by_drive(notes: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """What people should know of drives, by name, a line each: what is so of several is said once."""
+def merge_notes(notes: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """Return notes on drives for people, a line each; the same note on several drives is one line."""
     names: dict[str, list[str]] = {}
     for name, lines in notes:
         for line in lines:
@@ -84,6 +110,6 @@ def lines_by_drive(notes: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
 
 
 def _name(text: str) -> str:
-    """Of which drive an error is."""
-    found = _NAMED.search(text)
-    return found[2] if found else ""
+    """Return the name of the drive in an error, or ""."""
+    match = _NAMED.search(text)
+    return match[2] if match else ""

@@ -1,4 +1,4 @@
-"""What a robot requires of its drives, and whether the steps of their positions are fine enough for it."""
+"""Requirements of a robot on its drives, and checks that the resolution of their positions meets them."""
 
 from __future__ import annotations
 
@@ -10,64 +10,62 @@ from trirail_drivers.config import Drive, Drives
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES, Triple
 
-FINE_ENOUGH: Final = 10
-"""So many steps of a drive's position the following error must have, lest rounding alone be a fault."""
-
-
-SEVERAL: Final = 3
-"""So many steps of a drive's position a window must have to either side, lest rounding and its flicker leave it."""
+MIN_STEPS_PER_LIMIT: Final = 10
+"""Fewest position steps in a limit of the following error: with fewer, rounding alone could be a fault."""
+MIN_STEPS_PER_WINDOW: Final = 3
+"""Fewest position steps in a window to either side: with fewer, rounding and encoder flicker could leave it."""
 
 
 class Rule(NamedTuple):
-    """One thing that settings are refused for. Each can be looked at by itself, so that none hides another."""
+    """One check of the configuration. Each runs by itself, so that no error hides another."""
 
     key: str
-    """Of the configuration: what is wrong where it is refused."""
+    """Key that is wrong if the check fails."""
     reads: tuple[str, ...]
-    """What else the answer depends on: keys, or tables for all that is in them."""
+    """Other keys that the result depends on; the name of a table for all its keys."""
     check: Callable[[], object]
-    """Raises a TrirailError that says key, value and what would be right."""
+    """Function that raises a TrirailError with key, value and a valid value."""
 
 
 class Window(NamedTuple):
-    """How far something that follows from the sliders' positions may be from where it is to be."""
+    """Window of a value that depends on the sliders' positions."""
 
     key: str
-    """Of the configuration."""
+    """Key of the configuration."""
     width: float
-    """To either side."""
+    """Half width [unit]."""
     unit: str
     gains: Triple
-    """By how much at most a metre of the sliders A, B, C changes it."""
+    """Largest change of the value per metre of the sliders A, B, C [unit/m]."""
 
 
 class Requirements(NamedTuple):
-    """What the drives are to be able to do, A, B, C."""
+    """Requirements on the drives A, B, C."""
 
     period: float
-    """Of the cycle [s]."""
+    """Cycle period [s]."""
     low: Sequence[float]
     high: Sequence[float]
     """Travel of the sliders [m]."""
     velocity: Triple
-    """Of the sliders at most [m/s]."""
+    """Largest velocities of the sliders [m/s]."""
     following_error: float
-    """Beyond which the service stops everything [m]."""
+    """Following error above which the service stops all drives [m]."""
     windows: tuple[Window, ...] = ()
-    """In which the robot is to settle."""
+    """Windows in which the robot must settle."""
 
 
-def resolution(
+def resolution_rules(
     name: str, drive: Drive, drives: Drives, required: Requirements, step: float, remedy: Callable[[float], str]
 ) -> Iterator[Rule]:
-    """Yield what refuses a `step` of the position [m] that no limit is several of wide: rounding alone is no fault.
+    """Yield checks that every limit is several position steps of `step` [m] wide, so that rounding is no fault.
 
-    `remedy` says what would be right, given the widest step [m] that would do.
+    `remedy` returns the remedy for people, from the largest valid step [m].
     """
     scale = f"drives.{name}.offset", "limits.slider.position", "can.simulated.start"
     limits = (
-        ("limits.slider.following_error", "m", required.following_error, FINE_ENOUGH),
-        ("drives.following_error", "m", drives.following_error, FINE_ENOUGH),
+        ("limits.slider.following_error", "m", required.following_error, MIN_STEPS_PER_LIMIT),
+        ("drives.following_error", "m", drives.following_error, MIN_STEPS_PER_LIMIT),
         ("limits.slider.velocity", "m in a cycle", required.velocity[NAMES.index(name)] * required.period, 1),
     )
     reads = *scale, "loop.rate_hz", *(key for key, *_ in limits)
@@ -88,15 +86,15 @@ def _check_limits(
     for key, unit, limit, steps in limits:
         if step * steps > limit:
             raise DriveError(
-                f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: the position "
-                f"goes in steps of {step:g} m, too coarse for {key}, {limit:g} {unit}; {remedy(limit / steps)}"
+                f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: a position "
+                f"step of {step:g} m is too coarse for {key}, {limit:g} {unit}; {remedy(limit / steps)}"
             )
 
 
 def _check_window(name: str, step: float, window: Window) -> None:
-    least = SEVERAL * step * window.gains[NAMES.index(name)]
+    least = MIN_STEPS_PER_WINDOW * step * window.gains[NAMES.index(name)]
     if window.width < least:
         raise DriveError(
-            f"{window.key} = {window.width:g}: the position of drive {name} goes in steps of {step:g} m, and "
-            f"{SEVERAL} of them move it by {least:g} {window.unit}; wanted at least that, to settle in"
+            f"{window.key} = {window.width:g}: narrower than {MIN_STEPS_PER_WINDOW} position steps of drive {name}, "
+            f"{step:g} m each; wanted at least {least:g} {window.unit}, to settle in"
         )

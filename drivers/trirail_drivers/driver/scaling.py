@@ -1,4 +1,4 @@
-"""Metres on this side, drive counts on the other."""
+"""Conversion between metres and drive counts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ UINT32_MAX = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """One drive's scale of positions: `counts = counts_per_metre * (position - offset)`."""
+    """Position scale of one drive: `counts = counts_per_metre * (position - offset)`."""
 
     counts_per_metre: float
     """Negative where counts fall as the slider position rises."""
@@ -21,20 +21,20 @@ class Scale:
     """Slider position at zero counts [m]."""
 
     def counts(self, position: float) -> int:
-        """Slider position [m] in counts; ValueError or OverflowError if it is not finite."""
+        """Return a slider position [m] in counts; ValueError or OverflowError if it is not finite."""
         return round(self.exact(position))
 
     def exact(self, position: float) -> float:
-        """Slider position [m] in counts that need not be whole: turns."""
+        """Return a slider position [m] in counts, not rounded (an ODrive's turns)."""
         return self.counts_per_metre * (position - self.offset)
 
     def metres(self, counts: float) -> float:
-        """Slider position [m] of a drive position."""
+        """Return the slider position [m] of a drive position."""
         return counts / self.counts_per_metre + self.offset
 
 
 def scale_of(name: str, drive: Drive) -> Scale:
-    """Scale of the drive called `name`; DriveError if slider position 0 is beyond a 32-bit drive position."""
+    """Return the scale of a drive; DriveError if slider position 0 does not fit into a 32-bit drive position."""
     scale = Scale(drive.direction * drive.counts_per_metre, drive.offset)
     try:
         zero = scale.counts(0.0)

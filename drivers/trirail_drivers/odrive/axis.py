@@ -1,28 +1,28 @@
-"""One ODrive as its messages tell of it: position, state, errors, and what is wrong with it."""
+"""State of one ODrive from its messages: position, axis state, errors and faults."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
+from trirail_drivers.bus.wire import Handler
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
-from trirail_drivers.driver.cyclic import expected
+from trirail_drivers.driver.cyclic import expected_row
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.interface import DriveFault, PowerState
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.cansimple import AxisState, ProcedureResult
-from trirail_drivers.odrive.codes import words
-from trirail_drivers.odrive.flat_endpoints import Version
+from trirail_drivers.odrive.codes import describe_errors
 
 RESET_TIME = 3 * 3 * cansimple.ERROR_PERIOD
-"""How long errors may be told of after they were cleared, in which each drive is asked three times [s]."""
+"""Time after Clear_Errors in which errors are not yet a fault [s]: three error requests to each drive."""
 STALE_HEARTBEATS = 1
-"""So many heartbeats after a request may still be from before it."""
+"""Heartbeats after a request that may still show the state before it."""
 
 
 class OdriveAxis(Axis):
-    """One drive's newest feedback; the `on_` methods take a message's data or raise struct.error."""
+    """Newest feedback of one drive; the `on_` methods take a message's data or raise struct.error."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
@@ -37,65 +37,85 @@ class OdriveAxis(Axis):
         self.state: int = AxisState.UNDEFINED
         """Axis state of the newest heartbeat."""
         self.errors = 0
-        """Active errors, and why it was disarmed."""
+        """Active errors and disarm reason, as bits."""
         self.reported = False
-        """It has answered what its errors are."""
-        self.version: Version | None = None
-        """Of its hardware and firmware, once it told."""
-        self.sdo: tuple[int, bytes] | None = None
-        """Endpoint and value of the newest TxSdo."""
+        """Whether it has answered a Get_Error request."""
         self.requested: AxisState | None = None
-        """The state it was asked for last; None makes the driver ask anew."""
+        """Axis state requested last; None makes the driver request the target state again."""
         self.reset_until = -math.inf
-        """Until when clearing the errors is under way [s]."""
+        """Time until which cleared errors may persist [s]."""
         self._beats = 0
-        self._initialised = False
-        self._restarted = False
+        """Heartbeats since the last request."""
+        self._started = False
+        """Whether a heartbeat has shown that it is not booting."""
         self._result: int = ProcedureResult.SUCCESS
 
-    def rests(self, wanted: AxisState | None) -> bool:
-        """Whether nothing is to be done for it, nor found out, as long as its frames say nothing new."""
-        in_state = wanted is not None and self.requested is wanted and self.state == wanted and self.obeys
+    def is_steady(self, wanted: AxisState | None) -> bool:
+        """Whether the driver has nothing to send or decide as long as the drive's frames do not change."""
+        in_state = wanted is not None and self.requested is wanted and self.state == wanted and self.state_is_current
         well = self.reported and not self.errors and self.event is None and self.reset_until == -math.inf
         follows = self.powered_up or wanted is AxisState.IDLE
-        return in_state and well and follows and self.missed == 0 and math.isfinite(self.position)
+        return in_state and well and follows and self.configured and self.missed == 0 and math.isfinite(self.position)
 
     @property
-    def said(self) -> tuple[int, int]:
-        """What of its newest heartbeat decides something: state, and how the last procedure ended."""
+    def heartbeat_state(self) -> tuple[int, int]:
+        """Axis state and procedure result of the newest heartbeat: its only fields that decide anything."""
         return self.state, self._result
 
-    def expected(self, number: int) -> list[tuple[Any, ...]]:
-        """The frames that say nothing new of it, as rows of trirail_drivers.driver.cyclic.EXPECTED; it has a number."""
+    def expected_rows(self, number: int) -> list[tuple[Any, ...]]:
+        """Return rows of trirail_drivers.driver.cyclic.EXPECTED: frames of drive `number` that carry no news."""
 
-        def of(command: int) -> int:
+        def identifier(command: int) -> int:
             return cansimple.identifier(self.node, command)
 
-        beat, decides = cansimple.BEAT.pack(0, *self.said, 0), cansimple.BEAT.pack(0xFFFFFFFF, 0xFF, 0xFF, 0)
+        beat, decides = cansimple.BEAT.pack(0, *self.heartbeat_state, 0), cansimple.BEAT.pack(0xFFFFFFFF, 0xFF, 0xFF, 0)
         nothing, any_of_it = bytes(cansimple.ESTIMATES.size), b"\xff" * cansimple.ERRORS.size
         return [
-            expected(of(cansimple.GET_ENCODER_ESTIMATES), number, nothing, nothing, position_at=0),
-            expected(of(cansimple.HEARTBEAT), number, beat, decides, lives=True),
-            expected(of(cansimple.GET_ERROR), number, bytes(cansimple.ERRORS.size), any_of_it),
+            expected_row(identifier(cansimple.GET_ENCODER_ESTIMATES), number, nothing, nothing, position_at=0),
+            expected_row(identifier(cansimple.HEARTBEAT), number, beat, decides, lives=True),
+            expected_row(identifier(cansimple.GET_ERROR), number, bytes(cansimple.ERRORS.size), any_of_it),
         ]
 
     def input_pos(self, position: float, velocity: float) -> bytes:
-        """Set_Input_Pos of a setpoint [m], [m/s]; OverflowError or struct.error where it holds none such."""
+        """Return Set_Input_Pos of a setpoint [m], [m/s]; OverflowError or struct.error if it does not fit."""
         return cansimple.input_pos(self.scale.exact(position), self.scale.counts_per_metre * velocity)
 
-    def on_version(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002  one signature for all
-        """Get_Version."""
-        _, line, number, variant, major, minor, revision, unreleased = cansimple.VERSION.unpack(data)
-        self.version = Version((line, number, variant), (major, minor, revision), bool(unreleased))
+    def with_setup_listener(self, number: int, handler: Handler) -> Handler:
+        """Return a handler that passes messages of this number to a running set-up as well."""
+        identifier = cansimple.identifier(self.node, number)
 
-    def on_sdo(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """TxSdo: the value of an endpoint that was asked for; its length is the endpoint's."""
-        _, endpoint, _ = cansimple.SDO.unpack_from(data)
-        self.sdo = endpoint, bytes(data[cansimple.SDO.size :])
+        def handle(data: bytearray, now: float) -> None:
+            if self.setup_listener is not None:
+                self.setup_listener(identifier, data)
+            handler(data, now)
+
+        return handle
+
+    def ignore_answer(self, data: bytes | bytearray, now: float) -> None:
+        """Do nothing: only set-up needs this message, and gets it from `with_setup_listener`."""
+
+    def set_up(self, turns: float, errors: int, state: int) -> None:
+        """Adopt the state that the drive had at the end of its set-up."""
+        self.position = self.scale.metres(turns)
+        self.state, self.reported, self._started = state, True, True
+        self.note_request(AxisState.IDLE)
+        self._update_errors(errors)
+
+    def rejoin(self, now: float) -> None:
+        """Take part in the cycle again after a set-up in the background."""
+        self.restarted = self.silent = self.powered_up = False
+        self.heard = now
+        self.clear_missed()
+
+    def forget_power_state(self) -> None:
+        """Forget the last reported power state; the set-up requests it."""
+        self.state, self.requested = AxisState.UNDEFINED, None
 
     def on_estimates(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Get_Encoder_Estimates: the position when the request came."""
+        """Handle Get_Encoder_Estimates: the position at the arrival of the request."""
         turns, _ = cansimple.ESTIMATES.unpack(data)
+        if not self.configured:  # one that boots does not know its position yet
+            return
         self.answer()
         if math.isfinite(turns):
             self.position = self.scale.metres(turns)
@@ -103,39 +123,41 @@ class OdriveAxis(Axis):
             self.note_fault("frame", 0, f"position estimate is {turns}: has its encoder been calibrated?")
 
     def on_errors(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Get_Error: active errors and disarm reason."""
+        """Handle Get_Error: active errors and disarm reason."""
         active, reason = cansimple.ERRORS.unpack(data)
         self.reported = True
-        self._take_errors(active | reason)
+        self._update_errors(active | reason)
 
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
-        """Heartbeat: the drive lives; its state, errors and how the last procedure ended."""
+        """Handle a heartbeat: axis state, errors and procedure result."""
         errors, self.state, self._result, _ = cansimple.BEAT.unpack(data)
         self.heard = now
         self._beats += 1
-        self._take_errors(errors)
+        self._update_errors(errors)
+        if not cansimple.is_starting(self.state, errors):
+            self._started = True
         if self.state == AxisState.CLOSED_LOOP_CONTROL:
             if self.requested is AxisState.CLOSED_LOOP_CONTROL:
                 self.powered_up = True
-            elif self.obeys:
-                self.requested = None  # it still has power: tell it again
-        elif self.requested is AxisState.CLOSED_LOOP_CONTROL and self.obeys and not self.powered_up:
+            elif self.state_is_current:
+                self.requested = None  # it still has power: request idle again
+        elif self.requested is AxisState.CLOSED_LOOP_CONTROL and self.state_is_current and not self.powered_up:
             self._watch_refusal()
 
     def note_request(self, state: AxisState) -> None:
-        """Note that the drive was asked for a state."""
+        """Record that a state was requested of the drive."""
         self.requested = state
         self._beats = 0
 
-    def forgive(self, now: float) -> None:
-        """Forget what happened, but not what lasts, and allow time for errors to be cleared."""
-        if not self._restarted:
+    def clear_faults(self, now: float) -> None:
+        """Forget the latched event, not a lasting condition, and allow time for errors to be cleared."""
+        if self.configured:
             self.event = None
         if self.errors:
             self.reset_until = now + RESET_TIME
 
     def power(self, follows: bool) -> PowerState:
-        """The state as CiA 402 has it; `follows` tells whether it is to follow setpoints, rather than to stop."""
+        """Return the state in terms of CiA 402; `follows`: it should follow setpoints and is not stopping."""
         match self.state:
             case AxisState.UNDEFINED:
                 return PowerState.NOT_READY_TO_SWITCH_ON
@@ -153,47 +175,48 @@ class OdriveAxis(Axis):
         """Whether there may be current in its motor."""
         return self.state not in (AxisState.UNDEFINED, AxisState.IDLE)
 
-    def fault(self, now: float, follows: bool) -> DriveFault | None:
-        """What is wrong with the drive at time `now`, given whether it is to follow setpoints."""
+    def find_fault(self, now: float, follows: bool) -> DriveFault | None:
+        """Return the drive's fault at time `now` [s]; `follows`: it should follow setpoints."""
         if self.event is not None:
             return self.event
         if self.errors and now >= self.reset_until:
-            return self.made("fault", self.errors, f"error {words(self.errors)}")
-        if silent := self.silence(now):
+            return self.make_fault("fault", self.errors, f"error {describe_errors(self.errors)}")
+        if silent := self.silence_fault(now):
             return silent
         if self.state in cansimple.PROCEDURES:
-            return self.made("state", 0, f"is in {cansimple.state_name(self.state)}, on whoever's command")
+            text = f"runs {cansimple.state_name(self.state)}, which the service did not request"
+            return self.make_fault("state", 0, text)
         if follows and self.powered_up and self.state != AxisState.CLOSED_LOOP_CONTROL:
-            return self.made("state", 0, f"left closed loop control unasked: {cansimple.state_name(self.state)}")
+            text = f"left closed loop control by itself: it is in {cansimple.state_name(self.state)}"
+            return self.make_fault("state", 0, text)
         return None
 
-    def late_for(self, wanted: str, seconds: float) -> DriveFault | None:
-        """What is wrong where `seconds` [s] after it was `wanted` to lose its power the drive has not."""
+    def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
+        """Return the fault of a drive that still has power `seconds` [s] after `wanted`, as "quick stop"."""
         if not self.powered:
             return None
-        text = f"is in {cansimple.state_name(self.state)} {seconds:g} s after {wanted}; idle was expected"
-        return self.made("timeout", 0, text)
+        text = f"is in {cansimple.state_name(self.state)} {seconds:g} s after {wanted}; expected idle"
+        return self.make_fault("timeout", 0, text)
 
     @property
-    def obeys(self) -> bool:
-        """Enough heartbeats have come since the last request for the newest to be an answer to it."""
+    def state_is_current(self) -> bool:
+        """Whether the newest heartbeat was sent after the drive got the last request."""
         return self._beats > STALE_HEARTBEATS
 
-    def _take_errors(self, errors: int) -> None:
+    def _update_errors(self, errors: int) -> None:
         self.errors = errors
         if not errors:
             self.reset_until = -math.inf
-        self._watch_restart()
+        # A drive that has started shows INITIALIZING or an undefined state only after another boot.
+        if self._started and cansimple.is_starting(self.state, errors):
+            self._note_restart()
 
-    def _watch_restart(self) -> None:
-        """A drive that begins anew may have lost count of its turns."""
-        begins = self.state == AxisState.UNDEFINED or bool(self.errors & cansimple.Error.INITIALIZING)
-        if not begins:
-            self._initialised = True
-        elif self._initialised:
-            self._restarted = True
-            # Takes the place of an earlier event, for it is the one that a reset cannot help.
-            self.event = self.made("state", 0, "has restarted and may have lost its position; restart the service")
+    def _note_restart(self) -> None:
+        """Note that the drive boots: it may be another one, or have lost its settings and its position."""
+        self._started, self.state = False, AxisState.UNDEFINED
+        self.restarted, self.boots = True, self.boots + 1
+        # Replaces an earlier event: a restart explains it.
+        self.event = self.make_fault("state", 0, "has restarted: wait until its settings are checked, then send reset")
 
     def _watch_refusal(self) -> None:
         if self._result in (ProcedureResult.SUCCESS, ProcedureResult.BUSY):

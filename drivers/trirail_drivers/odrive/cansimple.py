@@ -1,4 +1,4 @@
-"""ODrive's CANSimple messages as bytes: identifiers, layouts, states, errors, and what they put on the bus.
+"""ODrive's CANSimple messages as bytes: identifiers, layouts, states, errors, bus traffic.
 
 Layouts are those of firmware 0.6, from ODrive's manual, chapter "CAN Protocol": little-endian, floats of 32 bits,
 positions in turns of the encoder that the axis loads.
@@ -20,6 +20,7 @@ ESTOP: Final = 0x02
 GET_ERROR: Final = 0x03
 RX_SDO: Final = 0x04
 TX_SDO: Final = 0x05
+ADDRESS: Final = 0x06
 SET_AXIS_STATE: Final = 0x07
 GET_ENCODER_ESTIMATES: Final = 0x09
 SET_CONTROLLER_MODE: Final = 0x0B
@@ -32,6 +33,8 @@ BEAT: Final = Struct("<IBBBx")
 """Heartbeat: axis error, axis state, procedure result, trajectory done flag."""
 ERRORS: Final = Struct("<II")
 """Get_Error: active errors, disarm reason."""
+SERIAL_AT: Final = slice(1, 7)
+"""Address: node id, serial number of 48 bits; newer firmware has a connection id behind them."""
 SDO: Final = Struct("<BHB")
 """RxSdo: opcode, endpoint, reserved; TxSdo: reserved, endpoint, reserved. The value follows, in its endpoint's type."""
 READ: Final = 0
@@ -75,7 +78,7 @@ ERROR_PERIOD: Final = 0.01
 
 
 class AxisState(IntEnum):
-    """States of an ODrive axis that this driver tells apart; all other states are procedures of the drive's own."""
+    """States of an ODrive axis that this driver distinguishes; all others are procedures of the drive's own."""
 
     UNDEFINED = 0
     IDLE = 1
@@ -101,7 +104,7 @@ PROCEDURES: Final = {
 
 
 class ProcedureResult(IntEnum):
-    """How the last procedure of an axis, or its way into closed loop control, ended."""
+    """Result of an axis' last procedure, or of its transition into closed loop control."""
 
     SUCCESS = 0
     BUSY = 1
@@ -149,17 +152,17 @@ class Error(IntFlag):
 
 
 def identifier(node: int, command: int) -> int:
-    """The 11-bit identifier of one node's command."""
+    """Return the 11-bit identifier of one node's command."""
     return node << 5 | command
 
 
 def command(node: int, number: int, data: bytes) -> Frame:
-    """A message to one node."""
+    """Return a message to one node."""
     return Frame(identifier(node, number), data)
 
 
 def request(node: int, number: int) -> Frame:
-    """A remote frame, on which the node sends the message of that number.
+    """Return a remote frame, on which the node sends the message of that number.
 
     ODrives take an empty data frame for a request as well. But that would collide, bit by bit, with a message that
     the drive sends by itself at this moment; a remote frame lets that one go first (ISO 11898-1).
@@ -168,12 +171,23 @@ def request(node: int, number: int) -> Frame:
 
 
 def input_pos(position: float, velocity: float) -> bytes:
-    """Set_Input_Pos of `position` [turns] and `velocity` [turns/s]; OverflowError or struct.error if beyond them."""
+    """Return Set_Input_Pos of a position [turns], velocity [turns/s]; OverflowError or struct.error if out of range."""
     return INPUT_POS.pack(position, round(velocity / VELOCITY_STEP), 0)
 
 
+def serial_number(address: bytes) -> int | None:
+    """Return the serial number in an Address message; None where it is too short for one."""
+    data = address[SERIAL_AT]
+    return int.from_bytes(data, "little") if len(data) == SERIAL_AT.stop - SERIAL_AT.start else None
+
+
+def is_starting(state: int, errors: int) -> bool:
+    """Whether an axis state, or error bits, are those of a drive that boots."""
+    return state == AxisState.UNDEFINED or bool(errors & Error.INITIALIZING)
+
+
 def state_name(state: int) -> str:
-    """An axis state in words."""
+    """Return an axis state in words."""
     if state in PROCEDURES:
         return PROCEDURES[state]
     try:
@@ -183,14 +197,14 @@ def state_name(state: int) -> str:
 
 
 def error_names(errors: int) -> str:
-    """The errors whose bits are set, as ODrive's own tools write them."""
+    """Return the names of the errors whose bits are set, as ODrive's own tools write them."""
     names = [error.name or "" for error in Error if errors & error]
     unknown = errors & ~sum(Error)
     return ", ".join([*names, *([f"unknown error {unknown:08X}"] if unknown else [])])
 
 
 def _background(heartbeat: float) -> float:
-    """Bits per second of error requests, their answers, and three heartbeats of this period [s]."""
+    """Return the bits per second of error requests, their answers, and three heartbeats of this period [s]."""
     return (frame_bits(0) + frame_bits(ERRORS.size)) / ERROR_PERIOD + 3 * frame_bits(BEAT.size) / heartbeat
 
 
@@ -201,5 +215,5 @@ TRAFFIC: Final = Traffic(
 )
 """One cycle: three setpoints, three requests, three encoder estimates.
 
-Sent are at most those setpoints and requests, a mode and a state for each drive, and an error request.
+At most the service sends those setpoints and requests, a mode and a state for each drive, and an error request.
 """

@@ -1,4 +1,4 @@
-"""Refuses settings that no ODrive could carry out."""
+"""Checks of the configuration that are specific to ODrives."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from trirail_drivers.config import Drive, Drives
-from trirail_drivers.driver.requirements import Requirements, Rule, resolution
+from trirail_drivers.driver.requirements import Requirements, Rule, resolution_rules
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES
@@ -16,8 +16,7 @@ from trirail_drivers.odrive import flat_endpoints, setup
 from trirail_drivers.odrive.cansimple import MAX_FEED_FORWARD
 
 _FLOAT_DIGITS: Final = 23
-"""Binary digits of an ODrive's position after the first, a 32-bit float."""
-
+"""Fraction bits of an ODrive's position, a 32-bit float."""
 
 _CANOPEN_ONLY: Final = {
     "homing": "homing is CiA 402's, an ODrive must know its position at power-on; leave the table out",
@@ -27,7 +26,7 @@ _CANOPEN_ONLY: Final = {
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield what refuses settings that a drive has not, cannot be told or cannot resolve."""
+    """Yield checks for settings that an ODrive does not have, or whose values it cannot take or resolve."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         for key in _CANOPEN_ONLY:
             yield Rule(f"drives.{name}.{key}", (), partial(_check_canopen_only, name, drive, key))
@@ -36,13 +35,13 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
         counts, scale = f"drives.{name}.counts_per_metre", (f"drives.{name}.offset", f"drives.{name}.direction")
         yield Rule(counts, scale, partial(scale_of, name, drive))
         farthest = max(abs(required.low[leg] - drive.offset), abs(required.high[leg] - drive.offset))
-        yield from resolution(name, drive, drives, required, farthest * 2.0**-_FLOAT_DIGITS, _nearer)
+        yield from resolution_rules(name, drive, drives, required, farthest * 2.0**-_FLOAT_DIGITS, _offset_remedy)
         fastest = required.velocity[leg]
         yield Rule("limits.slider.velocity", (counts,), partial(_check_feed_forward, name, drive, fastest))
 
 
 def files(drives: Drives) -> Iterator[Rule]:
-    """Yield what refuses a flat_endpoints.json that is not there, or is none."""
+    """Yield checks for a flat_endpoints.json that is missing or invalid."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.endpoints is not None:
             yield Rule(f"drives.{name}.endpoints", (), partial(flat_endpoints.read, name, Path(drive.endpoints)))
@@ -51,20 +50,20 @@ def files(drives: Drives) -> Iterator[Rule]:
 def _check_canopen_only(name: str, drive: Drive, key: str) -> None:
     value = getattr(drive, key)
     if value:
-        said = f" = {value}" if isinstance(value, str) else ""
-        raise DriveError(f"drives.{name}.{key}{said}: {_CANOPEN_ONLY[key]}")
+        shown = f" = {value}" if isinstance(value, str) else ""
+        raise DriveError(f"drives.{name}.{key}{shown}: {_CANOPEN_ONLY[key]}")
 
 
-def _nearer(widest: float) -> str:
-    return f"wanted an offset nearer to the travel than {widest * 2**_FLOAT_DIGITS:g} m"
+def _offset_remedy(widest: float) -> str:
+    return f"wanted an offset within {widest * 2**_FLOAT_DIGITS:g} m of the travel"
 
 
 def _check_feed_forward(name: str, drive: Drive, velocity: float) -> None:
-    """CANSimple has 16 bits for the velocity feed-forward; without it an ODrive lags out of its window."""
+    """Check that the velocity fits CANSimple's 16-bit feed-forward; without it an ODrive lags out of its window."""
     turns = velocity * drive.counts_per_metre
     if turns > MAX_FEED_FORWARD:
         raise DriveError(
             f"limits.slider.velocity = {velocity:g}: with drives.{name}.counts_per_metre = "
-            f"{drive.counts_per_metre:g} that is {turns:g} turns/s, and an ODrive's feed-forward ends at "
+            f"{drive.counts_per_metre:g} that is {turns:g} turns/s, beyond the limit of an ODrive's feed-forward, "
             f"{MAX_FEED_FORWARD:g}; lower the velocity, or use a longer lead"
         )

@@ -1,15 +1,15 @@
-"""Which number each setting of an ODrive has, by its firmware: the maker's flat_endpoints.json.
+"""Endpoint numbers of an ODrive's settings, by firmware: the maker's flat_endpoints.json.
 
-The numbers change with every firmware, and with the hardware. Those that are used here are in endpoints.json beside
-this module, for the firmwares whose table is at hand; for others a user names his drive's file, `endpoints`. A number
-that is another setting's would be read, or written, without any error: so the versions have to be the same.
+The numbers change with every firmware and hardware. endpoints.json beside this module has those that are used here,
+for known firmwares; for any other, the configuration names the drive's file, `endpoints`. A wrong number reads or
+writes another setting without any error, so the versions must match.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import msgspec
 from msgspec import Struct
@@ -21,7 +21,7 @@ DOWNLOADS: Final = "docs.odriverobotics.com/releases/firmware"
 
 
 class Version(NamedTuple):
-    """What Get_Version tells."""
+    """Hardware and firmware version of a drive."""
 
     hardware: tuple[int, int, int]
     """Product line, version, variant."""
@@ -29,42 +29,54 @@ class Version(NamedTuple):
     """Major, minor, revision."""
     unreleased: bool = False
 
+    @classmethod
+    def from_fields(cls, protocol: int, *numbers: int) -> Self:  # noqa: ARG003  it has been 2 with every firmware since 0.6
+        """Return the version from the fields of Get_Version, `cansimple.VERSION`."""
+        line, number, variant, major, minor, revision, unreleased = numbers
+        return cls((line, number, variant), (major, minor, revision), bool(unreleased))
+
     @property
-    def words(self) -> str:
-        """For people."""
+    def dotted(self) -> tuple[str, str]:
+        """Firmware and hardware version, as 0.6.10 and 5.2.0."""
+        development = "-dev" if self.unreleased else ""
+        return _dotted(self.firmware) + development, _dotted(self.hardware)
+
+    @property
+    def description(self) -> str:
+        """Description for people."""
         development = ", a development version" if self.unreleased else ""
         return f"firmware {_dotted(self.firmware)}{development} on hardware {_dotted(self.hardware)}"
 
 
 class Endpoint(Struct, frozen=True):
-    """A setting."""
+    """Number and type of a setting."""
 
     id: int
     type: str = ""
 
 
 class Table(Struct, frozen=True):
-    """What is used of a flat_endpoints.json."""
+    """Used part of a flat_endpoints.json."""
 
     fw_version: str
     hw_version: str
     endpoints: dict[str, Endpoint]
 
-    def is_of(self, version: Version) -> bool:
-        """Whether it is of a drive, as the maker's own examples compare it."""
+    def matches(self, version: Version) -> bool:
+        """Whether the table is for a drive of this version, compared as in the maker's own examples."""
         same = self.fw_version.partition("-")[0] == _dotted(version.firmware)
         return same and self.hw_version == _dotted(version.hardware)
 
 
-class _Known(Struct, frozen=True):
+class _KnownTables(Struct, frozen=True):
     tables: tuple[Table, ...]
 
 
 _DECODER: Final = msgspec.json.Decoder(Table)
-KNOWN: Final[tuple[Table, ...]] = msgspec.json.decode(
-    Path(__file__).with_name("endpoints.json").read_bytes(), type=_Known
+KNOWN_TABLES: Final[tuple[Table, ...]] = msgspec.json.decode(
+    Path(__file__).with_name("endpoints.json").read_bytes(), type=_KnownTables
 ).tables
-"""The firmwares whose table is at hand."""
+"""Tables of the known firmwares."""
 _DECODER.decode(b'{"fw_version": "", "hw_version": "", "endpoints": {}}')  # before there are threads
 
 
@@ -74,24 +86,24 @@ def read(name: str, path: Path) -> Table:
     try:
         return _DECODER.decode(files.text(path))
     except FileError as error:
-        raise DriveError(f"{key}: {error}; the maker has one for each firmware: {DOWNLOADS}") from error
+        raise DriveError(f"{key}: {error}; download the one for your firmware: {DOWNLOADS}") from error
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise DriveError(f"{key}: {path} is no flat_endpoints.json ({error}); the maker's: {DOWNLOADS}") from error
+        raise DriveError(f"{key}: {path} is no flat_endpoints.json ({error}); download it: {DOWNLOADS}") from error
 
 
-def of(name: str, version: Version, own: str | None) -> Mapping[str, Endpoint] | None:
-    """Return the settings of a drive of a version by their paths; None where nobody knows their numbers.
+def endpoints_of(name: str, version: Version, own: str | None) -> Mapping[str, Endpoint] | None:
+    """Return the endpoints of a drive's settings by path; None for an unknown firmware.
 
-    `own` is the file that the configuration names. Raises DriveError where that is none, or another drive's.
+    `own` is the file that the configuration names. Raises DriveError if it is invalid or for another version.
     """
     if own is None:
-        known = (table.endpoints for table in KNOWN if table.is_of(version) and not version.unreleased)
+        known = (table.endpoints for table in KNOWN_TABLES if table.matches(version) and not version.unreleased)
         return next(known, None)
     table = read(name, Path(own))
-    if not table.is_of(version):
+    if not table.matches(version):
         raise DriveError(
             f"drives.{name}.endpoints: {own} is for firmware {table.fw_version} on hardware {table.hw_version}, "
-            f"and the drive has {version.words}: get the one for it from {DOWNLOADS}"
+            f"but the drive has {version.description}; get its file from {DOWNLOADS}"
         )
     return table.endpoints
 

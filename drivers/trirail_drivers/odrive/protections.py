@@ -1,4 +1,4 @@
-"""What an ODrive must have been set to, and what is so where it is not: judged from its settings, read by RxSdo."""
+"""Settings that an ODrive must have, checked by RxSdo, and the consequences if it lacks them."""
 
 from __future__ import annotations
 
@@ -18,64 +18,79 @@ CYCLIC: Final = tuple(
     f"axis0.config.can.{name}_msg_rate_ms"
     for name in ("version", "encoder", "iq", "error", "temperature", "bus_voltage", "torques", "powers")
 )
-SETTINGS: Final = (WATCHDOG, WATCHDOG_TIMEOUT, SCALE, HEARTBEAT, *CYCLIC)
-NEEDED: Final = frozenset((WATCHDOG, WATCHDOG_TIMEOUT, HEARTBEAT))
-"""Every firmware since 0.6 has these; older ones lack some of the others, which then are off, or the default."""
-LEAST_PERIODS: Final = 3
-"""A watchdog that is shorter than so many cycles ends motion where one is late."""
-_ROUNDED: Final = 1e-6
-"""Times are told as floats of 32 bits."""
+POSITION_STATUS: Final = "axis0.pos_vel_mapper.status"
+RELATIVE_MODE: Final = 9
+"""Value of POSITION_STATUS if positions count from the place at which the drive was switched on."""
+RELATIVE: Final = (
+    f"{POSITION_STATUS} is {RELATIVE_MODE}, relative: its position is lost with its supply; use an absolute encoder, "
+    "or home it by odrivetool before each start of the service"
+)
+"""Note on a drive with RELATIVE_MODE."""
+SETTINGS: Final = (WATCHDOG, WATCHDOG_TIMEOUT, SCALE, HEARTBEAT, *CYCLIC, POSITION_STATUS)
+REQUIRED: Final = frozenset((WATCHDOG, WATCHDOG_TIMEOUT, HEARTBEAT))
+"""Settings that every firmware since 0.6 has; early ones lack some of the others, which then are off or default."""
+MIN_WATCHDOG_CYCLES: Final = 3
+"""Shortest watchdog [cycles]: a shorter one disarms the drive when a single cycle is late."""
+_FLOAT32_TOLERANCE: Final = 1e-6
+"""Relative error of times, which are 32-bit floats."""
 Settings = Mapping[str, float]
-"""Those that a drive has, by their paths; seconds, milliseconds, 1 for true."""
+"""Settings of a drive by path, in the drive's units; 1 for true."""
 
 
 class Protection(NamedTuple):
-    """What a setting protects."""
+    """Purpose of a required setting, and the consequence if it is missing, for people."""
 
     purpose: str
     without: str
 
 
 PROTECTIONS: Final = {
-    "endpoints": Protection("the numbers of its settings", "none of them is looked at"),
-    "enable_watchdog": Protection("its stop when it hears nobody", "it goes on as it was told last"),
-    "input_vel_scale": Protection("the unit of the velocity feed-forward", "it is too much or too little"),
-    "heartbeat_msg_rate_ms": Protection("this service's watch on it", "it is told late, or loads the bus"),
-    "cyclic_messages": Protection("positions in answer to requests alone", "they come uncounted, of any age"),
+    "endpoints": Protection("the endpoint numbers of its settings", "none of them is checked"),
+    "enable_watchdog": Protection("its stop when the host is silent", "it continues with the last setpoint"),
+    "input_vel_scale": Protection("the unit of the velocity feed-forward", "the feed-forward has the wrong size"),
+    "heartbeat_msg_rate_ms": Protection("this service's watch on it", "its loss is seen late, or it loads the bus"),
+    "cyclic_messages": Protection("positions only in answer to requests", "positions of unknown age arrive"),
 }
-"""What `accept_without` may name for an ODrive."""
+"""Protections that `accept_without` may name for an ODrive."""
 
 
-def means(protection: str) -> str:
-    """What a protection is for, and what is so without, for people."""
+def describe_protection(protection: str) -> str:
+    """Return a protection's purpose and the consequence of lacking it, for people."""
     used = PROTECTIONS[protection]
     return f"{used.purpose}; without: {used.without}"
 
 
-def lacking(settings: Settings | None, drives: Drives) -> dict[str, str]:
-    """Return the protections that a drive lacks with these settings, each with why; None where they are not known."""
+def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, str]:
+    """Return the protections that a drive lacks, each with the reason; `settings` is None for an unknown firmware."""
     if settings is None:
-        return {"endpoints": "its firmware is not known here; endpoints names its flat_endpoints.json"}
-    found = {}
+        return {"endpoints": "its firmware is unknown; set endpoints to its flat_endpoints.json"}
+    reasons = {}
     longest = MISSED_HEARTBEATS * drives.heartbeat
     if not settings[WATCHDOG]:
-        found["enable_watchdog"] = f"{WATCHDOG} is False"
-    elif not settings[WATCHDOG_TIMEOUT] <= longest * (1.0 + _ROUNDED):
-        found["enable_watchdog"] = f"{WATCHDOG_TIMEOUT} is {settings[WATCHDOG_TIMEOUT]:g} s, wanted {longest:g} at most"
+        reasons["enable_watchdog"] = f"{WATCHDOG} is False"
+    elif not settings[WATCHDOG_TIMEOUT] <= longest * (1.0 + _FLOAT32_TOLERANCE):
+        reasons["enable_watchdog"] = f"{WATCHDOG_TIMEOUT} is {settings[WATCHDOG_TIMEOUT]:g} s, wanted <= {longest:g} s"
     if (scale := settings.get(SCALE, VELOCITY_SCALE)) != VELOCITY_SCALE:
-        found["input_vel_scale"] = f"{SCALE} is {scale:g}, wanted {VELOCITY_SCALE}"
+        reasons["input_vel_scale"] = f"{SCALE} is {scale:g}, wanted {VELOCITY_SCALE}"
     if settings[HEARTBEAT] != (wanted := round(1000 * drives.heartbeat)):
-        found["heartbeat_msg_rate_ms"] = f"{HEARTBEAT} is {settings[HEARTBEAT]:g}, wanted {wanted}, drives.heartbeat"
+        reasons["heartbeat_msg_rate_ms"] = f"{HEARTBEAT} is {settings[HEARTBEAT]:g}, wanted {wanted}, drives.heartbeat"
     if on := [f"{path} is {settings[path]:g}" for path in CYCLIC if settings.get(path)]:
-        found["cyclic_messages"] = f"{', '.join(on)}, wanted 0"
-    return found
+        reasons["cyclic_messages"] = f"{', '.join(on)}, wanted 0"
+    return reasons
+
+
+def is_relative(settings: Settings | None) -> bool:
+    """Whether a drive reports that it loses its position with its supply; without a report it is taken to keep it."""
+    return settings is not None and settings.get(POSITION_STATUS) == RELATIVE_MODE
 
 
 def check_watchdog(name: str, settings: Settings | None, period: float) -> None:
-    """Refuse with DriveError a watchdog by which one late cycle of `period` [s] would end motion."""
-    least = LEAST_PERIODS * period
-    if settings is not None and settings[WATCHDOG] and not settings[WATCHDOG_TIMEOUT] >= least * (1.0 - _ROUNDED):
+    """Raise DriveError for a watchdog that a single late cycle of `period` [s] would trigger."""
+    least = MIN_WATCHDOG_CYCLES * period
+    if settings is None or not settings[WATCHDOG]:
+        return
+    if not settings[WATCHDOG_TIMEOUT] >= least * (1.0 - _FLOAT32_TOLERANCE):
         raise DriveError(
-            f"drive {name}: {WATCHDOG_TIMEOUT} is {settings[WATCHDOG_TIMEOUT]:g} s, less than {LEAST_PERIODS} cycles; "
-            f"wanted {least:g} at least, with ODrive's own tools"
+            f"drive {name}: {WATCHDOG_TIMEOUT} is {settings[WATCHDOG_TIMEOUT]:g} s, less than {MIN_WATCHDOG_CYCLES} "
+            f"cycles; set at least {least:g} s with odrivetool"
         )

@@ -1,4 +1,4 @@
-"""What three ODrives are to follow, and the ramp down which a quick stop leads it."""
+"""Setpoints of three ODrives, and their ramp in a quick stop."""
 
 from __future__ import annotations
 
@@ -8,51 +8,51 @@ from collections.abc import Sequence
 from typing import Final
 
 from trirail_drivers.bus.wire import Wire
-from trirail_drivers.driver.ramp import braked
+from trirail_drivers.driver.ramp import brake
 from trirail_drivers.interface import Triple
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
-SETTLING: Final = 0.05
-"""How long a drive holds at the end of a quick stop before its power is taken off, for its servo to catch up [s]."""
+SETTLE_TIME_S: Final = 0.05
+"""Time for which a drive holds at the end of a quick stop before its power is off, so that its servo catches up."""
 
 
 class SetpointSender:
-    """Sends the setpoints that were written; these, those sent last and the positions in force are in the axes."""
+    """Sender of the written setpoints. The axes hold them, those sent last, and the positions in force."""
 
     def __init__(self, axes: Sequence[OdriveAxis], wire: Wire, deceleration: float) -> None:
         """`deceleration` is that of the quick-stop ramp [m/s²]."""
         self.period = 0.0
-        """Of the cycle [s]."""
+        """Cycle period [s]."""
         self._axes = axes
         self._wire = wire
         self._deceleration = deceleration
-        self._braking: float | None = None
-        """Time since a quick stop has brought the setpoints to a standstill [s]; None where none is under way."""
+        self._standstill_time: float | None = None
+        """Time since the setpoints of a quick stop came to rest [s]; None if no quick stop is under way."""
 
     @property
     def stopping(self) -> bool:
         """Whether a quick stop is under way."""
-        return self._braking is not None
+        return self._standstill_time is not None
 
     @property
     def written(self) -> bool:
-        """Whether setpoints are to be sent at the next SYNC."""
+        """Whether setpoints wait for the next SYNC."""
         return not math.isnan(self._axes[0].wanted)
 
     @property
     def sent(self) -> bool:
-        """Whether drives have been sent setpoints since enabling."""
+        """Whether the drives have got setpoints since they were enabled."""
         return not math.isnan(self._axes[0].sent)
 
     def begin(self) -> None:
-        """Forget what was sent before the drives are to get power."""
-        self._braking = None
+        """Forget earlier setpoints, before the drives get power."""
+        self._standstill_time = None
         for axis in self._axes:
             axis.sent = axis.sent_rate = axis.in_force = math.nan
 
     def set_next(self, position: Triple, velocity: Triple) -> OdriveAxis | None:
-        """Take what is to be sent at the next SYNC; the axis whose message cannot hold it, if there is one."""
+        """Keep setpoints for the next SYNC; return the first axis whose message cannot hold its setpoint, or None."""
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             if not _is_sendable(axis, metres, rate):
                 return axis
@@ -61,31 +61,31 @@ class SetpointSender:
         return None
 
     def step(self, enabled: bool, sent: int = 0) -> int:
-        """Send what is due at a SYNC, where somebody else has sent so many frames; return how many frames are due."""
-        if self._braking is not None:
+        """Send the setpoints due at a SYNC, without the first `sent`, which are on the bus; return how many are due."""
+        if self._standstill_time is not None:
             self._brake()
-        # Without power none is sent: a drive that has missed losing it is to stay where the ramp has ended.
+        # Nothing is sent once disabled: a drive that missed the command must stay where the ramp has ended.
         if self.written and (enabled or self.stopping):
             self._send([(axis.wanted, axis.wanted_rate) for axis in self._axes], sent)
             return len(self._axes)
         return 0
 
     def stop(self) -> None:
-        """Begin to lead the drives down the ramp, now; they must have been sent setpoints."""
+        """Begin the ramp now, if the drives have got setpoints."""
         if not self.sent:
             return
-        self._braking = 0.0
-        # The position in force stays; what the drives are to run on with is less from now on.
-        self._send([(axis.in_force, self._braked(axis)[1]) for axis in self._axes])
+        self._standstill_time = 0.0
+        # The position in force stays; the velocity feed-forward falls from this moment on.
+        self._send([(axis.in_force, self._braked_setpoint(axis)[1]) for axis in self._axes])
         for axis in self._axes:
             axis.wanted = math.nan
 
     def abandon(self) -> None:
-        """Lead the drives down the ramp no longer."""
-        self._braking = None
+        """End the ramp."""
+        self._standstill_time = None
 
-    def _send(self, setpoints: Sequence[tuple[float, float]], taken: int = 0) -> None:
-        """Send setpoints, but for so many that the bus has taken; each is in force when it arrives."""
+    def _send(self, setpoints: Sequence[tuple[float, float]], sent: int = 0) -> None:
+        """Send setpoints, without the first `sent` ones, which are on the bus; each is in force on arrival."""
         for axis, (metres, rate) in zip(self._axes, setpoints, strict=True):
             axis.sent, axis.sent_rate = metres, rate
             if math.isnan(axis.in_force):
@@ -93,33 +93,33 @@ class SetpointSender:
         stopping = self.stopping
         for number, (axis, (metres, rate)) in enumerate(zip(self._axes, setpoints, strict=True)):
             data = axis.input_pos(metres, rate)
-            if number < taken or self._wire.send(cansimple.command(axis.node, cansimple.SET_INPUT_POS, data)):
+            if number < sent or self._wire.send(cansimple.command(axis.node, cansimple.SET_INPUT_POS, data)):
                 axis.in_force = metres
             else:
                 axis.setpoints_lost += 1
             if self.stopping != stopping:
-                return  # what could not be sent has begun a quick stop, whose setpoints are newer
+                return  # a failed send has begun a quick stop, whose setpoints are newer
 
     def _brake(self) -> None:
-        """One period further down the ramp; at its end, power off.
+        """Advance the ramp by one period; at its end, end the quick stop, which takes the power off.
 
-        Where the bus takes no setpoint the time goes on, but the place does not: a drive that hears nothing stands
-        soon, and is not to catch up with the ramp when the bus is back.
+        While the bus takes no setpoint, the ramp loses velocity but keeps its position: a drive without setpoints
+        soon stands, and must not catch up with the ramp when the bus is back.
         """
-        if not self.sent or self._braking is None:
+        if not self.sent or self._standstill_time is None:
             return
         moving = any(axis.sent_rate for axis in self._axes)
         for axis in self._axes:
-            axis.wanted, axis.wanted_rate = self._braked(axis)
+            axis.wanted, axis.wanted_rate = self._braked_setpoint(axis)
         if moving:
             return
-        self._braking += self.period
-        if self._braking > SETTLING:
-            self._braking = None
+        self._standstill_time += self.period
+        if self._standstill_time > SETTLE_TIME_S:
+            self._standstill_time = None
 
-    def _braked(self, axis: OdriveAxis) -> tuple[float, float]:
-        """The setpoint one period further down the ramp from that in force, of the velocity sent last."""
-        return braked(axis.in_force, axis.sent_rate, self._deceleration, self.period)
+    def _braked_setpoint(self, axis: OdriveAxis) -> tuple[float, float]:
+        """Return the setpoint one period down the ramp from the position in force, at the velocity sent last."""
+        return brake(axis.in_force, axis.sent_rate, self._deceleration, self.period)
 
 
 def _is_sendable(axis: OdriveAxis, metres: float, rate: float) -> bool:

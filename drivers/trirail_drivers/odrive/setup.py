@@ -1,41 +1,46 @@
-"""Finds the ODrives on the bus, takes their power off and reads how they are set, before the cycle runs.
+"""Set-up of ODrives, before the cycle or in its background: find them, take their power off, check their settings.
 
-Nothing is written: a drive must have been given by ODrive's own tools, and have saved,
+Nothing is written. These must have been set with ODrive's own tools, and saved:
 
-- `axis0.config.can.node_id`, `heartbeat_msg_rate_ms` as [drives] says, `encoder_msg_rate_ms = 0` and the other cyclic
-  messages off: the driver asks for what it needs, and nothing else takes a share of the bus;
-- `axis0.config.can.input_vel_scale = 1000`, which is the default;
-- `axis0.config.enable_watchdog = True` with a `watchdog_timeout` that bridges a few cycles. It is all that disarms a
-  drive whose host is gone, and every setpoint feeds it;
-- its gains, velocity and current limits, and a calibrated encoder whose position survives power-off.
+- `axis0.config.can.node_id`, `heartbeat_msg_rate_ms` as in [drives], `encoder_msg_rate_ms = 0` and the other cyclic
+  messages off: the driver requests what it needs, and nothing else loads the bus;
+- `axis0.config.can.input_vel_scale = 1000`, the default;
+- `axis0.config.enable_watchdog = True` with a `watchdog_timeout` that bridges a few cycles. Only the watchdog disarms
+  a drive whose host is gone; every setpoint feeds it;
+- gains, velocity and current limits, and a calibrated encoder that keeps its position without power.
 
-All but the last are read by RxSdo and TxSdo, and count as protections, see trirail_drivers.odrive.protections.
+All but the last are read by RxSdo and TxSdo, and count as protections: see trirail_drivers.odrive.protections.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import math
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
 
-from trirail_drivers.bus.frames import send_in_setup
-from trirail_drivers.bus.wire import Wire
-from trirail_drivers.config import Drives
+import can
+
+from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
-from trirail_drivers.driver.refusals import judged, raise_all
-from trirail_drivers.errors import DriveError, DriveTimeout
+from trirail_drivers.driver.conversations import run_concurrently
+from trirail_drivers.driver.refusals import raise_combined, review_protections
+from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock
 from trirail_drivers.odrive import cansimple, settings
-from trirail_drivers.odrive.asking import late
-from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
-from trirail_drivers.odrive.protections import PROTECTIONS, Settings, check_watchdog, lacking
+from trirail_drivers.odrive.client import OdriveClient
+from trirail_drivers.odrive.flat_endpoints import Version
+from trirail_drivers.odrive.protections import PROTECTIONS, RELATIVE, check_watchdog, is_relative, missing_protections
 
-OLDEST_FIRMWARE = (0, 6, 0)
-"""Since then errors and heartbeats are laid out as this driver reads them."""
+MIN_FIRMWARE: Final = (0, 6, 0)
+"""First firmware whose errors and heartbeats have the layout that this driver reads."""
+BOOT_TIMEOUTS: Final = 10
+"""Longest boot of a drive, as a multiple of `sdo_timeout`."""
 
 
 def check_nodes(drives: Drives) -> None:
-    """Refuse node ids that CANSimple does not have, or that two drives share, with DriveError."""
+    """Raise DriveError for node ids that CANSimple does not have, or that two drives share."""
     nodes = {f"drives.{name}.node": drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
     for key, node in nodes.items():
         if node not in cansimple.NODES:
@@ -44,79 +49,137 @@ def check_nodes(drives: Drives) -> None:
         raise DriveError(f"node ids must differ, but are {', '.join(f'{key} = {node}' for key, node in nodes.items())}")
 
 
-class Allowed(NamedTuple):
-    """What a drive does without, as its configuration allows."""
+class OdriveSetupTask(NamedTuple):
+    """Inputs of one drive's set-up."""
+
+    client: OdriveClient
+    drive: Drive
+    drives: Drives
+    period: float
+    """Cycle period [s]."""
+
+
+class OdriveIdentity(NamedTuple):
+    """Identity of a drive, from its own messages."""
+
+    version: Version
+    serial: int | None
+    """Serial number; None if its firmware has no Address message."""
+
+
+class OdriveSetup(NamedTuple):
+    """Result of a drive's set-up."""
 
     name: str
-    lacking: tuple[str, ...]
-    """Protections, as `accept_without` names them."""
+    identity: OdriveIdentity
+    relative: bool
+    """Whether its position is lost with its supply."""
+    missing_protections: tuple[str, ...]
+    """Protections that it lacks, as `accept_without` names them."""
     notes: tuple[str, ...]
     """Lines for people."""
 
 
+class OdriveStart(NamedTuple):
+    """State of a drive at the end of its set-up."""
+
+    turns: float
+    """Position estimate [turns]."""
+    errors: int
+    """Active errors and disarm reason."""
+    state: int
+    """Axis state."""
+
+
+def setup_tasks(bus: can.BusABC, drives: Drives, period: float, clock: Clock) -> list[OdriveSetupTask]:
+    """Return the set-up tasks of the three drives, for a cycle of `period` seconds."""
+    return [
+        OdriveSetupTask(OdriveClient(bus, name, drive.node, drives.sdo_timeout, clock), drive, drives, period)
+        for name, drive in zip(NAMES, drives.each, strict=True)
+    ]
+
+
 def configure(
-    wire: Wire, axes: Sequence[OdriveAxis], drives: Drives, period: float, clock: Clock
-) -> tuple[Allowed, ...]:
-    """Take power off, and see that every drive answers, lives, is set as it must be and knows its position.
+    bus: can.BusABC, each: Sequence[OdriveSetupTask], clock: Clock, *, awaits: bool = False
+) -> tuple[tuple[OdriveSetup, OdriveStart] | None, ...]:
+    """Set three drives up concurrently; with `awaits`, the result of one that does not answer is None.
 
-    Raises DriveError; of its kinds, DriveTimeout for a drive that does not answer. Errors of a drive are none here.
+    Raises DriveError for all drives together, DriveTimeout among them for a drive that does not answer.
     """
-    for axis in axes:
-        send_in_setup(
-            wire.bus, cansimple.command(axis.node, cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(AxisState.IDLE))
-        )
-        axis.note_request(AxisState.IDLE)
-        axis.sync_sent()
-        for number in (cansimple.GET_VERSION, cansimple.GET_ERROR, cansimple.GET_ENCODER_ESTIMATES):
-            send_in_setup(wire.bus, cansimple.request(axis.node, number))
-    for axis in late(wire, axes, clock, drives.sdo_timeout, _missing):
-        raise DriveTimeout(axis.name, f"answer to {_missing(axis)}", drives.sdo_timeout)
-    for axis in axes:
-        _check(axis)
-    done = _judge(axes, settings.read(wire, axes, drives, clock), drives, period)
-    timeout = MISSED_HEARTBEATS * drives.heartbeat
-    for axis in late(wire, axes, clock, timeout, _not_idle):
-        if axis.state == AxisState.UNDEFINED:
-            raise DriveTimeout(axis.name, "heartbeat (heartbeat_msg_rate_ms)", timeout)
-        raise DriveError(
-            f"drive {axis.name}: keeps its power on when told off (it is in {cansimple.state_name(axis.state)})"
-        )
-    return done
+
+    def progress() -> str:
+        answers = "; ".join(f"{one.client.name} {one.client.answered} answers" for one in each)
+        return f"set-up of the drives: {answers}"
+
+    ends = run_concurrently(bus, clock, [configure_one(one, lambda _: None) for one in each], progress)
+    kept = [None if awaits and isinstance(end, DriveAbsentError) else end for end in ends]
+    raise_combined([end for end in kept if isinstance(end, DriveError)])
+    return tuple(None if isinstance(end, DriveError) else end for end in kept)
 
 
-def _judge(
-    axes: Sequence[OdriveAxis], found: Sequence[Settings | None], drives: Drives, period: float
-) -> tuple[Allowed, ...]:
-    """Refuse drives whose settings are not as they must be, all in one; tell what their configuration accepts."""
-    done, refused = [], []
-    for axis, drive, read in zip(axes, drives.each, found, strict=True):
-        lacks = lacking(read, drives)
-        why, notes = judged(axis.name, lacks, drive.accept_without, PROTECTIONS)
-        refused += [DriveError(why)] if why else []
-        try:
-            check_watchdog(axis.name, read, period)
-        except DriveError as error:
-            refused.append(error)
-        done.append(Allowed(axis.name, tuple(lacks), tuple(notes)))
-    raise_all(refused)
-    return tuple(done)
+async def configure_one(
+    one: OdriveSetupTask, check: Callable[[OdriveIdentity], None]
+) -> tuple[OdriveSetup, OdriveStart]:
+    """Take a drive's power off; check that it answers, has the required settings and knows its position.
+
+    `check` raises for the wrong drive. Raises DriveError; DriveTimeout for a drive that does not answer,
+    DriveAbsentError for one that has answered nothing. A drive's own errors raise nothing here.
+    """
+    client, name = one.client, one.client.name
+    _command_idle(client)
+    answer = await client.request(cansimple.GET_VERSION, "Get_Version")
+    version = Version.from_fields(*_unpacked(client, cansimple.VERSION, answer))
+    if version.firmware < MIN_FIRMWARE:
+        raise DriveError(f"drive {name}: {version.description} is too old; update to 0.6.0 or newer")
+    state = await _wait_until_idle(one)
+    address = await client.try_request(cansimple.ADDRESS)
+    serial = None if address is None else cansimple.serial_number(address)
+    check(OdriveIdentity(version, serial))
+    read = await settings.read(client, version, one.drive.endpoints)
+    lacks = missing_protections(read, one.drives)
+    remedy = "set them with odrivetool" if read is not None else ""
+    refused, notes = review_protections(name, lacks, one.drive.accept_without, PROTECTIONS, remedy)
+    if refused:
+        raise DriveError(refused)
+    check_watchdog(name, read, one.period)
+    errors = _unpacked(client, cansimple.ERRORS, await client.request(cansimple.GET_ERROR, "Get_Error"))
+    estimates = await client.request(cansimple.GET_ENCODER_ESTIMATES, "Get_Encoder_Estimates")
+    turns, _ = _unpacked(client, cansimple.ESTIMATES, estimates)
+    if not math.isfinite(turns):
+        raise DriveError(f"drive {name}: position estimate is {turns}: has its encoder been calibrated?")
+    relative = is_relative(read)
+    notes += [RELATIVE] * relative
+    made = OdriveSetup(name, OdriveIdentity(version, serial), relative, tuple(lacks), tuple(notes))
+    return made, OdriveStart(turns, errors[0] | errors[1], state)
 
 
-def _missing(axis: OdriveAxis) -> str:
-    """What the drive has not answered yet, or ""."""
-    if axis.version is None:
-        return "Get_Version"
-    if not axis.reported:
-        return "Get_Error"
-    return "Get_Encoder_Estimates" if axis.age else ""
+def _command_idle(client: OdriveClient) -> None:
+    client.command(cansimple.SET_AXIS_STATE, cansimple.AXIS_STATE.pack(AxisState.IDLE))
 
 
-def _not_idle(axis: OdriveAxis) -> bool:
-    return axis.state != AxisState.IDLE
+async def _wait_until_idle(one: OdriveSetupTask) -> int:
+    """Wait until a heartbeat shows no power, for as long as a boot may take; return the axis state."""
+    client = one.client
+    begun, within = client.clock(), MISSED_HEARTBEATS * one.drives.heartbeat
+    state: int | None = None
+    while True:
+        data = await client.heartbeat(begun + within)
+        if data is None and state is None:
+            raise DriveTimeout(client.name, "heartbeat (heartbeat_msg_rate_ms)", within)
+        if data is None:
+            name = cansimple.state_name(state or 0)
+            raise DriveError(f"drive {client.name}: does not take its power off: it is in {name}, expected idle")
+        errors, state, _, _ = _unpacked(client, cansimple.BEAT, data)
+        if cansimple.is_starting(state, errors):
+            within = max(within, BOOT_TIMEOUTS * client.timeout)
+        elif state == AxisState.IDLE:
+            return state
+        else:  # again with every heartbeat, since the command may be lost
+            _command_idle(client)
 
 
-def _check(axis: OdriveAxis) -> None:
-    if axis.version is not None and axis.version.firmware < OLDEST_FIRMWARE:
-        raise DriveError(f"drive {axis.name}: it has {axis.version.words}; wanted firmware 0.6.0 or newer")
-    if axis.event is not None:
-        raise DriveError(axis.event.message)
+def _unpacked(client: OdriveClient, layout: struct.Struct, data: bytes) -> tuple[Any, ...]:
+    try:
+        return layout.unpack(data)
+    except struct.error as error:
+        raise DriveError(f"drive {client.name}: a message has wrong length {len(data)}") from error

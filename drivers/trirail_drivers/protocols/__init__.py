@@ -1,4 +1,4 @@
-"""The protocols that drives may speak: the one place where all of them are named."""
+"""The protocols of drives; only this module lists all of them."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -9,6 +9,6 @@ from trirail_drivers.protocols.odrive import ODRIVE
 from trirail_drivers.protocols.protocol import Protocol
 
 PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType({each.name: each for each in (CIA402, ODRIVE)})
-"""Each protocol by the name that `drives.protocol` has for it."""
+"""Protocols by their names in `drives.protocol`."""
 
 __all__ = ["CIA402", "ODRIVE", "PROTOCOLS", "Protocol"]

@@ -1,4 +1,4 @@
-"""CiA 402 drives on CANopen, as a protocol."""
+"""The protocol CiA 402 on CANopen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail_drivers.cia402 import canopen_frames, checks, units
 from trirail_drivers.cia402.backup import restore, save
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.inspection import inputs, inspect
-from trirail_drivers.cia402.objects import PROTECTIONS, means
+from trirail_drivers.cia402.objects import PROTECTIONS, describe_protection
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Mechanics, Servo, SimulatedDevice, SimulatedDrive
 
@@ -21,9 +21,9 @@ def _simulated_drive(
     drive: config.Drive,
     start: float,
 ) -> SimulatedDevice:
-    """A drive that is to be homed counts from 0 at power-on, and has its home switch at zero counts of [drives].
+    """Return a simulated drive; one with homing counts from 0 at power-on, its switch at zero counts of [drives].
 
-    Without its maker's EDS it has the objects that the configuration writes, and they do nothing.
+    Without its maker's EDS it has the objects that the configuration writes, without any function.
     """
     counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
     switch = None if drive.homing is None else -counts
@@ -36,11 +36,11 @@ def _simulated_drive(
 
 
 def mechanics_of(drive: config.Drive) -> Mechanics:
-    """The axis as it is configured: what of the drive's units its dictionary does not tell."""
+    """Return the configured axis: those units of the drive that its dictionary does not report."""
     counts, revolutions = drive.counts_per_metre, drive.revolutions_per_metre
 
     def fixed(key: str, text: str | None, power: int) -> float:
-        per_metre = units.written(key, text, power).per_metre(counts, revolutions) if text is not None else None
+        per_metre = units.parse_unit(key, text, power).per_metre(counts, revolutions) if text is not None else None
         return counts / per_metre if per_metre is not None else 1.0
 
     configured = ((0x60A9, drive.velocity_unit), (0x60AA, drive.acceleration_unit))
@@ -49,7 +49,7 @@ def mechanics_of(drive: config.Drive) -> Mechanics:
         counts_per_revolution=math.nan if revolutions is None else counts / revolutions,
         velocity=fixed("velocity_unit", drive.velocity_unit, 1),
         acceleration=fixed("acceleration_unit", drive.acceleration_unit, 2),
-        # Without its maker's EDS it stands for a drive that does not tell the units that the configuration names.
+        # Without its maker's EDS it simulates a drive that does not report the configured units.
         untold=tuple(index for index, unit in configured if unit is not None and drive.eds is None),
     )
 
@@ -65,7 +65,7 @@ CIA402 = Protocol(
     inputs=inputs,
     save=save,
     restore=restore,
-    protections={name: means(name) for name in PROTECTIONS},
+    protections={name: describe_protection(name) for name in PROTECTIONS},
     states=lambda node: {canopen_frames.TPDO1 + node, canopen_frames.TPDO2 + node},
     fault_frames={
         "nmt": Frames(True, canopen_frames.NMT),

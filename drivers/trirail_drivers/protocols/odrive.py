@@ -1,4 +1,4 @@
-"""ODrives on CANSimple, as a protocol."""
+"""The protocol of ODrives, CANSimple."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from trirail_drivers import config
 from trirail_drivers.driver.axis import MISSED_HEARTBEATS
 from trirail_drivers.odrive import cansimple, checks
 from trirail_drivers.odrive.drives import Odrive
-from trirail_drivers.odrive.protections import PROTECTIONS, means
+from trirail_drivers.odrive.protections import PROTECTIONS, describe_protection
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedOdrive
 
 FRICTION: Final = 2.0
-"""How a simulated ODrive's slider slows down that coasts [m/s²]."""
+"""Deceleration of a simulated ODrive's slider that coasts [m/s²]."""
 _NODE: Final = cansimple.identifier(1, 0)
-"""What each further node id adds to an identifier."""
+"""Difference between the identifiers of consecutive node ids."""
 
 
 def _simulated_drive(
@@ -27,7 +27,7 @@ def _simulated_drive(
         Servo.configured(simulated, drive, turns),
         heartbeat=drives.heartbeat,
         friction=FRICTION * drive.counts_per_metre,
-        # As long as a CiA 402 drive waits for its master: CANSimple has no way to tell a drive.
+        # The same time as a CiA 402 drive waits for its master: CANSimple has no message that sets it.
         watchdog=MISSED_HEARTBEATS * drives.heartbeat,
     )
 
@@ -43,7 +43,7 @@ ODRIVE = Protocol(
     inputs=None,
     save=None,
     restore=None,
-    protections={name: means(name) for name in PROTECTIONS},
+    protections={name: describe_protection(name) for name in PROTECTIONS},
     states=lambda node: {
         cansimple.identifier(node, cansimple.HEARTBEAT),
         cansimple.identifier(node, cansimple.GET_ENCODER_ESTIMATES),

@@ -1,4 +1,4 @@
-"""What a protocol brings: its driver, the checks of its settings, its traffic, and its simulated drive."""
+"""Description of a protocol: its driver, checks of its settings, its traffic, its simulated drive."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus.load import Traffic
-from trirail_drivers.cia402.backup import Restored
-from trirail_drivers.cia402.parameter_file import Saved
+from trirail_drivers.cia402.backup import RestoreResult
+from trirail_drivers.cia402.parameter_file import SavedParameters
 from trirail_drivers.driver.requirements import Requirements, Rule
 from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock, DriveGroup
@@ -20,34 +20,35 @@ from trirail_drivers.simulated import Frames, SimulatedDevice
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """All that is known of a protocol outside its own modules."""
+    """Everything that other rooms use of a protocol."""
 
     name: str
-    """As `drives.protocol` of the configuration names it."""
-    driver: Callable[[can.BusABC, int, config.Drives, Clock], DriveGroup]
-    """Makes the driver of three drives, from the bus, its bitrate, section [drives] and the clock."""
+    """Name in `drives.protocol` of the configuration."""
+    driver: Callable[..., DriveGroup]
+    """Return the driver of three drives, from the bus, its bitrate, section [drives], the clock and, if a lost bus can
+    be reopened, a Reopening."""
     rules: Callable[[config.Drives, Requirements], Iterator[Rule]]
-    """Yields what refuses settings that the drives could not carry out."""
+    """Yield checks for settings that the drives cannot carry out."""
     files: Callable[[config.Drives], Iterator[Rule]]
-    """Yields what refuses files that the settings name, by reading them."""
+    """Yield checks that read the files that the settings name."""
     traffic: Traffic
-    """What drives and service put on the bus."""
+    """Bus traffic of drives and service."""
     simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]
-    """Makes one simulated drive, its slider at rest at a position [m]."""
+    """Return one simulated drive, its slider at rest at a position [m]."""
     inspect: Callable[..., list[dict[str, Any]]] | None
-    """Tells what each drive is and what its set-up would change, from the bus, section [drives], the period [s],
-    the clock and the sliders' limit of velocity [m/s], and whether to `apply` that; None where they tell nothing."""
-    save: Callable[..., dict[str, Saved | DriveError]] | None
-    """Reads the parameters of drives, from the bus, section [drives], the clock and the drives' names; None where they
-    have no object dictionary."""
-    restore: Callable[..., Restored] | None
-    """Gives a drive its parameters back, from the same, its name and what was saved."""
+    """Return a description of each drive and the changes of its set-up, from the bus, section [drives], the period [s],
+    the clock, the sliders' velocity limit [m/s], and whether to `apply` them; None if drives cannot be inspected."""
+    save: Callable[..., dict[str, SavedParameters | DriveError]] | None
+    """Read the parameters of drives, from the bus, section [drives], the clock and the drives' names; None if they have
+    no object dictionary."""
+    restore: Callable[..., RestoreResult] | None
+    """Restore the parameters of a drive, from the same arguments, its name and its saved parameters."""
     protections: Mapping[str, str]
-    """What `accept_without` may name, and what each means, for people."""
+    """Names that `accept_without` may have, each with its description for people."""
     inputs: Callable[[can.BusABC, config.Drives, Clock], Callable[[str], int | None]] | None
-    """Makes what reads the digital inputs of the drive of a name, as bits of object 60FDh; None where drives do not
-    tell them."""
+    """Return a function that reads a drive's digital inputs by its name, as bits of object 60FDh; None if drives do not
+    report them."""
     states: Callable[[int], set[int]]
-    """The identifiers of the frames in which the drive of a node id says what is now."""
+    """Return the identifiers of the state frames of a node."""
     fault_frames: Mapping[str, Frames]
-    """The frames that faults on demand can name."""
+    """Frames that faults on demand can name."""

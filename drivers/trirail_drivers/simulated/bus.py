@@ -17,11 +17,11 @@ from trirail_drivers.simulated.exchange import SimulatedExchange
 from trirail_drivers.simulated.faults import Faults
 
 _STEP = 0.0005
-"""How long a waiting receiver sleeps before it looks at the drives again [s]."""
+"""Interval at which a waiting receiver polls the drives [s]."""
 
 
 class SimulatedBus(can.BusABC):
-    """Carries frames between one python-can user and the drives, which live by its `send` and `recv`."""
+    """CAN bus between one python-can user and the drives, which run only inside its `send` and `recv`."""
 
     def __init__(
         self,
@@ -29,7 +29,7 @@ class SimulatedBus(can.BusABC):
         clock: Clock,
         faults: Faults,
     ) -> None:
-        """`faults` are those of the same drives."""
+        """Put the drives on the bus; `faults` act on these drives."""
         self.drives = tuple(drives)
         self.faults = faults
         self.channel_info = "simulated drives"
@@ -39,13 +39,13 @@ class SimulatedBus(can.BusABC):
         self._exchange = SimulatedExchange(self.drives, clock, faults, self._emit)
 
     def press(self, index: int, switches: int) -> None:
-        """Press switches of a slider by hand, and let go of the others: bits of its drive's digital inputs (60FDh)."""
+        """Press these switches of a slider and release the others: bits of its drive's digital inputs (60FDh)."""
         self.drives[index].press(switches)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Bring a frame to every drive; their answers can be received at once.
+        """Deliver a frame to every drive; their answers can be received immediately.
 
-        Raises can.CanOperationError while the controller is bus-off, as the system would of its full queue.
+        Raises can.CanOperationError while the controller is bus-off, like a socket whose queue is full.
         """
         if not self._exchange.receive(can_id(msg), bytes(msg.data), self._clock()):
             raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)

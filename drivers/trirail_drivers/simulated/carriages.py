@@ -1,4 +1,4 @@
-"""Where simulated sliders really are: what a rule beside each rail reads, whatever the encoders say."""
+"""True positions of the simulated sliders, as a scale beside each rail would read, independent of the encoders."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from trirail_drivers.simulated.servo import Servo
 
 
 class Mounted(NamedTuple):
-    """What a drive really moves, whatever its configuration says."""
+    """Slider that a drive actually moves, whatever its configuration says."""
 
     slider: int
     """Index of the slider."""
     counts_per_metre: float
-    """Of that slider; below 0 where counts fall as it rises."""
+    """Scale of that slider; negative if counts fall as its position rises."""
 
 
 class Carriages:
-    """The three sliders and what moves them: each drive one slider, unless its wiring or mechanics is wrong."""
+    """The three sliders and their drives: each drive moves one slider, unless wiring or mechanics are wrong."""
 
     def __init__(self, servos: Sequence[Servo], counts_per_metre: Sequence[float]) -> None:
-        """`counts_per_metre`: negative where counts fall as the slider rises."""
+        """`counts_per_metre`: negative if counts fall as the slider's position rises."""
         self._servos = tuple(servos)
         self._scales = tuple(counts_per_metre)
         self._moves = [(index, 1.0) for index in range(len(self._servos))]
@@ -29,12 +29,12 @@ class Carriages:
         self._places = [0.0] * len(self._servos)
 
     def couple(self, index: int, slider: int, ratio: float) -> None:
-        """From now on a drive moves that slider, `ratio` times as far as it counts; below 0 the other way."""
+        """Couple a drive to a slider, which moves `ratio` times the counted distance; a negative ratio reverses it."""
         self.read()
         self._moves[index] = slider, ratio
 
     def read(self) -> tuple[float, ...]:
-        """What rules read that were put beside the sliders at power-on, at 0, rising as slider positions do [m]."""
+        """Return the slider positions since power-on, as scales zeroed at power-on would read [m]."""
         for index, (servo, scale, (slider, ratio)) in enumerate(
             zip(self._servos, self._scales, self._moves, strict=True)
         ):
@@ -43,7 +43,7 @@ class Carriages:
         return tuple(self._places)
 
     def push(self, slider: int, by: float) -> None:
-        """Push a slider by hand [m]: what is coupled to it turns, and its encoder counts that."""
+        """Push a slider by hand [m]: the motors coupled to it turn, and their encoders count."""
         for servo, scale, (moved, ratio) in zip(self._servos, self._scales, self._moves, strict=True):
             if moved == slider:
                 servo.push(by * scale / ratio)

@@ -1,4 +1,4 @@
-"""A CANopen device as CiA 301 has it: NMT, heartbeat, SYNC, PDO, SDO and EMCY, in no thread of its own."""
+"""A CANopen device (CiA 301): NMT, heartbeat, SYNC, PDO, SDO and EMCY, without a thread of its own."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ALL = range(0x10000)
 
 
 class Nmt(IntEnum):
-    """NMT states, as a heartbeat carries them."""
+    """NMT states, as encoded in a heartbeat."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -39,27 +39,27 @@ class Nmt(IntEnum):
 
 
 _ON_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
-"""Where 1029h:01 sends an OPERATIONAL device on a communication error; 1 leaves it there."""
+"""State that an OPERATIONAL device enters on a communication error, by 1029h:01; 1 keeps it OPERATIONAL."""
 
 
 def _discard(can_id: int, data: bytes) -> None:
-    """Where a device that is on no bus sends."""
+    """Drop a frame of a device that is on no bus."""
 
 
 class Device:
-    """A node on a CAN bus. Whoever owns it brings frames and the time to it with `receive` and `poll`."""
+    """A node on a CAN bus. Its owner passes it frames and the time with `receive` and `poll`."""
 
     def __init__(self, node: int, eds: Path) -> None:
         self.node = node
         self.objects = Dictionary(eds, node)
         self.nmt = Nmt.INITIALISING
         self.fault = 0
-        """Code of the error that the device profile holds on to until it is reset; 0 for none."""
+        """Code of the error that the device profile latches until a fault reset; 0 for none."""
         self.silent = False
-        """True cuts the wire: nothing is heard or sent any more, while the device itself goes on."""
+        """Whether its wire is cut: it receives and sends nothing, but keeps running."""
         self._now = 0.0
         self._up_to_date = False
-        """Whether all that is due at this moment has been done, and nothing has happened since."""
+        """Whether everything due at this time has been done and nothing has changed since."""
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {}
         self._emergency_id = self.objects.internal(0x1014, 0, 0x80 + node)
@@ -80,30 +80,30 @@ class Device:
         self.objects.on_write(0x1005, self._sync_written)
 
     def _pdos(self, communication: int) -> list[int]:
-        """Which PDOs the EDS describes, counted from 0."""
+        """Return the numbers of the PDOs that the EDS describes, counted from 0."""
         return [n for n in range(_MOST_PDOS) if (communication + n, 1) in self.objects]
 
     @property
     def emergencies(self) -> Emergencies:
-        """The errors that it tells by EMCY."""
+        """Errors that it reports by EMCY."""
         return self.errors
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Put the device on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
+        """Put the device on a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
         self._transmit = transmit
         self._now = now
         self._reset(_ALL)
 
     def restart(self, now: float) -> None:
-        """Lose supply and get it back at time `now` [s]."""
+        """Cycle the power supply at time `now` [s]."""
         self._now = now
         self._reset(_ALL)
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
-        """Take in a data frame at time `now` [s]."""
+        """Receive a data frame at time `now` [s]."""
         if can_id not in self._handlers or self.silent:
             return
-        self.poll(now)  # what was due before the frame came may also decide whether it is heard
+        self.poll(now)  # work due before the frame may also change whether the device accepts it
         handler = self._handlers.get(can_id)
         if handler is not None:
             handler(data)
@@ -112,7 +112,7 @@ class Device:
             self._send_events()
 
     def receive_remote(self, can_id: int, now: float) -> None:
-        """Take in a remote frame at time `now` [s]: it asks for a TPDO."""
+        """Receive a remote frame at time `now` [s], which requests a TPDO or guards the node."""
         if self.silent:
             return
         self.poll(now)
@@ -127,7 +127,7 @@ class Device:
                 self._send(can_id, pdo.pack())
 
     def poll(self, now: float) -> None:
-        """Do what is due at time `now` [s]."""
+        """Do the work due at time `now` [s]."""
         if now == self._now and self._up_to_date:
             return
         self._now, self._up_to_date = now, True
@@ -140,26 +140,26 @@ class Device:
         if self._event_tpdos:
             self._send_events()
 
-    # What a device profile adds.
+    # Hooks for a device profile.
 
     def before_sync(self) -> None:
-        """A SYNC has come: bring the values up to date that TPDOs are about to sample."""
+        """Update the values that TPDOs are about to sample, because a SYNC has arrived."""
 
     def time_passed(self, now: float) -> None:
-        """It is `now`; with or without frames."""
+        """Advance to time `now` [s]; called with or without frames."""
 
     def sync_timeout(self) -> float:
-        """How long the device waits for the next SYNC [s]; inf for ever."""
+        """Return the time-out for the next SYNC [s]; inf for none."""
         return math.inf
 
     def sync_lost(self, at: float) -> None:
-        """No SYNC for `sync_timeout` seconds, as of time `at`."""
+        """Handle the absence of SYNC for `sync_timeout` seconds, detected at time `at`."""
 
     def connection_lost(self, code: int) -> None:
-        """The master's heartbeat is gone, or the device is about to leave OPERATIONAL: EMCY `code`."""
+        """Handle a lost heartbeat of the master, or the imminent exit from OPERATIONAL: EMCY `code`."""
 
     def restarted(self) -> None:
-        """The objects have their power-on values: begin anew."""
+        """Start from the beginning: the objects have their power-on values."""
 
     # NMT and heartbeat.
 
@@ -207,7 +207,7 @@ class Device:
         self.errors.mute(state is Nmt.STOPPED)
 
     def _route(self) -> None:
-        """Decide which frames are heard: CiA 301, NMT states and communication object relation."""
+        """Select the frames to accept (CiA 301, NMT states and communication object relation)."""
         operational = self.nmt is Nmt.OPERATIONAL
         rpdos = [pdo for pdo in self._rpdos if operational and pdo.valid and pdo.entries]
         tpdos = [pdo for pdo in self._tpdos if operational and pdo.valid and pdo.entries]
@@ -266,7 +266,7 @@ class Device:
         if len(data) < pdo.layout.size:
             self.errors.report(PDO_TOO_SHORT, pdo.number)
             return
-        if len(data) > pdo.layout.size:  # CiA 301: the mapped bytes are taken, the rest is reported
+        if len(data) > pdo.layout.size:  # CiA 301: use the mapped bytes and report the excess length
             self.errors.report(PDO_TOO_LONG, pdo.number)
         elif self.errors:
             self.errors.clear(PDO_TOO_SHORT, pdo.number)

@@ -1,4 +1,4 @@
-"""What a simulated bus and its faults need of a drive, whatever it speaks."""
+"""Interface of a simulated drive, of any protocol, to the bus and its faults."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from trirail_drivers.simulated.servo import Servo
 
 
 class SimulatedDevice(Protocol):
-    """A drive on the bus, of any protocol."""
+    """Drive on the bus, of any protocol."""
 
     node: int
     servo: Servo
     silent: bool
-    """True cuts the wire: nothing is heard or sent any more."""
+    """Whether its wire is cut: it receives and sends nothing."""
 
     @property
     def state(self) -> object:
-        """Its state; `str` gives it in words."""
+        """State of the drive; `str` gives it in words."""
 
     @property
     def power(self) -> PowerState:
-        """Its state as CiA 402 has it."""
+        """State of the drive in terms of CiA 402."""
 
     @property
     def emergencies(self) -> Emergencies | None:
-        """The errors that it tells by EMCY; None where its protocol has no such message."""
+        """Errors that it reports by EMCY; None if its protocol has no such message."""
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Put it on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
+        """Put it on a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
-        """Take in a data frame."""
+        """Receive a data frame."""
 
     def receive_remote(self, can_id: int, now: float) -> None:
-        """Take in a remote frame."""
+        """Receive a remote frame."""
 
     def poll(self, now: float) -> None:
-        """Do what is due."""
+        """Do the work due at time `now` [s]."""
 
     def press(self, switches: int) -> None:
-        """Have these switches of its slider pressed: bits of CiA 402's digital inputs."""
+        """Press these switches of its slider: bits of the digital inputs (CiA 402)."""
 
     def fail(self, code: int) -> None:
-        """Break down with an error code of its protocol."""
+        """Enter the fault state with an error code of its protocol."""
 
     def restart(self, now: float) -> None:
-        """Lose power for a moment."""
+        """Cycle the power supply."""

@@ -1,14 +1,29 @@
-"""A device's objects, as its EDS describes them: values, access rules and what follows a write."""
+"""Object dictionary of a device, as its EDS describes it: values, access rules and write callbacks."""
 
 from __future__ import annotations
 
+import configparser
 from collections.abc import Callable
 from pathlib import Path
 
+from canopen import SdoAbortedError
 from canopen.objectdictionary import ODVariable
 
+from trirail_drivers.cia402 import eds
 from trirail_drivers.cia402.eds import read
-from trirail_drivers.simulated.edsfile import compact_arrays
+
+
+def compact_arrays(file: Path) -> dict[int, int]:
+    """Return the number of sub-objects of each array whose elements the EDS does not list (CiA 306, CompactSubObj)."""
+    sections = configparser.RawConfigParser(inline_comment_prefixes=(";",), strict=False)
+    with eds.open_text(file) as text:
+        sections.read_file(text)
+    return {
+        int(section, 16): int(sections.get(section, "CompactSubObj"), 0)
+        for section in sections.sections()
+        if sections.has_option(section, "CompactSubObj")
+    }
+
 
 WRITE_ONLY = 0x06010001
 READ_ONLY = 0x06010002
@@ -27,30 +42,22 @@ WRONG_STATE = 0x08000022
 NO_DATA = 0x08000024
 
 LONGEST = 1 << 16
-"""A text or domain takes so much at most [bytes]."""
+"""Maximum size of a text or domain [bytes]."""
 
 _UNSIGNED = {0x01: 1, 0x05: 1, 0x06: 2, 0x16: 3, 0x07: 4, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
 _SIGNED = {0x02: 1, 0x03: 2, 0x10: 3, 0x04: 4, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8}
 _OCTETS = {0x08: 4, 0x11: 8, 0x0C: 6, 0x0D: 6}
-"""CiA 301 data types and their bytes: BOOLEAN and UNSIGNED8 to 64; INTEGER8 to 64; REAL32, REAL64, TIME_OF_DAY and
-TIME_DIFFERENCE, which no code here reckons with. What is in none of them is text or a domain, of any length."""
+"""CiA 301 data types and their sizes in bytes: BOOLEAN and UNSIGNED8 to 64; INTEGER8 to 64; REAL32, REAL64, TIME_OF_DAY
+and TIME_DIFFERENCE, which no code here computes with. Any other type is text or a domain, of any length."""
 _BOOLEAN = 0x01
 _FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h", (4, False): "I", (4, True): "i",
             (8, False): "Q", (8, True): "q"}  # fmt: skip
 
 
-class SdoAbort(Exception):
-    """A request is refused, with an abort code of CiA 301 (SDO abort transfer)."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(f"SDO abort {code:08X}h")
-        self.code = code
-
-
 class ObjectEntry:
-    """One object or sub-object, which holds an integer or, of other data types, its bytes.
+    """One object or sub-object: an integer or, for other data types, bytes.
 
-    `value` is the integer it holds; the device's own code sets it directly.
+    `value` is the integer; the device's own code sets it directly.
     """
 
     __slots__ = (
@@ -80,14 +87,14 @@ class ObjectEntry:
         self.integer = kind in _UNSIGNED or kind in _SIGNED
         self._signed = kind in _SIGNED
         self.size: int | None = (_UNSIGNED | _SIGNED | _OCTETS).get(kind)
-        """Bytes; None where the length is not fixed."""
+        """Size [bytes]; None if the length is not fixed."""
         given = variable.value if variable.value is not None else variable.default
         self.unset = given is None
-        """Whether the EDS gives no power-on value."""
+        """Whether the EDS has no power-on value."""
         self.default = self.value = self._wrapped(given) if self.integer and isinstance(given, int) else 0
         self._default_content = self.content = b"" if self.integer else _octets(variable, given, self.size)
         low, high = variable.min, variable.max
-        if low is not None and high is not None and low > high:  # as some files have it: no limit was meant
+        if low is not None and high is not None and low > high:  # some EDS files write "no limit" like this
             low = high = None
         if kind == _BOOLEAN:
             low, high = 0, 1
@@ -100,16 +107,16 @@ class ObjectEntry:
 
     @property
     def format(self) -> str:
-        """How a struct packs it, if it is of a fixed size."""
+        """Format for `struct`, if the size is fixed."""
         return _FORMATS.get((self.size or 0, self._signed), f"{self.size}s") if self.integer else f"{self.size}s"
 
     @property
     def plain(self) -> bool:
-        """Whether a struct packs its `value`; else it packs `encode`."""
+        """Whether a struct packs its `value`; otherwise it packs the result of `encode`."""
         return not self.format.endswith("s")
 
     def encode(self) -> bytes:
-        """The value as it travels, little-endian."""
+        """Return the value as transmitted, little-endian."""
         return (
             self._wrapped(self.value).to_bytes(self.size or 0, "little", signed=self._signed)
             if self.integer
@@ -117,60 +124,60 @@ class ObjectEntry:
         )
 
     def load(self, data: bytes) -> None:
-        """Take its bytes from the bus; refused, it raises SdoAbort and leaves the old ones."""
+        """Write bytes from the bus. Raises SdoAbortedError, and keeps the old value, if they are refused."""
         if self._limits is None:
-            raise SdoAbort(READ_ONLY)
+            raise SdoAbortedError(READ_ONLY)
         longest = self.size or LONGEST
         if len(data) > longest:
-            raise SdoAbort(TOO_LONG)
+            raise SdoAbortedError(TOO_LONG)
         if self.size is not None and len(data) < self.size:
-            raise SdoAbort(TOO_SHORT)
+            raise SdoAbortedError(TOO_SHORT)
         if self.integer:
             self.write(int.from_bytes(data, "little", signed=self._signed))
         else:
             self.content = data
 
     def write(self, value: int) -> None:
-        """Take an integer from the bus, by SDO or PDO; refused, it raises SdoAbort and leaves the old one."""
+        """Write an integer from an SDO or PDO. Raises SdoAbortedError, and keeps the old one, if it is refused."""
         if self._limits is None:
-            raise SdoAbort(READ_ONLY)
+            raise SdoAbortedError(READ_ONLY)
         low, high = self._limits
         if high is not None and value > high:
-            raise SdoAbort(VALUE_TOO_HIGH)
+            raise SdoAbortedError(VALUE_TOO_HIGH)
         if low is not None and value < low:
-            raise SdoAbort(VALUE_TOO_LOW)
+            raise SdoAbortedError(VALUE_TOO_LOW)
         old, self.value = self.value, value
         if self.on_write is not None:
             try:
                 self.on_write(self, old)
-            except SdoAbort:
+            except SdoAbortedError:
                 self.value = old
                 raise
 
     def store(self, number: float) -> None:
-        """Hold the nearest integer that the data type has; the device's own code does that."""
+        """Store the nearest integer of the data type; for the device's own code."""
         bits = 8 * (self.size or 0) - self._signed
         self.value = max(-(1 << bits) if self._signed else 0, min(round(number), (1 << bits) - 1))
 
     def _wrapped(self, given: int) -> int:
-        """What an EDS gives, which may write a negative number as its two's complement."""
+        """Return a value of the EDS, which may contain a negative number as its two's complement."""
         bits = 8 * (self.size or 0)
         value = given % (1 << bits)
         return value - (1 << bits) if self._signed and value >> (bits - 1) else value
 
     def restore(self) -> None:
-        """Hold the power-on value."""
+        """Restore the power-on value."""
         self.value, self.content = self.default, self._default_content
 
 
 def _octets(variable: ODVariable, given: object, size: int | None) -> bytes:
-    """What the EDS gives for an object that is no integer, as it travels."""
-    if isinstance(given, int) and size is not None:  # times are written as integers
+    """Return the EDS value of an object that is not an integer, as transmitted."""
+    if isinstance(given, int) and size is not None:  # EDS files write times as integers
         return (given % (1 << 8 * size)).to_bytes(size, "little")
     if isinstance(given, str | float):
         try:
             return bytes(variable.encode_raw(given))
-        except (ValueError, TypeError):  # text that ASCII has not
+        except (ValueError, TypeError):  # text outside ASCII
             return str(given).encode("utf-8")
     return bytes(given) if isinstance(given, bytes) else bytes(size or 0)
 
@@ -195,7 +202,7 @@ class Dictionary:
                 self._entries[index, 0].default = self._entries[index, 0].value = compact[index]
 
     def add(self, index: int, subindex: int, bits: int, *, signed: bool) -> None:
-        """Have one more integer that the bus may write, where there is none yet."""
+        """Add an integer that the bus may write, unless the object exists already."""
         variable = ODVariable(f"Object {index:04X}", index, subindex)
         sizes = _SIGNED if signed else _UNSIGNED
         variable.data_type = next(kind for kind, size in sizes.items() if size * 8 == bits and kind != _BOOLEAN)
@@ -204,20 +211,20 @@ class Dictionary:
         self._entries.setdefault((index, subindex), ObjectEntry(variable))
 
     def __getitem__(self, key: tuple[int, int]) -> ObjectEntry:
-        """The entry at (index, subindex); raises SdoAbort where there is none."""
+        """Return the entry at (index, subindex). Raises SdoAbortedError if there is none."""
         try:
             return self._entries[key]
         except KeyError:
-            raise SdoAbort(NO_SUBINDEX if key[0] in self._indices else NO_OBJECT) from None
+            raise SdoAbortedError(NO_SUBINDEX if key[0] in self._indices else NO_OBJECT) from None
 
     def __contains__(self, key: tuple[int, int]) -> bool:
         """Whether the device has the object."""
         return key in self._entries
 
     def internal(self, index: int, subindex: int, initial: int = 0) -> ObjectEntry:
-        """The entry at (index, subindex); where the device has none, one that the bus does not see.
+        """Return the entry at (index, subindex), or one hidden from the bus if the device has none.
 
-        `initial` is its power-on value where the EDS gives none.
+        `initial` is its power-on value if the EDS has none.
         """
         entry = self._entries.get((index, subindex)) or self._hidden.get((index, subindex))
         if entry is None:
@@ -230,13 +237,13 @@ class Dictionary:
         return entry
 
     def on_write(self, index: int, action: Callable[[ObjectEntry, int], None]) -> None:
-        """Call `action(entry, old value)` after each write to `index`; it may refuse by raising SdoAbort."""
+        """Call `action(entry, old value)` after each write to `index`; it may refuse by raising SdoAbortedError."""
         for entry in self._entries.values():
             if entry.index == index:
                 entry.on_write = action
 
     def restore(self, indices: range) -> None:
-        """Give the objects in `indices` their power-on values."""
+        """Restore the power-on values of the objects in `indices`."""
         for entry in (*self._entries.values(), *self._hidden.values()):
             if entry.index in indices:
                 entry.restore()

@@ -1,4 +1,4 @@
-"""A servo drive as CiA 402 has it, on a simulated axis: cyclic synchronous position, interpolated position, homing."""
+"""A CiA 402 servo drive with a simulated axis: cyclic synchronous position, interpolated position and homing modes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ EDS: Final = Path(__file__).parents[1] / "cia402" / "servo.eds"
 FOLLOWING_ERROR = 0x8611
 SYNC_LOST = 0x8700
 
-# Controlword bits beside the command's (CiA 402-2, 6040h; bit 4 as mode 6 defines it).
+# Controlword bits other than those of the command (CiA 402-2, 6040h; bit 4 as mode 6 defines it).
 _HOMING_START = 1 << 4
 _HALT = 1 << 8
 
-# Statusword bits beside the state's (CiA 402-2, 6041h; bits 12 and 13 as modes 6 to 8 define them).
+# Statusword bits other than those of the state (CiA 402-2, 6041h; bits 12 and 13 as modes 6 to 8 define them).
 _VOLTAGE_ENABLED = 1 << 4
 _REMOTE = 1 << 9
 _INTERNAL_LIMIT = 1 << 11
@@ -43,10 +43,9 @@ _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 class SimulatedDrive(Device):
     """A CANopen servo drive with its axis.
 
-    The axis moves one interpolation period (60C2h) per SYNC: at each SYNC first the motion since the last one
-    is done, then TPDOs sample it, then the latched setpoints take effect. Where no SYNC comes it moves with
-    the time; until the SYNC is found lost, it keeps its velocity. Without power it is held by its brake, which gives
-    way to a hand.
+    The axis moves one interpolation period (60C2h) per SYNC. Each SYNC first completes the motion since the last one,
+    then lets TPDOs sample it, then applies the latched setpoints. Without SYNC the axis moves with time; until the loss
+    of SYNC is detected, it keeps its velocity. Without power its brake holds it, but a push by hand still moves it.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class SimulatedDrive(Device):
         eds: Path = EDS,
         mechanics: Mechanics = MECHANICS,
     ) -> None:
-        """`eds` says which objects it has and in which units; it does without the others."""
+        """`eds` defines the objects and their units; the drive works without those missing."""
         super().__init__(node, eds)
         self._missed_syncs = missed_syncs
         self.servo = servo
@@ -67,7 +66,7 @@ class SimulatedDrive(Device):
         self._synchronised = False
         self._moved_at = 0.0
         self._heard_period = 0.0
-        """Between the last two SYNCs [s]."""
+        """Time between the last two SYNCs [s]."""
         self._setpoint_given = False
         self._beyond_window: float | None = None
         self._profile = Profile(self.objects, mechanics, self._mode_changed)
@@ -77,16 +76,16 @@ class SimulatedDrive(Device):
 
     @property
     def power(self) -> PowerState:
-        """Its state."""
+        """State of the power state machine."""
         return self.state
 
     def press(self, switches: int) -> None:
-        """Have these switches of its slider pressed: bits of the digital inputs 60FDh, where it has that."""
+        """Press these switches of its slider: bits of the digital inputs 60FDh, if it has that object."""
         self._profile.inputs.value = switches
         self._up_to_date = False
 
     def fail(self, code: int) -> None:
-        """Break down with EMCY and 603Fh error `code`: transitions 13 and, at standstill, 14."""
+        """Enter the fault state with `code` in EMCY and 603Fh: transitions 13 and, at standstill, 14."""
         if self.state in _FAULTY:
             return
         self._up_to_date = False
@@ -94,10 +93,10 @@ class SimulatedDrive(Device):
         self.errors.report(code)
         self._change(PowerState.FAULT_REACTION_ACTIVE)
 
-    # Device: what CiA 402 adds to CiA 301.
+    # Hooks of Device: the additions of CiA 402 to CiA 301.
 
     def restarted(self) -> None:
-        """Transitions 0 and 1."""
+        """Perform transitions 0 and 1."""
         self.fault = 0
         self._synchronised = self._setpoint_given = False
         self._moved_at = self._now
@@ -107,7 +106,7 @@ class SimulatedDrive(Device):
         self._change(PowerState.SWITCH_ON_DISABLED)
 
     def before_sync(self) -> None:
-        """Move from one setpoint to the next; at the first SYNC the axis has already moved with the time."""
+        """Move from one setpoint to the next, except at the first SYNC: the axis has already moved with time."""
         if self._synchronised:
             self._heard_period = self._now - self._moved_at
             self._move(self._step, self._profile.feed_forward)
@@ -115,22 +114,22 @@ class SimulatedDrive(Device):
         self._moved_at = self._now
 
     def time_passed(self, now: float) -> None:
-        """Move with the time where no SYNC sets the pace; a velocity offset has no meaning then."""
+        """Move with time if no SYNC sets the pace; a velocity offset has no meaning then."""
         if not self._synchronised and now > self._moved_at:
             self._move(now - self._moved_at, 0.0)
             self._moved_at = now
 
     def sync_timeout(self) -> float:
-        """So many periods: of SYNC (1006h) where it is set, else of interpolation; inf before the second SYNC."""
+        """Return `missed_syncs` periods of SYNC (1006h) if set, else of interpolation; inf before the second SYNC."""
         return self._missed_syncs * (self._sync_period.value * 1e-6 or self._step) or math.inf
 
     @property
     def _step(self) -> float:
-        """The time from one setpoint to the next [s]: 60C2h or 1006h where one is set, else what SYNC has."""
+        """Time from one setpoint to the next [s]: 60C2h or 1006h if set, else the measured SYNC period."""
         return self._profile.interpolation_period or self._sync_period.value * 1e-6 or self._heard_period
 
     def sync_lost(self, at: float) -> None:
-        """Go by the time from now on; while enabled and told to expect SYNC (1006h), break down."""
+        """Continue with time; enter the fault state if enabled and configured to expect SYNC (1006h)."""
         self._synchronised = False
         self.servo.coast(at - self._moved_at)
         self._moved_at = at
@@ -139,7 +138,7 @@ class SimulatedDrive(Device):
             self.fail(SYNC_LOST)
 
     def connection_lost(self, code: int) -> None:
-        """CiA 402-2, 6007h, abort connection option code."""
+        """React as the abort connection option code demands (CiA 402-2, 6007h)."""
         if self.state is not PowerState.OPERATION_ENABLED:
             return
         match self._profile.abort_option.value:
@@ -205,7 +204,7 @@ class SimulatedDrive(Device):
         return self.state is PowerState.OPERATION_ENABLED and self._profile.mode.value == HOMING
 
     def _home(self, word: int, old: int) -> None:
-        """CiA 402-2, homing mode: bit 4 of the controlword starts when it rises and interrupts when it falls."""
+        """Start homing on a rising controlword bit 4 and interrupt it on a falling one (CiA 402-2, homing mode)."""
         if word & ~old & _HOMING_START:
             self.homing.start(*self._profile.homing)
         elif old & ~word & _HOMING_START:
@@ -213,14 +212,14 @@ class SimulatedDrive(Device):
         self._publish()
 
     def _standstill(self) -> None:
-        """Transition 14, or 12 where the quick stop does not stay active."""
+        """Perform transition 14, or 12 if the quick stop does not stay active."""
         if self.state is PowerState.FAULT_REACTION_ACTIVE:
             self._change(PowerState.FAULT)
         elif self.state is PowerState.QUICK_STOP_ACTIVE and not self._profile.stays_stopped:
             self._change(PowerState.SWITCH_ON_DISABLED)
 
     def _watch_following_error(self, step: float) -> None:
-        """CiA 402-2, 6065h and 6066h: too far off for too long is a fault."""
+        """Raise a fault if the following error exceeds its window for too long (CiA 402-2, 6065h and 6066h)."""
         window, time = self._profile.window
         if abs(self.servo.following_error) <= window:
             self._beyond_window = None
@@ -230,7 +229,7 @@ class SimulatedDrive(Device):
             self.fail(FOLLOWING_ERROR)
 
     def _publish(self) -> None:
-        """Bring the actual values and the statusword up to date."""
+        """Update the actual values and the statusword."""
         self._profile.update_actual(self.servo)
         status = STATUS[self.state] | _VOLTAGE_ENABLED | _REMOTE
         if self._follows_command:
@@ -244,7 +243,7 @@ class SimulatedDrive(Device):
         self._profile.statusword.value = status
 
     def _homing_bits(self) -> int:
-        """CiA 402-2, homing mode: error, attained and target reached, of which the last says that the axis stands."""
+        """Return the bits error, attained and target reached (axis at rest) (CiA 402-2, homing mode)."""
         homing = self.homing
         meant_to_stand = not homing.under_way or bool(self._profile.controlword.value & _HALT)
         return (

@@ -1,4 +1,4 @@
-"""Errors in force: error register, error history and emergency messages (CiA 301, EMCY; 1001h, 1003h)."""
+"""Active errors: error register, error history and emergency messages (CiA 301, EMCY; 1001h, 1003h)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Callable
 from struct import Struct
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry, SdoAbort
+from canopen import SdoAbortedError
+
+from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry
 
 _EMERGENCY: Final = Struct("<HBH3x")
 
@@ -16,7 +18,7 @@ _REGISTER_BITS: Final = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: _PROFILE, 0x8: _C
 
 
 class Emergencies:
-    """Which errors a device has, and what it tells of them."""
+    """Active errors of a device and their EMCY messages."""
 
     def __init__(self, objects: Dictionary, send: Callable[[bytes], None]) -> None:
         self._send = send
@@ -29,11 +31,11 @@ class Emergencies:
         objects.on_write(0x1003, self._history_written)
 
     def __bool__(self) -> bool:
-        """Whether there is any error."""
+        """Whether an error is active."""
         return bool(self._active)
 
     def report(self, code: int, detail: int = 0) -> None:
-        """An error has come up, told of once while it lasts; `detail` goes with it in EMCY and history."""
+        """Report a new error once while it lasts; EMCY and history contain `detail` as well."""
         if (code, detail) in self._active:
             return
         self._active.add((code, detail))
@@ -42,7 +44,7 @@ class Emergencies:
         self._emit(code, detail)
 
     def _remember(self, error: int) -> None:
-        """The newest error stands first; a device without 1003h forgets it."""
+        """Insert the error at the front of the history, unless the device has no 1003h."""
         if not self._history:
             return
         self._count.value = min(self._count.value + 1, len(self._history))
@@ -51,7 +53,7 @@ class Emergencies:
         self._history[0].value = error
 
     def clear(self, code: int, detail: int = 0) -> None:
-        """An error is over; with the last one goes "error reset" (code 0)."""
+        """Clear an error; the last one to end sends "error reset" (code 0)."""
         if (code, detail) not in self._active:
             return
         self._active.remove((code, detail))
@@ -60,13 +62,13 @@ class Emergencies:
             self._emit(0, 0)
 
     def forget(self, but: int) -> None:
-        """After a reset: no error but the one with code `but`, and nothing told of it."""
+        """Drop all errors except those with code `but`, without an EMCY, after a reset."""
         self._active = {key for key in self._active if key[0] == but}
         self._update_register()
         self._held_back = None
 
     def mute(self, muted: bool) -> None:
-        """CiA 301: in STOPPED no EMCY is sent; the newest one is on leaving it."""
+        """Suppress EMCY in STOPPED, and send the newest one on leaving that state (CiA 301)."""
         self._muted = muted
         if not muted and self._held_back is not None:
             emergency, self._held_back = self._held_back, None
@@ -85,11 +87,11 @@ class Emergencies:
             self._send(emergency)
 
     def _history_written(self, entry: ObjectEntry, _old: int) -> None:
-        if entry.value:  # CiA 301, 1003h: only 0, which empties it
-            raise SdoAbort(INVALID_VALUE)
+        if entry.value:  # CiA 301, 1003h: only 0 may be written, which clears the history
+            raise SdoAbortedError(INVALID_VALUE)
 
 
 def _register_bits(code: int) -> int:
-    if code >> 8 == 0x86:  # positioning controller: CiA 402's, not communication
+    if code >> 8 == 0x86:  # positioning controller: a profile error of CiA 402, not communication
         return _GENERIC | _PROFILE
     return _GENERIC | _REGISTER_BITS.get(code >> 12, 0)

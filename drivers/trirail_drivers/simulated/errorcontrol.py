@@ -1,4 +1,4 @@
-"""Error control as CiA 301 has it: heartbeats made and heard, or node guarding and life guarding without them."""
+"""Error control (CiA 301): heartbeats produced and consumed, or node guarding and life guarding without them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _TOGGLE: Final = 0x80
 
 
 class ErrorControl:
-    """Who watches whom: the master this node by 1017h or guarding, this node the master by 1016h or life guarding."""
+    """Mutual supervision of this node (by 1017h or node guarding) and the master (by 1016h or life guarding)."""
 
     def __init__(self, objects: Dictionary, lost: Callable[[], None], changed: Callable[[], None]) -> None:
-        """`lost` is told that the master is gone, `changed` that another node is watched."""
+        """`lost` is called when the master is lost, `changed` when the watched node changes."""
         self._lost = lost
         self._changed = changed
         self._producer = objects.internal(0x1017, 0)
@@ -27,23 +27,23 @@ class ErrorControl:
         objects.on_write(0x1017, self._producer_written)
 
     def restart(self, now: float) -> None:
-        """After a reset: nothing is sent and nobody is watched until it begins again."""
+        """Stop sending and watching after a reset, until either starts again."""
         self._now = now
         self._heartbeat_due = self._consumer_due = self._guarding_due = math.inf
         self._toggle = 0
 
     @property
     def watched(self) -> int | None:
-        """The node whose heartbeat is watched."""
+        """Node whose heartbeat is watched; None for none."""
         node, milliseconds = divmod(self._consumer.value, 1 << 16)
         return node if node and milliseconds else None
 
     def heard(self, now: float) -> None:
-        """The watched node's heartbeat came; watching begins with the first one, and after a loss with the next."""
+        """Handle a heartbeat of the watched node: the first one, or the next after a loss, starts the time-out."""
         self._consumer_due = now + (self._consumer.value & 0xFFFF) * 1e-3
 
     def guarded(self, state: int, now: float) -> bytes | None:
-        """The answer to the master's guarding; None where heartbeats take its place (CiA 301: never both)."""
+        """Return the answer to the master's guarding; None if heartbeats replace it (CiA 301: never both)."""
         if self._producer.value:
             return None
         life_time = self._guard_time.value * self._life_factor.value * 1e-3
@@ -53,7 +53,7 @@ class ErrorControl:
         return answer
 
     def poll(self, now: float) -> bool:
-        """Tell of who is lost at time `now` [s]; return whether a heartbeat is due."""
+        """Report a master lost at time `now` [s]; return whether a heartbeat is due."""
         self._now = now
         if now >= self._consumer_due or now >= self._guarding_due:
             self._consumer_due = self._guarding_due = math.inf
@@ -62,7 +62,7 @@ class ErrorControl:
             return False
         period = self._producer.value * 1e-3
         self._heartbeat_due += period
-        if self._heartbeat_due <= now:  # too late for that one as well: leave it out
+        if self._heartbeat_due <= now:  # the next one is overdue as well: skip it
             self._heartbeat_due = now + period
         return True
 

@@ -1,4 +1,4 @@
-"""Frames between a master and simulated drives, and among these, unless faults have it otherwise."""
+"""Exchange of frames between a master and simulated drives, and among the drives, as modified by faults."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _FLAGS: Final = EXTENDED | REMOTE | ERROR
 
 
 class SimulatedExchange:
-    """The drives, on no bus yet: whoever owns it brings the master's frames and the time, and has the drives' frames.
+    """Drives without a bus: the owner passes in the master's frames and the time, and receives the drives' frames.
 
-    Identifiers have the flags of `struct can_frame`.
+    Identifiers include the flags of `struct can_frame`.
     """
 
     def __init__(
         self, drives: Sequence[SimulatedDevice], clock: Clock, faults: Faults, emit: Callable[[int, bytes], None]
     ) -> None:
-        """Switch the drives on; `faults` are those of the same drives, `emit` has the frames for the master."""
+        """Switch the drives on; `faults` act on these drives, `emit` receives the frames for the master."""
         self._drives = tuple(drives)
         self._faults = faults
         self._clock = clock
@@ -37,7 +37,7 @@ class SimulatedExchange:
             drive.connect(partial(self._from_drive, index, others), now)
 
     def receive(self, identifier: int, data: bytes, now: float) -> bool:
-        """Bring a frame of the master to every drive, at time `now` [s]; False while its controller is bus-off."""
+        """Deliver a frame of the master to every drive at time `now` [s]; False while its controller is bus-off."""
         if not self._faults.idle:
             self._faults.poll(now)
             if self._faults.bus_off:
@@ -49,14 +49,14 @@ class SimulatedExchange:
         return True
 
     def poll(self, now: float) -> None:
-        """Do what is due at time `now` [s]."""
+        """Do the work due at time `now` [s]."""
         if not self._faults.idle:
             self._faults.poll(now)
         for drive in self._drives:
             drive.poll(now)
 
     def _request(self, can_id: int, now: float) -> None:
-        """Bring a remote frame to every drive, unless faults have it otherwise."""
+        """Deliver a remote frame to every drive, as modified by faults."""
         for index in self._everyone:
             if self._faults.idle:
                 self._drives[index].receive_remote(can_id, now)
@@ -64,7 +64,7 @@ class SimulatedExchange:
                 self._faults.carry(index, True, can_id, b"", partial(self._hand_request_in, index, can_id))
 
     def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
-        """Bring a frame to some drives, unless faults have it otherwise."""
+        """Deliver a frame to some drives, as modified by faults."""
         if self._faults.idle:
             now = self._clock()
             for index in indices:
@@ -80,7 +80,7 @@ class SimulatedExchange:
         self._drives[index].receive(can_id, data, self._clock())
 
     def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
-        """Bring a drive's frame to the master and the other drives, unless faults have it otherwise."""
+        """Deliver a drive's frame to the master and the other drives, as modified by faults."""
         if self._faults.idle:
             self._hand_out(others, can_id, data)
         else:

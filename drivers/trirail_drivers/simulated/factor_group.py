@@ -1,8 +1,8 @@
-"""The units that a drive's own dictionary gives its objects (CiA 402-2, factor group), in counts and seconds.
+"""Units of a drive's objects as its own dictionary defines them (CiA 402-2, factor group), in counts and seconds.
 
-A count is the unit of position that the drive has at power-on. What its objects tell holds: 60A8h, 60A9h and 60AAh by
-CiA 303-2 (power of ten, numerator, denominator), else 6096h, a factor over units of position per second, and 6097h, one
-over units of velocity per second; positions change with 608Fh, 6091h and 6092h. What none tells, its maker has fixed.
+A count is the drive's unit of position at power-on. The objects define the others: 60A8h, 60A9h and 60AAh by CiA 303-2
+(power of ten, numerator, denominator), else 6096h, which divides units of position per second, and 6097h, which divides
+those of velocity; positions scale with 608Fh, 6091h and 6092h. The manufacturer fixes any unit that no object gives.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ _METRES: Final = {0x01: 1.0, 0xC1: 0.0254, 0xC2: 0.3048}
 _PER_REVOLUTION: Final = {0x10: math.tau, 0x40: 400.0, 0x41: 360.0, 0x42: 21_600.0, 0x43: 1_296_000.0, 0xB4: 1.0}
 _COUNTS: Final = (0xB5, 0xAC)
 _RPM: Final = 0xC0
-"""EPOS4's numerator of accelerations: its 00C00300h is rpm/s."""
+"""Numerator of accelerations in the EPOS4: its 00C00300h is rpm/s."""
 _SECONDS: Final = {0x03: 1.0, 0x47: 60.0, 0x48: 3600.0}
 _SECOND_SQUARED: Final = 0x57
 
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """What no object tells: the axis behind the drive, and units that the maker has fixed."""
+    """Properties that no object gives: the axis of the drive, and units fixed by the manufacturer."""
 
     counts_per_metre: float = math.nan
     counts_per_revolution: float = math.nan
-    """Of the motor."""
+    """Encoder counts per revolution of the motor."""
     velocity: float = 1.0
-    """The fixed unit of velocity [counts/s]."""
+    """Fixed unit of velocity [counts/s]."""
     acceleration: float = 1.0
-    """The fixed unit of acceleration [counts/s²]."""
+    """Fixed unit of acceleration [counts/s²]."""
     untold: tuple[int, ...] = ()
-    """Which of 60A9h and 60AAh are 0, whatever its EDS has: their units are those fixed here."""
+    """Those of 60A9h and 60AAh that are 0, whatever the EDS contains: their units are those fixed here."""
 
 
 class FactorGroup:
-    """The drive's units as its objects have them now."""
+    """Current units of the drive, as its objects define them."""
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics) -> None:
         self.position = 1.0
@@ -61,7 +61,7 @@ class FactorGroup:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take up what the objects say."""
+        """Update the units from the objects."""
         self.position = self._position()
         _, velocity, acceleration = (entry.value for entry in self._codes)
         by_factor, of_factor = self._ratio(0x6096), self._ratio(0x6097)
@@ -80,12 +80,12 @@ class FactorGroup:
         return self._counts_per_unit() / self._at_power_on
 
     def _counts_per_unit(self) -> float:
-        """Encoder increments of a unit of position: encoder resolution * gear ratio / feed constant."""
+        """Return encoder increments per unit of position: encoder resolution * gear ratio / feed constant."""
         resolution, gear, feed = (self._ratio(index) or 1.0 for index in (0x608F, 0x6091, 0x6092))
         return resolution * gear / feed
 
     def _ratio(self, index: int) -> float | None:
-        """Sub-index 1 by sub-index 2; None where the drive does not have or does not tell them."""
+        """Return sub-index 1 divided by sub-index 2; None if the drive has no such objects or leaves them unset."""
         numerator, divisor = (entry.value for entry in self._ratios[index])
         return numerator / divisor if numerator > 0 and divisor > 0 else None
 
@@ -114,4 +114,4 @@ class FactorGroup:
 
 
 _RATIOS: Final = (0x608F, 0x6091, 0x6092, 0x6096, 0x6097)
-"""Encoder resolution, gear ratio, feed constant, velocity factor, acceleration factor: each sub-index 1 by 2."""
+"""Encoder resolution, gear ratio, feed constant, velocity and acceleration factor: each sub-index 1 divided by 2."""

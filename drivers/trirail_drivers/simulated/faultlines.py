@@ -1,8 +1,8 @@
-"""The language of faults on demand: one fault a line.
+"""Language of injected faults, one fault per line.
 
     [at SECONDS] [when DRIVE CONDITION] [with CHANCE] [A|B|C|all] FAULT [VALUE] [FRAMES …] [for SECONDS | for N frames]
 
-`HELP` tells the words. What is not in the language is refused with one line that says what would be right.
+`HELP` explains the words. A line outside the language is refused with one line that gives the correct form.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ Commands: list · clear (ends all faults) · help"""
 
 
 class FaultSyntaxError(DriveError):
-    """A line is not in the language of faults; the message says what would be right."""
+    """A line outside the language of faults; the message gives the correct form."""
 
 
 class Frames(NamedTuple):
-    """Some of the frames between the bus and a drive."""
+    """Selection of frames between the bus and a drive."""
 
     to_drive: bool | None
     """Direction; None for both."""
     identifier: int | None
-    """That of node 0; None for all."""
+    """Identifier for node 0; None for all."""
     per_node: int = 0
-    """What each further node id adds to the identifier; 0 where it is the same for all."""
+    """Increment of the identifier per node id; 0 if it is the same for all."""
 
     def match(self, to_drive: bool, identifier: int, node: int) -> bool:
         """Whether a frame to or from the drive `node` is one of them."""
@@ -70,7 +70,7 @@ class Frames(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """What a drive must be doing for a fault to begin."""
+    """State that a drive must be in for a fault to begin."""
 
     drive: int | None
     """Index of the drive; None for any."""
@@ -79,33 +79,33 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One line, understood."""
+    """Fault described by one line."""
 
     line: str
     name: str
     drives: tuple[int, ...] = ()
-    """Indices of the drives it strikes; empty for the bus."""
+    """Indices of the affected drives; empty for the bus."""
     value: float = 0.0
     """Its VALUE; codes and identifiers are whole numbers."""
     frames: tuple[Frames, ...] = ()
     delay: float = 0.0
-    """Seconds from the line to the fault."""
+    """Time from the line to the fault [s]."""
     condition: Condition | None = None
     chance: float = 1.0
     duration: float = math.inf
-    """How long it lasts [s]."""
+    """Duration of the fault [s]."""
     number: int | None = None
-    """How many frames it strikes; None for all."""
+    """Number of frames affected; None for all."""
 
 
 EITHER: Final = {"to": Frames(True, None), "from": Frames(False, None)}
-"""Names of frames that drives of every protocol have."""
+"""Names of frames common to drives of every protocol."""
 CONDITIONS: Final = ("enabled", "moving", "stopping", "fault")
 _DRIVES: Final = {name: (index,) for index, name in enumerate(NAMES)} | {"all": tuple(range(len(NAMES)))}
 
 
 def _number(fits: Callable[[float], bool] = math.isfinite) -> Callable[[str], float]:
-    """Return what reads a finite number that fits."""
+    """Return a parser of finite numbers that fit; it raises ValueError for others."""
 
     def read(word: str) -> float:
         value = float(word)
@@ -134,10 +134,10 @@ def _between(low: int, high: int, base: int) -> Callable[[str], float]:
 
 
 class _Kind(NamedTuple):
-    """What a fault's name wants after it."""
+    """Syntax of the words after a fault's name."""
 
     wants: str = ""
-    """Its VALUE in words; empty where it has none."""
+    """Description of its VALUE; empty if it has none."""
     read: Callable[[str], float] | None = None
     example: str = ""
     momentary: bool = False
@@ -170,7 +170,7 @@ _OF_DRIVES: Final = {
     "play": _Kind("metres", _NOT_NEGATIVE, "0.00005"),
 }
 OF_SLIDERS: Final = ("node", "counts")
-"""Faults whose DRIVE is a slider, and that say what it has whatever is configured."""
+"""Faults whose DRIVE is a slider, and that override its configuration."""
 _OF_BUS: Final = {
     "bus-off": _Kind(),
     "error-passive": _Kind(),
@@ -180,7 +180,7 @@ _KINDS: Final = _OF_FRAMES | _OF_DRIVES | _OF_BUS
 
 
 class _Words:
-    """The words of a line, taken one by one."""
+    """Words of a line, consumed one by one."""
 
     def __init__(self, line: str) -> None:
         self.left = line.split()
@@ -202,7 +202,7 @@ class _Words:
 
 
 def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
-    """Read one line for drives whose frames have these names. Raises FaultSyntaxError, which says what is right."""
+    """Parse one line for drives with these names of frames. Raises FaultSyntaxError, which gives the correct form."""
     words = _Words(line)
     delay, chance, condition = 0.0, 1.0, None
     while words.next_is("at", "when", "with"):

@@ -1,4 +1,4 @@
-"""Faults on demand: disturbs the frames between a bus and its simulated drives, and the drives themselves."""
+"""Fault injection into the frames between a bus and its simulated drives, and into the drives themselves."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from trirail_drivers.simulated.faultlines import OF_SLIDERS, Condition, Fault, F
 from trirail_drivers.simulated.servo import SOUND
 
 MOVING: Final = 1e-3
-"""A slider moves from this speed on [m/s]."""
+"""Minimum speed at which a slider counts as moving [m/s]."""
 BABBLED: Final = 7000.0
-"""Frames a second of a node that takes all of a bus of 1 Mbit/s."""
+"""Frame rate of a node that saturates a bus of 1 Mbit/s [1/s]."""
 MOST_BABBLED: Final = 100
-"""Frames of it at a time, for somebody who did not listen for long."""
+"""Maximum number of its frames per poll, for a receiver that has not polled for a long time."""
 
 _STOPPING = (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
@@ -36,11 +36,11 @@ Deliver = Callable[[bytes], None]
 
 
 def _to_nobody(*_said: object) -> None:
-    """Where faults are told, and frames sent, that nobody listens to."""
+    """Discard announcements of faults, or frames, that have no receiver."""
 
 
 class _Active:
-    """A fault that waits for its time, or is in force."""
+    """A pending or active fault."""
 
     def __init__(self, fault: Fault, since: float) -> None:
         self.fault = fault
@@ -59,7 +59,7 @@ class _Active:
 
 
 class Faults:
-    """The faults of one bus. Chance comes from a seed: the same calls bring the same faults."""
+    """The faults of one bus. Random numbers are seeded: the same calls produce the same faults."""
 
     def __init__(
         self,
@@ -70,21 +70,22 @@ class Faults:
         announce: Callable[[str], None] = _to_nobody,
         mounted: Sequence[Mounted] | None = None,
     ) -> None:
-        """`counts_per_metre`: negative where counts fall as the slider rises. `frames`: those that lines can name.
+        """`counts_per_metre`: negative if counts fall as the slider's position rises. `frames`: those with names.
 
-        `announce`: hears what begins and ends. `mounted`: what each drive really moves, where that is not its own
-        slider by those counts; a line names a drive by that slider.
+        `announce`: called when a fault begins or ends. `mounted`: the slider and counts of each drive, if they differ
+        from its own slider and `counts_per_metre`; a line names a drive by that slider.
         """
         self.announce = announce
         self._mounted = [Mounted(*each) for each in enumerate(counts_per_metre)] if mounted is None else list(mounted)
         self._drive_of = {each.slider: index for index, each in enumerate(self._mounted)}
         self.carriages = Carriages([drive.servo for drive in drives], [each.counts_per_metre for each in self._mounted])
-        """Where the sliders really are."""
+        """True positions of the sliders."""
         for index, each in enumerate(self._mounted):
             self.carriages.couple(index, each.slider, 1.0)
         self._drives = drives
         self._frames = frames
-        self._scales = counts_per_metre
+        self._scales = [each.counts_per_metre for each in self._mounted]
+        """Counts of each drive per metre of actual slider travel."""
         self._random = random.Random(seed)
         self._active: list[_Active] = []
         self._held: list[tuple[float, int, Deliver, bytes]] = []
@@ -94,13 +95,13 @@ class Faults:
         self._emit: Callable[[int, bytes], None] = _to_nobody
 
     def connect(self, emit: Callable[[int, bytes], None], clock: Clock) -> None:
-        """Say where frames go that no drive sent, by identifier with flags and data, and what gives the time [s]."""
+        """Set the receiver of injected frames (identifier with flags, data) and the clock [s]."""
         self._emit = emit
         self._clock = clock
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether no fault is pending or active and no frame is delayed."""
         return not self._active and not self._held
 
     @property
@@ -109,11 +110,11 @@ class Faults:
         return any(active.begun and active.fault.name == "bus-off" for active in self._active)
 
     def seed(self, value: int) -> None:
-        """Begin chance anew."""
+        """Reseed the random number generator."""
         self._random.seed(value)
 
     def add(self, line: str) -> None:
-        """Take up a line. Raises FaultSyntaxError."""
+        """Add the fault of a line. Raises FaultSyntaxError."""
         fault = self._of_drives(parse(line, self._frames))
         if fault.name == "emcy":
             for index in fault.drives:
@@ -124,7 +125,7 @@ class Faults:
         self._active.append(_Active(fault, self._now))
 
     def _of_drives(self, fault: Fault) -> Fault:
-        """A fault of drives as they are configured, from one of drives by the sliders that they were mounted on."""
+        """Return the fault with configured indices of drives in place of the sliders that the drives are mounted on."""
         condition, drives = fault.condition, fault.drives
         if fault.name not in OF_SLIDERS:
             drives = tuple(self._drive_of.get(index, index) for index in drives)
@@ -133,7 +134,7 @@ class Faults:
         return dataclasses.replace(fault, drives=drives, condition=condition)
 
     def load(self, path: Path) -> None:
-        """Take up a file, one fault a line; # begins a comment. Raises DriveError with file and line."""
+        """Load a file with one fault per line; # begins a comment. Raises DriveError with file and line."""
         try:
             text = files.text(path)
         except FileError as error:
@@ -147,7 +148,7 @@ class Faults:
                     raise FaultSyntaxError(f"{path}:{number}: {error}") from error
 
     def clear(self) -> None:
-        """End all faults, and forget those to come."""
+        """End all active faults and discard pending ones."""
         ended, self._active = self._active, []
         for active in ended:
             if active.begun:
@@ -155,11 +156,11 @@ class Faults:
         self._break_drives()
 
     def lines(self) -> list[str]:
-        """Each fault in force or to come, as it was given."""
+        """Return the line of each active or pending fault."""
         return [f"{active.fault.line}{'' if active.begun else '  (to come)'}" for active in self._active]
 
     def poll(self, now: float) -> None:
-        """Do what is due at time `now` [s]."""
+        """Do the work due at time `now` [s]."""
         elapsed, self._now = now - self._now, now
         for active in tuple(self._active):
             fault = active.fault
@@ -179,7 +180,7 @@ class Faults:
             deliver(data)
 
     def carry(self, index: int, to_drive: bool, can_id: int, data: bytes, deliver: Deliver) -> None:
-        """Bring a frame to or from a drive: `deliver` it as often, as late and with such data as faults have it."""
+        """Carry a frame to or from a drive: faults determine how often, when and with which data to `deliver` it."""
         if self.bus_off or self._is_talked_down(can_id):
             return
         copies, wait = 1, 0.0
@@ -211,7 +212,7 @@ class Faults:
         fault = active.fault
         if self._now - active.since < fault.delay or (fault.condition and not self._holds(fault.condition)):
             return False
-        # With a chance, a fault of frames waits for its frames; others for their second, of which this is a part.
+        # A chance applies to each frame for faults of frames, and otherwise to each second, of which this is a part.
         return bool(fault.chance == 1.0 or self._strikes_frames(fault)) or (
             self._random.random() < 1.0 - (1.0 - fault.chance) ** elapsed
         )
@@ -277,39 +278,38 @@ class Faults:
     def _strikes_frames(fault: Fault) -> bool:
         return fault.name in ("drop", "duplicate", "corrupt", "delay", "dlc")
 
-    # What faults do.
+    # Effects of faults.
 
     def _break_drives(self) -> None:
-        """Make every drive as sound or defect as the faults now in force have it."""
+        """Apply the active faults to every drive, and restore drives without any."""
         begun = [active.fault for active in self._active if active.begun]
         wired = {round(each.value): slider for each in begun if each.name == "node" for slider in each.drives}
         counted = {slider: each.value for each in begun if each.name == "counts" for slider in each.drives}
-        for index, (drive, scale) in enumerate(zip(self._drives, self._scales, strict=True)):
+        for index, (drive, (mounted, counts)) in enumerate(zip(self._drives, self._mounted, strict=True)):
             fault = {each.name: each for each in begun if index in each.drives}
             drive.silent = "silent" in fault or "reboot" in fault
             drive.servo.lag = fault["lag"].value if "lag" in fault else None
-            drive.servo.forced_velocity = fault["runaway"].value * scale if "runaway" in fault else None
-            if "stuck" in fault:
-                drive.servo.forced_velocity = 0.0
-            slider, counts = self._mounted[index]
-            slider = wired.get(drive.node, round(fault["swapped"].value) if "swapped" in fault else slider)
+            slider = wired.get(drive.node, round(fault["swapped"].value) if "swapped" in fault else mounted)
             ratio = (fault["scale"].value if "scale" in fault else 1.0) * (-1.0 if "reversed" in fault else 1.0)
             if slider in counted:
                 ratio = counts / counted[slider]
-            drive.servo.encoder = self._encoder(fault, counts * ratio)
+            scale = self._scales[index] = counts / ratio
+            drive.servo.forced_velocity = fault["runaway"].value * scale if "runaway" in fault else None
+            if "stuck" in fault:
+                drive.servo.forced_velocity = 0.0
+            drive.servo.motor = -1.0 if "against" in fault else 1.0
+            drive.servo.encoder = self._encoder(fault, scale)
             drive.servo.play = fault["play"].value * scale if "play" in fault else 0.0
             self.carriages.couple(index, slider, ratio)
 
     @staticmethod
     def _encoder(fault: Mapping[str, Fault], rising: float) -> tuple[float, float]:
-        """The shares of its travel that a drive's encoder counts, as its counts rise and as they fall.
+        """Return the shares of the travel that a drive's encoder counts, as its counts rise and as they fall.
 
-        `rising` is below 0 where they fall as the slider rises.
+        `rising` is negative if counts fall as the slider's position rises.
         """
         if "loose" in fault:
             return 0.0, 0.0
-        if "against" in fault:
-            return -1.0, -1.0
         if "slips" not in fault:
             return SOUND
         held = 1.0 - fault["slips"].value  # while the slider's position rises

@@ -1,4 +1,4 @@
-"""Homing as a drive does it by itself: CiA 402-2, homing mode, to the edge of a switch or to where it stands."""
+"""Homing by the drive itself (CiA 402-2, homing mode): to the edge of a switch or at the current position."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Final
 from trirail_drivers.simulated.servo import Servo
 
 EDGES: Final = {17: 1, 18: -1, 19: -1, 20: 1, 21: 1, 22: -1}
-"""Methods 6098h without index pulse, and in which direction each at last crosses the edge of its switch."""
+"""Methods 6098h without index pulse, and the direction in which each finally crosses the edge of its switch."""
 STANDING: Final = (35, 37)
-"""Methods whose home is where the drive stands."""
+"""Methods that take the current position as home."""
 
 
 class Phase(Enum):
-    """What the axis is doing."""
+    """Phase of a homing run."""
 
     IDLE = auto()
     SEARCH = auto()
@@ -22,20 +22,20 @@ class Phase(Enum):
     RETREAT = auto()
     """Back across the edge, fast."""
     APPROACH = auto()
-    """Over the edge, slowly; where it is crossed is home."""
+    """Across the edge, slowly; home is where it is crossed."""
     HALT = auto()
     """Braking behind the edge."""
 
 
 class HomingMode:
-    """Finds home with one servo; velocities in counts/s, accelerations in counts/s²."""
+    """Homing mode of one servo; velocities in counts/s, accelerations in counts/s²."""
 
     def __init__(self, servo: Servo, switch: float | None) -> None:
         self.switch = switch
-        """Where the switch has its edge [counts]; None for nowhere."""
+        """Position of the edge of the switch [counts]; None without a switch."""
         self.attained = False
         self.failed = False
-        """True is a homing error; it ends with the next start."""
+        """Whether there is a homing error; the next start clears it."""
         self.phase = Phase.IDLE
         self._servo = servo
         self._direction = 1
@@ -44,16 +44,16 @@ class HomingMode:
 
     @property
     def under_way(self) -> bool:
-        """Whether it was started, and is neither over nor interrupted."""
+        """Whether homing has started and has neither finished nor been interrupted."""
         return self.phase is not Phase.IDLE
 
     def forget(self) -> None:
-        """Begin anew, as when the mode is entered."""
+        """Reset phase and result, as on entering the mode."""
         self.attained = self.failed = False
         self.phase = Phase.IDLE
 
     def start(self, method: int, fast: float, slow: float, acceleration: float, offset: int) -> None:
-        """Begin with `method`; afterwards the position at home is `offset` [counts]."""
+        """Start homing by `method`; afterwards the position at home is `offset` [counts]."""
         self.forget()
         self._fast, self._slow, self._acceleration, self._offset = fast, slow, acceleration, offset
         if method in STANDING and self._servo.velocity == 0.0:
@@ -65,11 +65,11 @@ class HomingMode:
             self.failed = True
 
     def interrupt(self) -> None:
-        """Give up; to brake is the drive's."""
+        """Abandon homing; braking is left to the drive."""
         self.phase = Phase.IDLE
 
     def move(self, step: float, halted: bool) -> None:
-        """Move for `step` seconds; `halted` only brakes, and what is under way goes on afterwards."""
+        """Move for `step` seconds; `halted` only brakes, and homing continues afterwards."""
         servo = self._servo
         before = self._beyond()
         speed = 0.0 if halted else self._speed()
@@ -92,11 +92,11 @@ class HomingMode:
                 return 0.0
 
     def _beyond(self) -> bool:
-        """Whether the axis is where it comes to when it crosses the edge in the last direction."""
+        """Return whether the axis is on the side of the edge that it reaches in the final direction."""
         return self.switch is not None and self._direction * (self._servo.position - self.switch) >= 0.0
 
     def _refer(self, home: float) -> None:
-        """Count from home on."""
+        """Reference the position to `home` [counts] and finish homing."""
         shift = self._offset - home
         self._servo.shift(shift)
         if self.switch is not None:

@@ -1,4 +1,4 @@
-"""An ODrive on CANSimple, simulated with its axis, in no thread of its own."""
+"""A simulated ODrive on CANSimple with its axis, without a thread of its own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Final
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.cansimple import AxisState, Error, ProcedureResult
-from trirail_drivers.odrive.flat_endpoints import KNOWN, Version
+from trirail_drivers.odrive.flat_endpoints import KNOWN_TABLES, Version
 from trirail_drivers.simulated.servo import Servo
 
 HARDWARE: Final = (4, 4, 58)
@@ -20,7 +20,7 @@ CAN: Final = "axis0.config.can"
 VELOCITY_CONTROL: Final = 2
 NEVER: Final = float("inf")
 BOOT: Final = 0.25
-"""How long a restarted drive says that it initialises [s]."""
+"""Time for which a restarted drive reports that it is initialising [s]."""
 
 _CYCLIC: Final = {
     "version": cansimple.GET_VERSION,
@@ -31,22 +31,27 @@ _SENT: Final = tuple(
     (name, f"{CAN}.{name}_msg_rate_ms", command)
     for name, command in (("heartbeat", cansimple.HEARTBEAT), *_CYCLIC.items())
 )
-"""What it sends by itself: the name, the setting with the period [ms], and the message."""
+"""Cyclic messages: name, setting with the period [ms], and command."""
 _OTHERS: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
-"""What it can send by itself beside heartbeats, and what nobody reads: settings that are told, and not sent."""
-_REQUESTS: Final = (cansimple.GET_VERSION, cansimple.GET_ERROR, cansimple.GET_ENCODER_ESTIMATES)
+"""Further cyclic messages that no client reads: their settings are stored and reported, but nothing is sent."""
+_REQUESTS: Final = (
+    cansimple.GET_VERSION,
+    cansimple.GET_ERROR,
+    cansimple.ADDRESS,
+    cansimple.GET_ENCODER_ESTIMATES,
+)
 
 
 def _discard(can_id: int, data: bytes) -> None:
-    """Where a device that is on no bus sends."""
+    """Drop a frame of a device that is on no bus."""
 
 
 class SimulatedOdrive:
-    """An ODrive axis. Whoever owns it brings frames and the time to it with `receive` and `poll`.
+    """An ODrive axis. Its owner passes it frames and the time with `receive` and `poll`.
 
-    It moves with the time, and follows each setpoint from its arrival on. Disarmed, it coasts: no brake holds it, and
-    `friction` [turns/s²] brings it to rest. Its watchdog disarms it where no message has come for `watchdog` seconds.
-    By itself it sends heartbeats, and what its settings ask for.
+    It moves with time and follows each setpoint from its arrival. Disarmed, it coasts: no brake holds it, and
+    `friction` [turns/s²] brings it to rest. Its watchdog disarms it after `watchdog` seconds without a message.
+    It sends heartbeats and the cyclic messages that its settings enable.
     """
 
     def __init__(self, node: int, servo: Servo, *, heartbeat: float, friction: float, watchdog: float = NEVER) -> None:
@@ -58,26 +63,28 @@ class SimulatedOdrive:
         self.disarm_reason = Error(0)
         self.result = ProcedureResult.SUCCESS
         self.calibrated = True
-        """Without calibration it refuses closed loop control."""
+        """Whether it is calibrated; otherwise it refuses closed loop control."""
         self.silent = False
-        """True cuts the wire: nothing is heard or sent any more, while the device itself goes on."""
+        """Whether its wire is cut: it receives and sends nothing, but keeps running."""
         self.modes = (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
-        """Control mode and input mode; at first whatever somebody else has left there."""
+        """Control mode and input mode; initially those that another client has left."""
         self.version = Version(HARDWARE, FIRMWARE)
+        self.serial = 0x3664_0000_0000 + node
         self.settings: dict[str, float] = {
             "axis0.config.enable_watchdog": watchdog < NEVER,
             "axis0.config.watchdog_timeout": watchdog if watchdog < NEVER else 0.0,
             f"{CAN}.input_vel_scale": 1000,
             f"{CAN}.heartbeat_msg_rate_ms": round(1000 * heartbeat),
             **{f"{CAN}.{name}_msg_rate_ms": 0 for name in (*_CYCLIC, *_OTHERS)},
+            "axis0.pos_vel_mapper.status": 0,
         }
-        """What it was set to, by the path; endpoints as its firmware numbers them."""
+        """Settings by path; endpoints as its firmware numbers them."""
         self._input = (servo.position, 0.0)
         self._friction = friction
         self._fed = self._moved_at = 0.0
         self._booted = NEVER
         self._due: dict[str, float] = {}
-        """When each cyclic message is due."""
+        """Time at which each cyclic message is due [s]."""
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {
             cansimple.ESTOP: self._estop,
@@ -90,13 +97,13 @@ class SimulatedOdrive:
 
     @property
     def state(self) -> str:
-        """The axis state in words, and why it was disarmed."""
+        """Axis state in words, and the reason for disarming."""
         name = cansimple.state_name(self.axis_state)
         return f"{name}, {cansimple.error_names(self.disarm_reason)}" if self.disarm_reason else name
 
     @property
     def power(self) -> PowerState:
-        """Its state as CiA 402 has it."""
+        """State of the drive in terms of CiA 402."""
         if self._armed:
             return PowerState.OPERATION_ENABLED
         return PowerState.FAULT if self._error_bits else PowerState.SWITCH_ON_DISABLED
@@ -107,17 +114,17 @@ class SimulatedOdrive:
         return None
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Put the drive on a bus, that it sends to by `transmit(can_id, data)`, and switch it on."""
+        """Put the drive on a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
         self._transmit = transmit
         self._moved_at = now
         self._due = dict.fromkeys(("heartbeat", *_CYCLIC), now)
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
-        """Take in a data frame at time `now` [s]; an empty one is a request as well, a wrong length does nothing."""
+        """Receive a data frame at time `now` [s]; an empty one is also a request, a wrong length is ignored."""
         node, command = divmod(can_id, 1 << 5)
         if node != self.node or self.silent:
             return
-        self.poll(now)  # what was due before the frame came
+        self.poll(now)  # work that was due before the frame
         self._fed = now
         if command in _REQUESTS:
             if not data:
@@ -127,11 +134,11 @@ class SimulatedOdrive:
                 self._handlers[command](data)
 
     def receive_remote(self, can_id: int, now: float) -> None:
-        """Take in a remote frame at time `now` [s]."""
+        """Receive a remote frame at time `now` [s]."""
         self.receive(can_id, b"", now)
 
     def poll(self, now: float) -> None:
-        """Do what is due at time `now` [s]."""
+        """Do the work due at time `now` [s]."""
         if now > self._moved_at:
             self._move(now - self._moved_at)
             self._moved_at = now
@@ -145,11 +152,11 @@ class SimulatedOdrive:
             if now >= self._due[name] and (period := self.settings[setting] / 1000.0):
                 self._answer(command)
                 self._due[name] += period
-                if self._due[name] <= now:  # too late for that one as well: leave it out
+                if self._due[name] <= now:  # the next one is overdue as well: skip it
                     self._due[name] = now + period
 
     def press(self, switches: int) -> None:
-        """Do nothing: CANSimple does not tell of switches."""
+        """Do nothing: CANSimple does not report switches."""
 
     def fail(self, errors: int) -> None:
         """Disarm with these errors."""
@@ -160,7 +167,7 @@ class SimulatedOdrive:
             self.axis_state = AxisState.IDLE
 
     def restart(self, now: float) -> None:
-        """Lose power for a moment: it comes back idle, without what it had not saved."""
+        """Cycle the power supply: the drive restarts in idle and loses its modes and errors."""
         self.axis_state, self.modes = AxisState.UNDEFINED, (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
         self.errors, self.disarm_reason, self.result = Error.INITIALIZING, Error(0), ProcedureResult.SUCCESS
         self._booted = now + BOOT
@@ -184,6 +191,8 @@ class SimulatedOdrive:
             data = cansimple.BEAT.pack(self._error_bits, self.axis_state, self.result, 0)
         elif command == cansimple.GET_VERSION:
             data = cansimple.VERSION.pack(2, *self.version.hardware, *self.version.firmware, self.version.unreleased)
+        elif command == cansimple.ADDRESS:
+            data = bytes([self.node]) + self.serial.to_bytes(6, "little") + b"\0"
         elif command == cansimple.GET_ERROR:
             data = cansimple.ERRORS.pack(self.errors, self.disarm_reason)
         else:
@@ -191,9 +200,9 @@ class SimulatedOdrive:
         self._send(command, data)
 
     def _sdo(self, data: bytes) -> None:
-        """RxSdo: read or write a setting; none of another firmware's numbers is answered."""
+        """Read or write a setting (RxSdo); endpoint numbers of other firmware get no answer."""
         opcode, number, _ = cansimple.SDO.unpack_from(data)
-        table = next((table.endpoints for table in KNOWN if table.is_of(self.version)), {})
+        table = next((table.endpoints for table in KNOWN_TABLES if table.matches(self.version)), {})
         for path, endpoint in table.items():
             if endpoint.id != number or path not in self.settings:
                 continue
@@ -222,7 +231,7 @@ class SimulatedOdrive:
             else:
                 self.result, self.axis_state = ProcedureResult.SUCCESS, AxisState.CLOSED_LOOP_CONTROL
                 self.disarm_reason = Error(0)
-                # It begins where it stands (axis.cpp of the firmware's published source).
+                # Hold the current position at first (axis.cpp of the firmware's published source).
                 self._input = self.servo.position, 0.0
 
     def _set_mode(self, data: bytes) -> None:

@@ -1,10 +1,12 @@
-"""Process data objects: mapping rules, packing, and when they take effect (CiA 301, PDO)."""
+"""Process data objects: mapping rules, packing, and the time at which they take effect (CiA 301, PDO)."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from struct import Struct
+
+from canopen import SdoAbortedError
 
 from trirail_drivers.simulated.dictionary import (
     INVALID_VALUE,
@@ -15,7 +17,6 @@ from trirail_drivers.simulated.dictionary import (
     WRONG_STATE,
     Dictionary,
     ObjectEntry,
-    SdoAbort,
 )
 
 _NOT_VALID = 1 << 31
@@ -29,14 +30,14 @@ _RESTRICTED = (
     range(0x601, 0x680),
     range(0x6E0, 0x800),
 )
-"""CAN-IDs that no PDO may have (CiA 301, restricted CAN-IDs)."""
+"""CAN-IDs forbidden for PDOs (CiA 301, restricted CAN-IDs)."""
 _MOST_BYTES = 8
 _ON_EVENT = 255
-"""Transmission type: as the device profile has it."""
+"""Transmission type: event-driven, as the device profile defines."""
 
 
 class Pdo(ABC):
-    """What both directions share: communication parameter, mapping, and the rules for changing them."""
+    """Common part of both directions: communication parameter, mapping, and the rules for changing them."""
 
     def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         self.number = communication % 0x200 + 1
@@ -45,7 +46,7 @@ class Pdo(ABC):
         self._cob_id = objects.internal(communication, 1, _NOT_VALID)
         self._type = objects.internal(communication, 2, _ON_EVENT)
         self._most = 0
-        """Objects that its mapping has room for."""
+        """Maximum number of objects in its mapping."""
         while (mapping, self._most + 1) in objects:
             self._most += 1
         given = [objects.internal(mapping, n).default for n in range(1, self._most + 1)]
@@ -65,69 +66,69 @@ class Pdo(ABC):
 
     @property
     def can_id(self) -> int:
-        """The CAN-ID that it is sent with."""
+        """CAN-ID of its frames."""
         return self._cob_id.value & _CAN_ID
 
     @property
     def remote(self) -> bool:
-        """Whether a remote frame may ask for it (bit 30 of its COB-ID is clear)."""
+        """Whether a remote frame may request it (bit 30 of its COB-ID is clear)."""
         return not self._cob_id.value & _NO_REMOTE
 
     @property
     def synchronous(self) -> bool:
-        """Whether it goes by SYNC (transmission types 0 to 240)."""
+        """Whether SYNC triggers it (transmission types 0 to 240)."""
         return self._type.value <= 240
 
     def refresh(self) -> None:
-        """Work out the packing from the mapping, so that the cycle has only to use it."""
+        """Compute the packing from the mapping in advance, for use in the cycle."""
         self.entries = tuple(self._mapped(value) for value in self._values())
         self.layout = Struct("<" + "".join(entry.format for entry in self.entries))
         self._plain = all(entry.plain for entry in self.entries)
 
     def power_on(self) -> None:
-        """Take up the mapping that the EDS gives; where that is none that could be written, nothing is mapped."""
+        """Apply the mapping of the EDS; if that mapping could not be written, nothing is mapped."""
         try:
             self.refresh()
-        except SdoAbort:
+        except SdoAbortedError:
             self.entries, self.layout, self._plain = (), Struct("<"), True
 
     @abstractmethod
     def permits(self, entry: ObjectEntry) -> bool:
-        """Whether `entry` may travel in this direction."""
+        """Return whether `entry` may be mapped in this direction."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Forget what was received or sent."""
+        """Discard received or sent data."""
 
     def _values(self) -> list[int]:
-        """The mapping as far as it is counted; the counts that some drives have at power-on go beyond it."""
+        """Return the mapped values up to the count, which exceeds the mapping at power-on in some drives."""
         values = [self._objects[self._mapping, n].value for n in range(1, min(self._count.value, self._most) + 1)]
         return values[: (*values, 0).index(0)]
 
     def _mapped(self, value: int) -> ObjectEntry:
-        """The entry that a mapping parameter names: index, subindex, length in bits."""
+        """Return the entry of a mapping parameter: index, subindex, length in bits. Raises SdoAbortedError."""
         index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
         if not value:
-            raise SdoAbort(NO_OBJECT)
+            raise SdoAbortedError(NO_OBJECT)
         entry = self._objects[index, subindex]
         if not (entry.mappable and self.permits(entry) and entry.size and bits == 8 * entry.size):
-            raise SdoAbort(NOT_MAPPABLE)
+            raise SdoAbortedError(NOT_MAPPABLE)
         return entry
 
     def _mapping_written(self, entry: ObjectEntry, old: int) -> None:
-        """CiA 301, 1600h and 1A00h: first no PDO, then no entries, then the entries, then how many."""
+        """Check the order of writes: PDO off, count 0, the entries, their count (CiA 301, 1600h and 1A00h)."""
         count = old if entry.subindex == 0 else self._count.value
         if self.valid or (entry.subindex and count):
-            raise SdoAbort(UNSUPPORTED_ACCESS)
+            raise SdoAbortedError(UNSUPPORTED_ACCESS)
         if entry.subindex:
             if entry.value:
                 self._mapped(entry.value)
             return
         if entry.value > self._most:
-            raise SdoAbort(PDO_TOO_LONG)
+            raise SdoAbortedError(PDO_TOO_LONG)
         mapped = [self._mapped(self._objects[self._mapping, n].value) for n in range(1, entry.value + 1)]
         if sum(item.size or 0 for item in mapped) > _MOST_BYTES:
-            raise SdoAbort(PDO_TOO_LONG)
+            raise SdoAbortedError(PDO_TOO_LONG)
         self.refresh()
 
     def _communication_written(self, entry: ObjectEntry, old: int) -> None:
@@ -135,40 +136,40 @@ class Pdo(ABC):
             case 1:
                 restricted = self.valid and any(self.can_id in ids for ids in _RESTRICTED)
                 if entry.value & _EXTENDED or restricted:
-                    raise SdoAbort(INVALID_VALUE)
+                    raise SdoAbortedError(INVALID_VALUE)
                 if self.valid and not old & _NOT_VALID and (entry.value ^ old) & ~_NOT_VALID:
-                    raise SdoAbort(WRONG_STATE)
+                    raise SdoAbortedError(WRONG_STATE)
             case 2:
                 if 240 < entry.value < 254:
-                    raise SdoAbort(INVALID_VALUE)
+                    raise SdoAbortedError(INVALID_VALUE)
             case 3:
                 if self.valid:
-                    raise SdoAbort(WRONG_STATE)
+                    raise SdoAbortedError(WRONG_STATE)
         self.reset()
         self._changed()
 
 
 class ReceivePdo(Pdo):
-    """An RPDO: taken up at the SYNC after it arrived (types 0 to 240) or at once (254, 255)."""
+    """An RPDO: applied at the SYNC after its arrival (types 0 to 240) or on arrival (254, 255)."""
 
     _latched: tuple[int | bytes, ...] | None = None
 
     def permits(self, entry: ObjectEntry) -> bool:
-        """Only what the bus may write."""
+        """Return whether the bus may write the entry."""
         return entry.writable
 
     def reset(self) -> None:
-        """Forget what was latched."""
+        """Discard the latched values."""
         self._latched = None
 
     def receive(self, data: bytes) -> None:
-        """Take in a frame that is long enough."""
+        """Receive a frame of sufficient length."""
         self._latched = self.layout.unpack_from(data)
         if not self.synchronous:
             self.write_latched()
 
     def write_latched(self) -> None:
-        """Write what was latched; a value that an object refuses is left out, as an SDO's would be."""
+        """Write the latched values; skip a value that its object refuses, as it would refuse an SDO."""
         values, self._latched = self._latched, None
         if values is None:
             return
@@ -178,7 +179,7 @@ class ReceivePdo(Pdo):
                     entry.write(value)
                 else:
                     entry.load(value)
-            except SdoAbort:
+            except SdoAbortedError:
                 continue
 
 
@@ -192,23 +193,23 @@ class TransmitPdo(Pdo):
         self.reset()
 
     def permits(self, entry: ObjectEntry) -> bool:
-        """Only what the bus may read."""
+        """Return whether the bus may read the entry."""
         return entry.readable
 
     def reset(self) -> None:
-        """Begin anew: nothing sent yet, no SYNC counted."""
+        """Reset to nothing sent and no SYNC counted."""
         self._syncs = 0
         self._sent: bytes | None = None
         self._sent_at = 0.0
 
     def pack(self) -> bytes:
-        """The mapped values as they are now."""
+        """Return the current mapped values."""
         if self._plain:
             return self.layout.pack(*[entry.value for entry in self.entries])
         return b"".join([entry.encode() for entry in self.entries])
 
     def at_sync(self) -> bytes | None:
-        """The data to send on this SYNC, if any."""
+        """Return the data to send on this SYNC, if any."""
         if self._type.value:
             self._syncs += 1
             if self._syncs < self._type.value:
@@ -222,7 +223,7 @@ class TransmitPdo(Pdo):
         return data
 
     def on_event(self, now: float) -> bytes | None:
-        """The data to send at time `now` [s], if any: on a change or by event timer, unless inhibited."""
+        """Return the data to send at time `now` [s], if any: on a change or by event timer, unless inhibited."""
         data = self.pack()
         if self._sent is not None:
             elapsed = now - self._sent_at

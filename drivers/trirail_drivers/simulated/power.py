@@ -1,4 +1,4 @@
-"""The CiA 402 power state machine as values: commands, transitions and the statusword of each state."""
+"""Tables of the CiA 402 power state machine: commands, transitions and the statusword of each state."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FAULT_REACTION_ACTIVE = PowerState.FAULT_REACTION_ACTIVE
 FAULT = PowerState.FAULT
 
 FAULT_RESET = 0x80
-"""The controlword's bit 7; its rising edge is the command."""
+"""Bit 7 of the controlword; its rising edge is the command."""
 
 STATUS: Final = {
     PowerState.NOT_READY_TO_SWITCH_ON: 0x0000,
@@ -32,11 +32,11 @@ STATUS: Final = {
 
 
 class ControlwordCommand(Enum):
-    """What a controlword asks for (CiA 402-2, 6040h, command coding)."""
+    """Command of a controlword (CiA 402-2, 6040h, command coding)."""
 
     SHUTDOWN = auto()
     SWITCH_ON = auto()
-    """In OPERATION ENABLED the same bits are "disable operation"."""
+    """Switch on; in OPERATION ENABLED the same bits are "disable operation"."""
     ENABLE_OPERATION = auto()
     DISABLE_VOLTAGE = auto()
     QUICK_STOP = auto()
@@ -54,7 +54,7 @@ _CODING: Final = (
 _TRANSITIONS: Final = {
     (SWITCH_ON_DISABLED, ControlwordCommand.SHUTDOWN): READY_TO_SWITCH_ON,  # 2
     (READY_TO_SWITCH_ON, ControlwordCommand.SWITCH_ON): SWITCHED_ON,  # 3
-    (READY_TO_SWITCH_ON, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 3 and at once 4
+    (READY_TO_SWITCH_ON, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 3, followed by 4
     (SWITCHED_ON, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 4
     (OPERATION_ENABLED, ControlwordCommand.SWITCH_ON): SWITCHED_ON,  # 5
     (SWITCHED_ON, ControlwordCommand.SHUTDOWN): READY_TO_SWITCH_ON,  # 6
@@ -68,11 +68,11 @@ _TRANSITIONS: Final = {
     (QUICK_STOP_ACTIVE, ControlwordCommand.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 12
     (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 16
 }
-"""By command; transitions 0, 1, 13, 14 are the drive's own and 15 is the fault reset."""
+"""Transitions by command; the drive performs 0, 1, 13 and 14 itself, and 15 is the fault reset."""
 
 
 def command(controlword: int) -> ControlwordCommand | None:
-    """The command in `controlword`, None where its bits are none."""
+    """Return the command in `controlword`; None if its bits are not a command."""
     for mask, value, meaning in _CODING:
         if controlword & mask == value:
             return meaning
@@ -80,7 +80,7 @@ def command(controlword: int) -> ControlwordCommand | None:
 
 
 def commanded(state: PowerState, controlword: int, resumes: bool) -> PowerState:
-    """The state after `controlword`; whether a quick stop `resumes` (transition 16) is for 605Ah to say."""
+    """Return the state after `controlword`; 605Ah determines whether a quick stop `resumes` (transition 16)."""
     order = command(controlword)
     if order is None or (state, order, resumes) == (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION, False):
         return state

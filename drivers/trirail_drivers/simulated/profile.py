@@ -1,4 +1,4 @@
-"""The objects of CiA 402 that a simulated drive goes by, in counts and seconds, whatever units they are in."""
+"""CiA 402 objects that a simulated drive uses, converted from their units to counts and seconds."""
 
 from __future__ import annotations
 
@@ -6,34 +6,77 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry, SdoAbort
+from canopen import SdoAbortedError
+
+from trirail_drivers.simulated.dictionary import INVALID_VALUE, Dictionary, ObjectEntry
 from trirail_drivers.simulated.factor_group import FactorGroup, Mechanics
 from trirail_drivers.simulated.homing import EDGES, STANDING
-from trirail_drivers.simulated.makes import MakersRules
 from trirail_drivers.simulated.servo import Servo
 
+TECHNOSOFT: Final = 0x1A3
+NANOTEC: Final = 0x26C
+LINEAR: Final = 1 << 8
+"""Bit 8 of Technosoft's 208Eh, auxiliary settings register."""
+_MILLISECONDS: Final = -3
+
+
+class MakersRules:
+    """Deviations of a manufacturer from CiA 402; drives of vendors not listed here have none."""
+
+    def __init__(self, objects: Dictionary) -> None:
+        vendor = objects.internal(0x1018, 1).value
+        self._technosoft = vendor == TECHNOSOFT
+        self._auxiliary = objects.internal(0x208E, 0)
+        if vendor == NANOTEC:
+            objects.on_write(0x60C2, _in_milliseconds)
+
+    @property
+    def interpolates_linearly(self) -> bool:
+        """Whether mode 7 follows 60C1h:01 as CiA 402 defines.
+
+        Technosoft, iPOS CANopen Programming (P091.063), section 9.2.1, as quoted in issues 198 and 222 of
+        roboticslab-uc3m/yarp-devices: 208Eh bit 8 selects linear interpolation without a buffer; else 60C0h = 0 is PT
+        mode, which buffers points with their time in 60C1h:02, so that a position alone moves nothing.
+        """
+        return not self._technosoft or bool(self._auxiliary.value & LINEAR)
+
+    @property
+    def shows_mode_with_power_alone(self) -> bool:
+        """Whether 6061h takes the value of 6060h only in OPERATION ENABLED.
+
+        Technosoft, the same manual of 2019, 6061h, as quoted in issue 215 of yarp-devices.
+        """
+        return self._technosoft
+
+
+def _in_milliseconds(entry: ObjectEntry, _old: int) -> None:
+    """Refuse exponents other than -3, milliseconds (Nanotec, manual of the PD4-C, 60C2h:02)."""
+    if entry.subindex == 2 and entry.value != _MILLISECONDS:
+        raise SdoAbortedError(INVALID_VALUE)
+
+
 DEVICE_TYPE: Final = 0x0002_0192
-"""1000h: a servo drive of CiA profile 402."""
+"""Value of 1000h: a servo drive of CiA profile 402."""
 
 NO_MODE: Final = 0
 HOMING: Final = 6
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8
 _MODES: Final = (HOMING, INTERPOLATED_POSITION, CYCLIC_SYNCHRONOUS_POSITION)
-"""What 6060h takes, of those in 6502h."""
+"""Modes that 6060h accepts, as far as 6502h lists them."""
 _INTERPOLATE: Final = 1 << 4
-"""The controlword's bit 4, as mode 7 defines it."""
+"""Bit 4 of the controlword, as mode 7 defines it."""
 
 _STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
-"""605Ah: by the quick-stop ramp into SWITCH ON DISABLED, or staying in QUICK STOP ACTIVE."""
+"""Values of 605Ah: quick-stop ramp into SWITCH ON DISABLED, or remaining in QUICK STOP ACTIVE."""
 _STAYS: Final = (5, 6, 7, 8)
-"""Values of 605Ah after which it stays there."""
+"""Values of 605Ah with which it remains in QUICK STOP ACTIVE."""
 
 _WINDOW_OFF: Final = 0xFFFFFFFF
 
 
 class Profile:
-    """What its dictionary lacks, the drive does without: 6007h as 0, 605Ah as 2, 6065h as no window, 60B1h as none."""
+    """CiA 402 objects, with defaults for those missing: 6007h is 0, 605Ah is 2, 6065h is no window, 60B1h is 0."""
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics, mode_changed: Callable[[], None]) -> None:
         self._mode_changed = mode_changed
@@ -72,70 +115,70 @@ class Profile:
         o.on_write(0x6098, self._method_written)
 
     def restarted(self) -> None:
-        """The objects have their power-on values."""
+        """Update units and mode display after the objects have received their power-on values."""
         self.units.refresh()
         if not self._makers.shows_mode_with_power_alone:
             self._mode_display.value = self.mode.value
 
     def change(self, *, enabled: bool) -> None:
-        """Have power, in operation enabled, or none."""
+        """Set whether the drive is in OPERATION ENABLED, with power."""
         self._enabled = enabled
         if enabled:
             self._mode_display.value = self.mode.value
 
     @property
     def follows_setpoints(self) -> bool:
-        """Whether mode and controlword have it follow setpoints; mode 7 does while bit 4 is set (CiA 402-2)."""
+        """Whether it follows setpoints, by mode and controlword; mode 7 does while bit 4 is set (CiA 402-2)."""
         if self.mode.value == INTERPOLATED_POSITION:
             return bool(self.controlword.value & _INTERPOLATE) and self._makers.interpolates_linearly
         return self.mode.value == CYCLIC_SYNCHRONOUS_POSITION
 
     @property
     def setpoint(self) -> float:
-        """Where it is to be [counts]: 607Ah, in mode 7 60C1h."""
+        """Setpoint of the position [counts]: 607Ah, in mode 7 60C1h."""
         entry = self._data_record if self.mode.value == INTERPOLATED_POSITION else self._target
         return entry.value * self.units.position
 
     def hold(self) -> None:
-        """Make where it is the setpoint."""
+        """Make the actual position the setpoint."""
         self._target.value = self._data_record.value = self._position.value
 
     @property
     def feed_forward(self) -> float:
-        """The velocity offset of mode 8 [counts/s]."""
+        """Velocity offset of mode 8 [counts/s]; 0 in other modes."""
         cyclic = self.mode.value == CYCLIC_SYNCHRONOUS_POSITION
         return self._velocity_offset.value * self.units.velocity if cyclic else 0.0
 
     @property
     def interpolation_period(self) -> float:
-        """60C2h [s]; 0 where it is not set."""
+        """Interpolation period, 60C2h [s]; 0 if not set."""
         return self._period.value * math.pow(10.0, self._exponent.value)
 
     @property
     def quick_stop_deceleration(self) -> float:
-        """6085h [counts/s²]; 0 where it is not set."""
+        """Quick-stop deceleration, 6085h [counts/s²]; 0 if not set."""
         return self._quick_stop_deceleration.value * self.units.acceleration
 
     @property
     def stays_stopped(self) -> bool:
-        """Whether it stays in QUICK STOP ACTIVE (605Ah)."""
+        """Whether it remains in QUICK STOP ACTIVE (605Ah)."""
         return self._quick_stop_option.value in _STAYS
 
     @property
     def window(self) -> tuple[float, float]:
-        """How far it may be from its setpoint [counts], and beyond that how long [s] (6065h, 6066h)."""
+        """Limit of the following error [counts], and the time for which it may be exceeded [s] (6065h, 6066h)."""
         window = math.inf if self._window.value == _WINDOW_OFF else self._window.value * self.units.position
         return window, self._window_time.value * 1e-3
 
     @property
     def homing(self) -> tuple[int, float, float, float, int]:
-        """Method, speeds towards switch and zero, acceleration, and the position at home, in counts."""
+        """Homing method, speeds towards switch and zero, acceleration, and the position at home, in counts."""
         fast, slow = (speed.value * self.units.velocity for speed in self._homing_speeds)
         acceleration = self._homing_acceleration.value * self.units.acceleration
         return self._homing_method.value, fast, slow, acceleration, round(self._home_offset.value * self.units.position)
 
     def update_actual(self, servo: Servo) -> None:
-        """Bring the actual values up to date."""
+        """Update the actual values."""
         units = self.units
         self._position.store(servo.position / units.position)
         self._velocity.store(servo.velocity / units.velocity)
@@ -144,7 +187,7 @@ class Profile:
     def _mode_written(self, entry: ObjectEntry, old: int) -> None:
         mode = entry.value
         if mode != NO_MODE and not (mode in _MODES and self._supported.value >> (mode - 1) & 1):
-            raise SdoAbort(INVALID_VALUE)
+            raise SdoAbortedError(INVALID_VALUE)
         if self._enabled or not self._makers.shows_mode_with_power_alone:
             self._mode_display.value = mode
         if mode != old:
@@ -152,8 +195,8 @@ class Profile:
 
     def _quick_stop_option_written(self, entry: ObjectEntry, _old: int) -> None:
         if entry.value not in (_STOP_AND_DISABLE, _STOP_AND_STAY):
-            raise SdoAbort(INVALID_VALUE)
+            raise SdoAbortedError(INVALID_VALUE)
 
     def _method_written(self, entry: ObjectEntry, _old: int) -> None:
         if entry.value not in (NO_MODE, *EDGES, *STANDING):
-            raise SdoAbort(INVALID_VALUE)
+            raise SdoAbortedError(INVALID_VALUE)

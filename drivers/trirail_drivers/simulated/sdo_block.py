@@ -1,47 +1,49 @@
-"""SDO block transfers as a server does them: segments without an answer each, a CRC over all (CiA 301, SDO block)."""
+"""Server side of SDO block transfers: segments without individual answers, a CRC over all (CiA 301, SDO block)."""
 
 from __future__ import annotations
 
 from binascii import crc_hqx
 from typing import Final
 
-from trirail_drivers.simulated.dictionary import TOO_LONG, SdoAbort
+from canopen import SdoAbortedError
+
+from trirail_drivers.simulated.dictionary import TOO_LONG
 
 INVALID_BLOCK_SIZE = 0x05040002
 INVALID_SEQUENCE = 0x05040003
 CRC_ERROR = 0x05040004
 
 MOST_SEGMENTS: Final = 127
-"""Segments of a block at most."""
+"""Maximum number of segments in a block."""
 _SEGMENT: Final = 7
-"""Bytes of a segment."""
+"""Size of a segment [bytes]."""
 _UPLOAD, _DOWNLOAD = 5, 6
-"""The client's command specifiers, in the three highest bits."""
+"""Command specifiers of the client, in the three highest bits."""
 _END, _ACKNOWLEDGED, _START = 1, 2, 3
-"""What the two lowest bits tell."""
+"""Subcommands, in the two lowest bits."""
 _ABORT: Final = 0x80
 CRC_WANTED: Final = 0x04
-"""Bit of a command that begins a transfer: the client, or in the answer the server, reckons the CRC."""
+"""Bit of a command that begins a transfer: the client (in the answer, the server) supports the CRC."""
 
 
 class BlockUpload:
-    """The client reads: blocks of segments go out, each block is acknowledged, then the CRC."""
+    """Read by the client: the server sends blocks of segments, each acknowledged, then the CRC."""
 
     def __init__(self, content: bytes, request: bytes) -> None:
         self.over = False
         self._content = content
         self._with_crc = bool(request[0] & CRC_WANTED)
         self._sent = 0
-        """Bytes acknowledged."""
+        """Number of bytes acknowledged."""
         self._size = request[4]
         self._check_size()
 
     def takes(self, data: bytes) -> bool:
-        """Whether a frame belongs to the transfer."""
+        """Return whether a frame belongs to the transfer."""
         return data[0] >> 5 == _UPLOAD and data[0] & 0x03 != 0
 
     def answers(self, data: bytes) -> list[bytes]:
-        """Go on with what the client said."""
+        """Return the answers to a frame of the client. Raises SdoAbortedError."""
         what = data[0] & 0x03
         if what == _START:
             return self._block()
@@ -51,9 +53,9 @@ class BlockUpload:
         return []
 
     def _acknowledged(self, last: int, size: int) -> list[bytes]:
-        """Segments after the last one that arrived are sent again, in blocks of the size that the client wants now."""
+        """Continue after the last segment that arrived, in blocks of the size that the client now requests."""
         if last > self._size:
-            raise SdoAbort(INVALID_SEQUENCE)
+            raise SdoAbortedError(INVALID_SEQUENCE)
         self._sent = min(self._sent + last * _SEGMENT, max(len(self._content), 1))
         self._size = size
         self._check_size()
@@ -77,18 +79,18 @@ class BlockUpload:
 
     def _check_size(self) -> None:
         if not 1 <= self._size <= MOST_SEGMENTS:
-            raise SdoAbort(INVALID_BLOCK_SIZE)
+            raise SdoAbortedError(INVALID_BLOCK_SIZE)
 
 
 class BlockDownload:
-    """The client writes: its segments come in blocks, each block is acknowledged, then its CRC is checked."""
+    """Write by the client: the server acknowledges each block of segments, then checks the CRC."""
 
     def __init__(self, request: bytes, longest: int) -> None:
         self.over = False
         self.content = b""
-        """What was written, when it is over."""
+        """Data written, complete when the transfer is over."""
         self.size = MOST_SEGMENTS
-        """Segments of a block."""
+        """Number of segments in a block."""
         self._with_crc = bool(request[0] & CRC_WANTED)
         self._longest = longest
         self._received = bytearray()
@@ -96,25 +98,25 @@ class BlockDownload:
         self._last = False
 
     def takes(self, data: bytes) -> bool:
-        """Whether a frame belongs to the transfer: all do but an abort, until the last segment has come."""
+        """Return whether a frame belongs to the transfer: until the last segment, every frame but an abort."""
         if self._last:
             return data[0] >> 5 == _DOWNLOAD and data[0] & 0x03 == _END
         return data[0] != _ABORT
 
     def answers(self, data: bytes) -> list[bytes]:
-        """Go on with what the client said."""
+        """Return the answers to a frame of the client. Raises SdoAbortedError."""
         return self._segment(data) if not self._last else self._end(data)
 
     def _segment(self, data: bytes) -> list[bytes]:
         number, last = data[0] & 0x7F, bool(data[0] & 0x80)
         if not 1 <= number <= self.size:
-            raise SdoAbort(INVALID_SEQUENCE)
+            raise SdoAbortedError(INVALID_SEQUENCE)
         in_turn = number == self._number + 1
-        if in_turn:  # those after a gap are let go, and sent again after the acknowledgement
+        if in_turn:  # segments after a gap are dropped; the client repeats them after the acknowledgement
             self._received += data[1:]
             self._number, self._last = number, last
             if len(self._received) > self._longest + _SEGMENT:
-                raise SdoAbort(TOO_LONG)
+                raise SdoAbortedError(TOO_LONG)
         if not last and number < self.size:
             return []
         acknowledged, self._number = self._number, 0
@@ -124,6 +126,6 @@ class BlockDownload:
         unused = data[0] >> 2 & 0x07
         self.content = bytes(self._received[: len(self._received) - unused])
         if self._with_crc and crc_hqx(self.content, 0) != int.from_bytes(data[1:3], "little"):
-            raise SdoAbort(CRC_ERROR)
+            raise SdoAbortedError(CRC_ERROR)
         self.over = True
         return [bytes([0xA0 | _END]).ljust(8, b"\0")]

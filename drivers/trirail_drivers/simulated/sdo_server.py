@@ -1,10 +1,13 @@
-"""An SDO server: expedited and segmented transfers, and to whom block transfers go (CiA 301, service data objects)."""
+"""SDO server of a simulated device: the one of python-canopen plus the block transfers it lacks (CiA 301, SDO)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from struct import Struct
-from typing import Final
+from typing import Any, Final
+
+from canopen import SdoAbortedError
+from canopen.sdo.server import SdoServer as CanopenServer
 
 from trirail_drivers.simulated.dictionary import (
     LONGEST,
@@ -15,158 +18,161 @@ from trirail_drivers.simulated.dictionary import (
     WRONG_LENGTH,
     Dictionary,
     ObjectEntry,
-    SdoAbort,
 )
 from trirail_drivers.simulated.sdo_block import CRC_WANTED, BlockDownload, BlockUpload
 
-TOGGLE_NOT_ALTERNATED = 0x05030000
-UNKNOWN_COMMAND = 0x05040001
+UNKNOWN_COMMAND: Final = 0x05040001
+ABORTED: Final = 0x80
+"""First byte of an abort."""
 
 _HEADER: Final = Struct("<BHB4s")
-_ABORT: Final = Struct("<BHBI")
+_EXPEDITED, _SIZED, _UNUSED_AT = 0x02, 0x01, 2
+_TOGGLE, _LAST = 0x10, 0x01
+"""Bits of the first byte of a download and of its segments (CiA 301, SDO download)."""
 
 
-class SdoServer:
-    """Serves one dictionary to one client, one transfer at a time."""
+class SdoServer(CanopenServer):
+    """Server of one dictionary for one client, one transfer at a time."""
+
+    _index: Any  # canopen's server has no type hints
+    _subindex: Any
+    _buffer: Any
 
     def __init__(self, objects: Dictionary, respond: Callable[[bytes], None]) -> None:
+        self.object_dictionary = objects
+        super().__init__(0, 0, self)  # type: ignore[no-untyped-call]
         self._objects = objects
         self._respond = respond
         self.reset()
 
     def reset(self) -> None:
-        """Forget the transfer under way."""
-        self._key = (0, 0)
-        self._toggle = 0
-        self._upload: bytes | None = None
-        self._download: bytearray | None = None
+        """Discard the current transfer."""
+        self._index = self._subindex = 0
+        self._buffer = bytearray()
+        self._uploads = False
+        self._longest = 0
         self._block: BlockUpload | BlockDownload | None = None
 
     def request(self, data: bytes) -> None:
-        """Answer one frame of the client; one that is not eight bytes long is none (CiA 301)."""
+        """Answer one frame of the client; ignore one that is not eight bytes long (CiA 301)."""
         if len(data) != 8:
             return
+        block = self._block
+        if block is None or not block.takes(data):
+            self._block = None
+            self.on_request(0, data, 0.0)  # type: ignore[no-untyped-call]
+            return
         try:
-            if self._block is not None and self._block.takes(data):
-                self._go_on_in_blocks(self._block, data)
-                return
-            match data[0] >> 5:
-                case 0:
-                    self._download_segment(data)
-                case 1:
-                    self._start_download(data)
-                case 2:
-                    self._start_upload(data)
-                case 3:
-                    self._upload_segment(data)
-                case 4:
-                    self.reset()
-                case 5:
-                    self._start_block_upload(data)
-                case 6:
-                    self._start_block_download(data)
-                case _:
-                    self._refuse(data)
-        except SdoAbort as abort:
-            key = self._key
-            self.reset()
-            self._respond(_ABORT.pack(0x80, *key, abort.code))
+            self._continue_block(block, data)
+        except SdoAbortedError as refused:
+            self.abort(refused.code)
 
-    def _refuse(self, data: bytes) -> None:
-        self._start(data)
-        raise SdoAbort(UNKNOWN_COMMAND)
-
-    def _start(self, data: bytes) -> tuple[ObjectEntry, bytes]:
-        self.reset()
-        _, index, subindex, payload = _HEADER.unpack(data)
-        self._key = index, subindex
-        return self._objects[index, subindex], payload
-
-    def _readable(self, data: bytes) -> bytes:
-        """What the object holds that a request to read names."""
-        entry, _ = self._start(data)
-        if not entry.readable:
-            raise SdoAbort(WRITE_ONLY)
-        if entry.index == 0x1003 and entry.subindex > self._objects.internal(0x1003, 0).value:
-            raise SdoAbort(NO_DATA)  # CiA 301, 1003h: no such error in the history
+    def get_data(self, index: int, subindex: int, *, check_readable: bool = False) -> bytes:
+        """Return the content of an object, as python-canopen's LocalNode does. Raises SdoAbortedError."""
+        entry = self._objects[index, subindex]
+        if check_readable and not entry.readable:
+            raise SdoAbortedError(WRITE_ONLY)
+        if index == 0x1003 and subindex > self._objects.internal(0x1003, 0).value:
+            raise SdoAbortedError(NO_DATA)  # CiA 301, 1003h: no such error in the history
         return entry.encode()
 
-    def _writable(self, data: bytes) -> tuple[ObjectEntry, bytes]:
-        entry, payload = self._start(data)
-        if not entry.writable:
-            raise SdoAbort(READ_ONLY)
-        return entry, payload
+    def set_data(self, index: int, subindex: int, data: bytes, *, check_writable: bool = False) -> None:  # noqa: ARG002
+        """Write an object, as python-canopen's LocalNode does. Raises SdoAbortedError."""
+        self._objects[index, subindex].load(bytes(data))
 
-    def _start_upload(self, data: bytes) -> None:
-        content = self._readable(data)
-        if 0 < len(content) <= 4:
-            command = 0x43 | (4 - len(content)) << 2
-            self._respond(_HEADER.pack(command, *self._key, content))
-        else:
-            self._upload = content
-            self._respond(_HEADER.pack(0x41, *self._key, len(content).to_bytes(4, "little")))
+    def send_response(self, response: bytes) -> None:
+        """Send a frame to the client."""
+        self._respond(bytes(response))
 
-    def _upload_segment(self, data: bytes) -> None:
-        if self._upload is None:
-            raise SdoAbort(UNKNOWN_COMMAND)
-        toggle = self._take_toggle(data)
-        segment, self._upload = self._upload[:7], self._upload[7:] or None
-        last = self._upload is None
-        self._respond(bytes([toggle | (7 - len(segment)) << 1 | last]) + segment.ljust(7, b"\0"))
+    def abort(self, abort_code: int = UNKNOWN_COMMAND) -> None:
+        """End the current transfer and send the reason; a segment without a transfer is an unknown command."""
+        super().abort(abort_code)  # type: ignore[no-untyped-call]
+        self.reset()
 
-    def _start_download(self, data: bytes) -> None:
-        entry, payload = self._writable(data)
-        expedited, sized = data[0] & 0x02, data[0] & 0x01
-        if expedited:
-            length = 4 - (data[0] >> 2 & 0x03) if sized else min(entry.size or 4, 4)
-            entry.load(payload[:length])
-        else:
-            self._download = bytearray()
-            if sized and entry.size not in (None, int.from_bytes(payload, "little")):
-                raise SdoAbort(WRONG_LENGTH)
-        self._respond(_HEADER.pack(0x60, *self._key, b""))
+    def init_download(self, request: bytes) -> None:
+        """Refuse an impossible write before its first segment, and take the length from the dictionary.
 
-    def _download_segment(self, data: bytes) -> None:
-        if self._download is None:
-            raise SdoAbort(UNKNOWN_COMMAND)
-        toggle = self._take_toggle(data)
-        self._download += data[1 : 8 - (data[0] >> 1 & 0x07)]
-        entry = self._objects[self._key]
-        if len(self._download) > (entry.size or LONGEST):
-            raise SdoAbort(TOO_LONG)
-        if data[0] & 0x01:
-            content, self._download = bytes(self._download), None
-            entry.load(content)
-        self._respond(bytes([0x20 | toggle]).ljust(8, b"\0"))
+        python-canopen's server refuses only after the last segment, and takes four bytes if a request gives no size.
+        """
+        entry = self._writable(request)
+        command, index, subindex, payload = _HEADER.unpack(request)
+        if command & _EXPEDITED:
+            if not command & _SIZED:
+                command |= _SIZED | (4 - min(entry.size or 4, 4)) << _UNUSED_AT
+        elif command & _SIZED and entry.size not in (None, int.from_bytes(payload, "little")):
+            raise SdoAbortedError(WRONG_LENGTH)
+        self._uploads = False
+        self._longest = 0 if command & _EXPEDITED else entry.size or LONGEST
+        super().init_download(_HEADER.pack(command, index, subindex, payload))  # type: ignore[no-untyped-call]
 
-    def _start_block_upload(self, data: bytes) -> None:
+    def init_upload(self, request: bytes) -> None:
+        """Begin an upload; answer an empty object, which python-canopen's server refuses, by a segment without data."""
+        self._name(request)
+        content = self.get_data(self._index, self._subindex, check_readable=True)
+        self._uploads = not 0 < len(content) <= 4
+        self._longest = 0
+        if content:
+            super().init_upload(request)  # type: ignore[no-untyped-call]
+            return
+        self._buffer, self._toggle = bytearray(), 0
+        self._answer(0x41, bytes(4))
+
+    def segmented_upload(self, command: int) -> None:
+        """Send the next segment; refuse one without a transfer."""
+        if not self._uploads:
+            raise SdoAbortedError(UNKNOWN_COMMAND)
+        super().segmented_upload(command)  # type: ignore[no-untyped-call]
+        self._uploads = bool(self._buffer)
+
+    def segmented_download(self, command: int, request: bytes) -> None:
+        """Accept the next segment; refuse one without a transfer, or beyond the length of its object."""
+        if not self._longest:
+            raise SdoAbortedError(UNKNOWN_COMMAND)
+        in_turn = command & _TOGGLE == self._toggle
+        if in_turn and len(self._buffer) + 7 - (command >> 1 & 7) > self._longest:
+            raise SdoAbortedError(TOO_LONG)
+        super().segmented_download(command, request)  # type: ignore[no-untyped-call]
+        if command & _LAST:
+            self._longest = 0
+
+    def block_upload(self, data: bytes) -> None:
+        """Begin a block upload, which handles the next frames."""
         if data[0] & 0x03:
-            raise SdoAbort(UNKNOWN_COMMAND)
-        content = self._readable(data)
+            raise SdoAbortedError(UNKNOWN_COMMAND)
+        self._name(data)
+        content = self.get_data(self._index, self._subindex, check_readable=True)
         self._block = BlockUpload(content, data)
-        self._respond(_HEADER.pack(0xC2 | data[0] & CRC_WANTED, *self._key, len(content).to_bytes(4, "little")))
+        self._answer(0xC2 | data[0] & CRC_WANTED, len(content).to_bytes(4, "little"))
 
-    def _start_block_download(self, data: bytes) -> None:
+    def block_download(self, data: bytes) -> None:
+        """Begin a block download, which handles the next frames."""
         if data[0] & 0x01:
-            raise SdoAbort(UNKNOWN_COMMAND)
-        entry, payload = self._writable(data)
-        if data[0] & 0x02 and entry.size not in (None, int.from_bytes(payload, "little")):
-            raise SdoAbort(WRONG_LENGTH)
+            raise SdoAbortedError(UNKNOWN_COMMAND)
+        entry = self._writable(data)
+        if data[0] & 0x02 and entry.size not in (None, int.from_bytes(data[4:], "little")):
+            raise SdoAbortedError(WRONG_LENGTH)
         self._block = block = BlockDownload(data, entry.size or LONGEST)
-        self._respond(_HEADER.pack(0xA0 | data[0] & CRC_WANTED, *self._key, bytes([block.size])))
+        self._answer(0xA0 | data[0] & CRC_WANTED, bytes([block.size]))
 
-    def _go_on_in_blocks(self, block: BlockUpload | BlockDownload, data: bytes) -> None:
-        answers = block.answers(data)
+    def _name(self, request: bytes) -> None:
+        """Store the object that a request names: an abort names it too."""
+        _, self._index, self._subindex, _ = _HEADER.unpack(request)
+
+    def _writable(self, request: bytes) -> ObjectEntry:
+        self._name(request)
+        entry = self._objects[self._index, self._subindex]
+        if not entry.writable:
+            raise SdoAbortedError(READ_ONLY)
+        return entry
+
+    def _continue_block(self, block: BlockUpload | BlockDownload, data: bytes) -> None:
+        answers: Any = block.answers(data)
         if block.over:
             self._block = None
             if isinstance(block, BlockDownload):
-                self._objects[self._key].load(block.content)
+                self.set_data(self._index, self._subindex, block.content)
         for answer in answers:
             self._respond(answer)
 
-    def _take_toggle(self, data: bytes) -> int:
-        toggle = data[0] & 0x10
-        if toggle != self._toggle:
-            raise SdoAbort(TOGGLE_NOT_ALTERNATED)
-        self._toggle ^= 0x10
-        return toggle
+    def _answer(self, command: int, payload: bytes) -> None:
+        self._respond(_HEADER.pack(command, self._index, self._subindex, payload))

@@ -1,4 +1,4 @@
-"""A servo axis: first-order lag behind its setpoint, within what its motor can do."""
+"""A servo axis: first-order lag behind its setpoint, within the limits of its motor."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import math
 from typing import Final
 
 from trirail_drivers import config
-from trirail_drivers.driver.ramp import braked
+from trirail_drivers.driver.ramp import brake
 
 SOUND: Final = (1.0, 1.0)
-"""An encoder that counts all of its travel, forwards and backwards."""
+"""Shares of the travel that a sound encoder counts, forwards and backwards."""
 
 
 class Servo:
     """One axis in counts and seconds: a position loop with velocity feed-forward and a braking ramp.
 
-    Over a step the setpoint r runs in a straight line from the last target to the new one, the feed-forward w
-    likewise from the last to the new, and the position x obeys
+    Over a step, the setpoint r changes linearly from the last target to the new one, the feed-forward w from its
+    last value to the new one, and the position x obeys
 
         dx/dt = w + (r - x) / time_constant,
 
-    so that the following error e = r - x obeys de/dt = (dr/dt - w) - e / time_constant: it fades, and only
-    what the feed-forward leaves uncovered feeds it. An exact feed-forward has no lag, none at all lags by
-    dr/dt · time_constant; `feed_forward_gain` is the share of it that this servo makes use of. With
-    time_constant = 0 the servo is ideal: on the target at the end of each step. The velocity that this asks
-    for is then cut to what can still be braked in time, to `max_velocity` and to `max_acceleration`.
+    so that the following error e = r - x obeys de/dt = (dr/dt - w) - e / time_constant: it decays, and only
+    the error of the feed-forward drives it. Exact feed-forward has no lag, none at all lags by
+    dr/dt · time_constant; `feed_forward_gain` is the share of it that this servo uses. With
+    time_constant = 0 the servo is ideal: on the target at the end of each step. The resulting velocity is
+    then limited to one that can still brake in time, to `max_velocity` and to `max_acceleration`.
     """
 
     def __init__(
@@ -41,21 +41,23 @@ class Servo:
         self.velocity = 0.0
         """Measured velocity [counts/s]."""
         self.setpoint = position
-        """What the last step aimed at [counts]."""
+        """Target of the last step [counts]."""
         self.limited = False
-        """Whether the last step was cut to a limit."""
+        """Whether a limit applied in the last step."""
         self.forced_velocity: float | None = None
-        """A defect: the velocity [counts/s] that the slider has whatever it is told, until its brake holds it."""
+        """Defect: velocity of the slider [counts/s] whatever its setpoint, until its brake holds it."""
         self.encoder = SOUND
-        """A defect: which shares of its travel the encoder counts, forwards and backwards; (0, 0) where it is loose."""
+        """Defect: shares of the travel that the encoder counts, forwards and backwards; (0, 0) if it is loose."""
+        self.motor = 1.0
+        """Defect: -1 if the motor turns against its encoder, as with two phases exchanged."""
         self.travelled = 0.0
-        """How far the motor has turned since power-on, whatever the encoder says [counts]."""
+        """Travel of the motor since power-on, whatever the encoder counts [counts]."""
         self.play = 0.0
-        """A defect: how far the motor turns before the slider goes along, where it turns back [counts]."""
+        """Defect: backlash, the travel of a reversing motor before the slider follows [counts]."""
         self.driven = 0.0
-        """How far the slider has gone since power-on: as the motor, but for the play [counts]."""
+        """Travel of the slider since power-on: that of the motor, apart from the play [counts]."""
         self.lag: float | None = None
-        """A defect: how long it is behind its setpoint [s]; feed-forward does not help then."""
+        """Defect: lag behind the setpoint [s]; feed-forward has no effect then."""
         self._feed_forward = 0.0
         self._feed_forward_gain = feed_forward_gain
         self._time_constant = time_constant
@@ -64,12 +66,12 @@ class Servo:
 
     @property
     def max_acceleration(self) -> float:
-        """What the motor can do at most [counts/s²]."""
+        """Maximum acceleration of the motor [counts/s²]."""
         return self._max_acceleration
 
     @classmethod
     def configured(cls, simulated: config.Simulated, drive: config.Drive, counts: float) -> Servo:
-        """The servo that a configuration describes, at rest at a position [counts]."""
+        """Return the servo of a configuration, at rest at a position [counts]."""
         return cls(
             counts,
             time_constant=simulated.time_constant,
@@ -80,17 +82,17 @@ class Servo:
 
     @property
     def following_error(self) -> float:
-        """Setpoint less position [counts]."""
+        """Setpoint minus position [counts]."""
         return self.setpoint - self.position
 
     def hold(self) -> None:
-        """Stand still here, by the brake."""
+        """Stop here by the brake."""
         self.velocity = self._feed_forward = 0.0
         self.setpoint = self.position
         self.limited = False
 
     def follow(self, target: float, feed_forward: float, step: float) -> None:
-        """Move for `step` seconds towards `target` [counts] with `feed_forward` [counts/s] at its end."""
+        """Move for `step` seconds towards `target` [counts], with `feed_forward` [counts/s] at the end of the step."""
         feed_forward *= self._feed_forward_gain if self.lag is None else 0.0
         time_constant = self._time_constant if self.lag is None else self.lag
         slope = (target - self.setpoint) / step
@@ -102,7 +104,7 @@ class Servo:
         else:
             closing = gap / step
 
-        # The fastest approach that max_acceleration can still end on the setpoint, step by step.
+        # Fastest approach that max_acceleration can still stop at the setpoint, in discrete steps.
         gain = self._max_acceleration * step
         brakable = 0.5 * gain * (math.sqrt(1.0 + 8.0 * abs(gap) / (gain * step)) - 1.0)
         if gap * closing > 0.0:
@@ -112,10 +114,10 @@ class Servo:
         self.setpoint, self._feed_forward = target, feed_forward
 
     def chase(self, target: float, feed_forward: float, step: float) -> None:
-        """Move for `step` seconds towards a `target` [counts] that has jumped there and stays, as does the rest.
+        """Move for `step` seconds towards a `target` [counts] that is constant after a jump, as is the feed-forward.
 
-        So a drive does that follows each setpoint from its arrival on: dx/dt = w + (r - x) / time_constant with
-        constant r and w, cut to `max_velocity` and to `max_acceleration`.
+        A drive that follows each setpoint from its arrival moves like this: dx/dt = w + (r - x) / time_constant with
+        constant r and w, limited to `max_velocity` and to `max_acceleration`.
         """
         feed_forward *= self._feed_forward_gain if self.lag is None else 0.0
         time_constant = self._time_constant if self.lag is None else self.lag
@@ -129,7 +131,7 @@ class Servo:
         self.setpoint, self._feed_forward = target, feed_forward
 
     def _move(self, wanted: float, step: float) -> None:
-        """Move for `step` seconds with the wanted velocity [counts/s], or what the motor can do of it."""
+        """Move for `step` seconds with the wanted velocity [counts/s], within the limits of the motor."""
         gain = self._max_acceleration * step
         velocity = max(-self._max_velocity, min(wanted, self._max_velocity))
         velocity = max(self.velocity - gain, min(velocity, self.velocity + gain))
@@ -137,10 +139,10 @@ class Servo:
         if self.forced_velocity is not None:
             velocity = self.forced_velocity
         self.velocity = velocity
-        self.turn(velocity * step)
+        self._drive(velocity * step)
 
     def brake(self, deceleration: float, step: float) -> None:
-        """Slow down for `step` seconds with `deceleration` [counts/s²], at most to standstill."""
+        """Brake for `step` seconds with `deceleration` [counts/s²], at most to standstill."""
         if self.forced_velocity is not None:
             self.velocity = self.forced_velocity
             self.coast(step)
@@ -149,37 +151,41 @@ class Servo:
             self.roll(deceleration, step)
 
     def roll(self, deceleration: float, step: float) -> None:
-        """Slow down as `brake` does, but without power: no defect drives it on."""
-        way, self.velocity = braked(0.0, self.velocity, deceleration, step)
-        self.turn(way)
+        """Slow down like `brake`, but without power: a forced velocity has no effect."""
+        way, self.velocity = brake(0.0, self.velocity, deceleration, step)
+        self._drive(way)
         self.setpoint, self._feed_forward = self.position, 0.0
 
     def run(self, velocity: float, acceleration: float, step: float) -> None:
-        """Come to `velocity` [counts/s] with `acceleration` [counts/s²] for `step` seconds, following no setpoint."""
+        """Accelerate to `velocity` [counts/s] with `acceleration` [counts/s²] for `step` seconds; ignore setpoints."""
         change = acceleration * step
         before = self.velocity
         self.velocity = max(before - change, min(velocity, before + change))
         if self.forced_velocity is not None:
             before = self.velocity = self.forced_velocity
-        self.turn(0.5 * (before + self.velocity) * step)
+        self._drive(0.5 * (before + self.velocity) * step)
         self.setpoint, self._feed_forward = self.position, 0.0
 
     def shift(self, by: float) -> None:
-        """Count from elsewhere: nothing moves, but every position is `by` counts more."""
+        """Shift the origin: nothing moves, but every position increases by `by` counts."""
         self.position += by
         self.setpoint += by
 
     def coast(self, step: float) -> None:
-        """Keep the velocity for `step` seconds, as a drive does that waits for its next setpoint."""
-        self.turn(self.velocity * step)
+        """Keep the velocity for `step` seconds, like a drive that waits for its next setpoint."""
+        self._drive(self.velocity * step)
 
     def push(self, by: float) -> None:
-        """Be turned by hand, without power [counts]."""
+        """Turn the motor by hand, without power [counts]."""
         self.turn(by)
         self.setpoint = self.position
 
+    def _drive(self, by: float) -> None:
+        """Turn by the motor's own force [counts], against the encoder if that is its defect."""
+        self.turn(by if self.forced_velocity is not None else self.motor * by)
+
     def turn(self, by: float) -> None:
-        """Turn the motor `by` so much [counts]; the encoder counts what it counts of it."""
+        """Turn the motor by `by` [counts]; the encoder counts its share of the travel."""
         forwards, backwards = self.encoder
         self.travelled += by
         half = abs(self.play) / 2.0

@@ -1,1 +1,1 @@
-"""From marks in cameras to the motion that lays a part right: images, calibration from moves, the rigid error."""
+"""Alignment of a part by camera marks: mark detection, camera calibration by stage moves, and corrections."""

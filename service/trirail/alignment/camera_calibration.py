@@ -1,108 +1,130 @@
-"""Calibration of cameras from moves of the stage: where each shows what, and where marks are on the table.
+"""Calibration of cameras from moves of the stage: the map of each view, and the places of the marks on the table.
 
-A mark at q on the table is in the base frame at w = t + R(phi) q, with the platform at (t, phi). The unknowns of a view
-are its map and its marks' places; a mark's turn about the stage's centre tells q, its way tells the map. Gauss-Newton,
-from the solution that is linear in b, M and M q for small phi.
+A mark at q on the platform is at w = t + R(phi) q in the base frame, with the platform at (t, phi). The unknowns of a
+view are its map and the places q of its marks: rotations of the stage determine q, translations determine the map.
+Gauss-Newton starts from the solution that is linear in b, M and M q for small phi.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from trirail.alignment.images import CameraView, Lens, Pair, Points, pixels, project
-from trirail.alignment.rigid import Floats, turned
+from trirail.alignment.images import CameraView, Lens, Pair, Points, project_points, project_with
+from trirail.alignment.rigid_motion import Floats, rotation_matrix
 from trirail.errors import AlignmentError, AlignmentFault
 
 Marks = Mapping[str, Pair]
-"""The pixels (u, v) of marks by their names; one that was not found is missing."""
-ROUNDS = 30
-CONVERGED = 1e-12
-STILL = 3.0
-"""Marks that move less than so many pixels over all moves have not moved."""
-WORST_CONDITION = 1e6
-"""Of the normal equations' scaled matrix, beyond which the moves do not tell all of the unknowns."""
+"""Pixels (u, v) of marks by name; a mark that was not found is missing."""
+MAX_ITERATIONS = 30
+STEP_TOLERANCE = 1e-12
+MIN_TRAVEL_PX = 3.0
+"""Travel over all moves below which marks count as unmoved."""
+MAX_RESIDUAL_SHARE = 0.1
+"""Residual of a view, as a share of its marks' travel, above which its pictures do not belong to the moves. One picture
+that is late by a move leaves 0.3 and more of that move, the distortion of a lens a hundredth."""
+MAX_CONDITION = 1e6
+"""Condition of the scaled Jacobian above which the moves do not determine all unknowns."""
 
 
-class Sight(NamedTuple):
-    """What cameras showed with the platform at a pose."""
+class CalibrationSample(NamedTuple):
+    """Pixels of the marks with the platform at a pose."""
 
     pose: tuple[float, float, float]
-    """x, y [m], phi [rad], measured."""
+    """Measured pose x, y [m], phi [rad]."""
     marks: Marks
 
 
 class MarkFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A mark of the calibration's part."""
+    """Fitted place of a mark of the calibration's part."""
 
     view: str
-    """The name of the view that shows it."""
+    """Name of the view that shows the mark."""
     place: Pair
-    """In the platform's frame, from the stage's centre [m]."""
+    """Position in the platform's frame, from the stage's centre [m]."""
     deviation: Pair
-    """Standard deviations of that [m]."""
+    """Standard deviations of `place` [m]."""
 
 
 class CameraCalibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What was found; a file keeps it."""
+    """Result of a calibration, as it is saved in a file."""
 
     views: dict[str, CameraView]
     marks: dict[str, MarkFit]
     noise: float
     """Standard deviation of a mark's u or v, from the residuals [pixel]."""
     residuals: tuple[dict[str, Pair], ...]
-    """Seen less computed, of each look and mark [pixel]."""
+    """Observed minus computed pixels of each look and mark."""
     poses: tuple[tuple[float, float, float], ...]
-    """Where the platform was at each look: x, y [m], phi [rad]."""
+    """Pose of the platform at each look: x, y [m], phi [rad]."""
     covariances: dict[str, tuple[tuple[float, ...], ...]]
-    """Of each view's unknowns: b [pixel], M by rows [pixel/m], the lens's bend, and its marks' places [m]."""
+    """Covariance of each view's unknowns: b [pixel], M by rows [pixel/m], the lens's bend, its marks' places [m]."""
     confirmed: bool = False
-    """Whether a correction has gone where it should with it: until then corrections are bounded."""
+    """True once a correction with this calibration had the predicted effect; until then corrections are bounded."""
+    looks: int = 1
+    """Pictures averaged in each look; `noise` is the noise of the average."""
 
     @property
     def reach(self) -> float:
-        """How far a mark went from its place at the first look, at most [m]."""
+        """Greatest distance of a mark from its position at the first look [m]."""
         return max(
-            float(np.linalg.norm(placed(mark.place, pose) - placed(mark.place, self.poses[0])))
+            float(np.linalg.norm(to_base_frame(mark.place, pose) - to_base_frame(mark.place, self.poses[0])))
             for mark in self.marks.values()
             for pose in self.poses
         )
 
 
-def placed(place: Pair, pose: Sequence[float]) -> Floats:
-    """Return where a point of the platform is in the base frame, (2,) [m]."""
-    return np.asarray(pose[:2] + turned(pose[2]) @ place)
+def to_base_frame(place: Pair, pose: Sequence[float]) -> Floats:
+    """Return the position in the base frame, (2,) [m], of a point of the platform at a pose."""
+    return np.asarray(pose[:2] + rotation_matrix(pose[2]) @ place)
 
 
 def calibrate(
-    sights: Sequence[Sight],
+    samples: Sequence[CalibrationSample],
     views: Mapping[str, str] | None = None,
     lens: Lens = "affine",
     centre: Pair = (0.0, 0.0),
+    looks: int = 1,
 ) -> CameraCalibration:
-    """Return the calibration that looks from several poses tell.
+    """Return the calibration determined by samples at several poses.
 
-    `views` names the view of each mark: marks of one name are seen by one camera that stands still. Without it every
-    mark has a view of its own, as with two cameras, or one that is moved to each. `centre` is a radial lens's [pixel].
-    Raises AlignmentError: too few looks, marks that stand still, moves that do not tell it all.
+    Parameters
+    ----------
+    samples
+        Pixels of the marks at the poses.
+    views
+        Name of the view of each mark. Marks with the same view share one fixed camera. If None, every mark has a view
+        of its own, as with two cameras, or with one that is moved to each mark.
+    lens
+        Kind of the lens of all views.
+    centre
+        Pixel on the axis of a radial lens.
+    looks
+        Pictures averaged in each sample.
+
+    Raises
+    ------
+    AlignmentError
+        Too few samples, marks that do not move or do not follow the moves, or moves that leave unknowns undetermined.
     """
-    names = sorted({name for sight in sights for name in sight.marks})
-    of = dict(views) if views is not None else {name: name for name in names}
-    if unknown := [name for name in names if name not in of]:
+    names = sorted({name for sample in samples for name in sample.marks})
+    view_of = dict(views) if views is not None else {name: name for name in names}
+    if unknown := [name for name in names if name not in view_of]:
         raise AlignmentError(AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; name one for each")
     if len(names) < 1:
-        raise AlignmentError(AlignmentFault.MISSING, "no mark was seen in any look: see to light, focus and threshold")
+        raise AlignmentError(AlignmentFault.MISSING, "no mark was found in any look; check light, focus and threshold")
     fits = {
-        view: _Fit(
-            sights,
-            [name for name in names if of[name] == view],
+        view: _ViewFit(
+            samples,
+            [name for name in names if view_of[name] == view],
             CameraView((0, 0), (0, 0), ((1, 0), (0, 1)), lens, centre=centre),
             view,
         )
-        for view in sorted({of[name] for name in names})
+        for view in sorted({view_of[name] for name in names})
     }
     squares = sum(fit.squares for fit in fits.values())
     freedom = sum(fit.freedom for fit in fits.values())
@@ -114,48 +136,54 @@ def calibrate(
         deviations = np.sqrt(np.diag(covariance))[fit.first_place :].reshape(-1, 2)
         for mark, place, deviation in zip(fit.names, fit.places, deviations, strict=True):
             marks[mark] = MarkFit(name, _pair(place), _pair(deviation))
-    found = {name: fit.view for name, fit in fits.items()}
+    fitted = {name: fit.view for name, fit in fits.items()}
     residuals = tuple(
         {
-            name: _pair(seen - pixels(found[of[name]], placed(marks[name].place, sight.pose)[None])[0])
-            for name, seen in sight.marks.items()
+            name: _pair(
+                seen - project_points(fitted[view_of[name]], to_base_frame(marks[name].place, sample.pose)[None])[0]
+            )
+            for name, seen in sample.marks.items()
         }
-        for sight in sights
+        for sample in samples
     )
-    poses = tuple((float(x), float(y), float(phi)) for (x, y, phi), _ in sights)
-    return CameraCalibration(found, marks, noise, residuals, poses, covariances)
+    poses = tuple((float(x), float(y), float(phi)) for (x, y, phi), _ in samples)
+    return CameraCalibration(fitted, marks, noise, residuals, poses, covariances, looks=looks)
 
 
-class _Fit:
-    """One view's unknowns: b, M by rows, bend, and a place for each mark; the point o is the first mark's first."""
+class _ViewFit:
+    """Least-squares fit of the unknowns of one view: b, M by rows, bend, and the place of each mark.
 
-    def __init__(self, sights: Sequence[Sight], names: Sequence[str], lens: CameraView, view: str) -> None:
+    The point o is the position of the first mark at its first look.
+    """
+
+    def __init__(self, samples: Sequence[CalibrationSample], names: Sequence[str], lens: CameraView, view: str) -> None:
         self.names, self._lens, self._name = names, lens, view
         bends = {"affine": 0, "perspective": 2, "radial": 1}[lens.lens]
         self.first_place = 6 + bends
         rows = [
-            (names.index(name), sight.pose, seen)
-            for sight in sights
-            for name, seen in sight.marks.items()
+            (names.index(name), sample.pose, seen)
+            for sample in samples
+            for name, seen in sample.marks.items()
             if name in names
         ]
-        self._which = np.array([which for which, _, _ in rows])
+        self._mark_index = np.array([index for index, _, _ in rows])
         poses = np.array([pose for _, pose, _ in rows])
         self._t, self._phi = poses[:, :2], poses[:, 2]
         self._seen = np.array([seen for _, _, seen in rows], float)
         self._first = poses[0]
         self.freedom = self._seen.size - self.first_place - 2 * len(names)
-        self._check()
-        x, scales = self._start(), self._scales()
-        for _ in range(ROUNDS):
-            jacobian, residuals = self._jacobian(x) * scales, self._seen - self._computed(x)
+        self._check_samples()
+        x, scales = self._initial_estimate(), self._scales()
+        for _ in range(MAX_ITERATIONS):
+            jacobian, residuals = self._jacobian(x) * scales, self._seen - self._project(x)
             step, _, _, singular = np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)
-            if singular[-1] * WORST_CONDITION < singular[0]:
+            if singular[-1] * MAX_CONDITION < singular[0]:
                 self._refuse_moves()
             x = x + scales * step
-            if np.abs(step).max() < CONVERGED * max(1.0, np.abs(x / scales).max()):
+            if np.abs(step).max() < STEP_TOLERANCE * max(1.0, np.abs(x / scales).max()):
                 break
-        self.squares = float(((self._seen - self._computed(x)) ** 2).sum())
+        self.squares = float(((self._seen - self._project(x)) ** 2).sum())
+        self._check_residual()
         jacobian = self._jacobian(x) * scales
         self.inverse = np.linalg.inv(jacobian.T @ jacobian) * np.outer(scales, scales)
         self.places = x[self.first_place :].reshape(-1, 2)
@@ -164,71 +192,87 @@ class _Fit:
         origin = _pair(self._origin(self.places[0]))
         self.view = CameraView(origin, _pair(x[:2]), matrix, lens.lens, _pair(bend), lens.centre)
 
-    def _check(self) -> None:
+    def _check_samples(self) -> None:
         if self.freedom < 1:
-            need = -(-(self.first_place + 2 * len(self.names) + 1) // (2 * len(self.names)))
+            needed = -(-(self.first_place + 2 * len(self.names) + 1) // (2 * len(self.names)))
             raise AlignmentError(
                 AlignmentFault.MOVES,
-                f"{len(self._seen)} marks seen in view {self._name}: at least {need} looks are wanted for each mark",
+                f"view {self._name}: {len(self._seen)} marks found over all looks, each mark needs {needed} looks; "
+                "add moves",
             )
-        spread = max(np.ptp(self._seen[self._which == n], axis=0).max() for n in range(len(self.names)))
-        if spread < STILL:
+        spread = max(np.ptp(self._seen[self._mark_index == n], axis=0).max() for n in range(len(self.names)))
+        if spread < MIN_TRAVEL_PX:
             raise AlignmentError(
                 AlignmentFault.STILL,
-                f"the marks of view {self._name} have moved by {spread:.2f} pixels over all moves: "
-                "is it a picture of this stage, and a new one at each look?",
+                f"view {self._name}: the marks moved by {spread:.2f} pixels over all moves, at least "
+                f"{MIN_TRAVEL_PX:.0f} are needed; check that the camera shows this stage, and take a new picture at "
+                "each look",
                 value=float(spread),
-                limit=STILL,
+                limit=MIN_TRAVEL_PX,
+            )
+
+    def _check_residual(self) -> None:
+        residual = math.sqrt(self.squares / self.freedom)
+        spread = float(np.ptp(self._seen[self._mark_index == 0], axis=0).max())
+        if residual > MAX_RESIDUAL_SHARE * spread:
+            raise AlignmentError(
+                AlignmentFault.STILL,
+                f"view {self._name}: the marks do not follow the moves; the residual is {residual:.1f} pixels, the "
+                f"limit {MAX_RESIDUAL_SHARE * spread:.1f} at a travel of {spread:.0f}; take a new picture at each look",
+                value=residual,
+                limit=MAX_RESIDUAL_SHARE * spread,
             )
 
     def _refuse_moves(self) -> None:
         raise AlignmentError(
             AlignmentFault.MOVES,
-            f"these moves do not tell the map of view {self._name}: move along x, along y and turn, each both ways",
+            f"view {self._name}: the moves do not determine its map; move along x, along y and turn, each both ways",
         )
 
     def _origin(self, place: Points) -> Points:
-        return np.asarray(self._first[:2] + turned(self._first[2]) @ place)
+        return np.asarray(self._first[:2] + rotation_matrix(self._first[2]) @ place)
 
-    def _start(self) -> Floats:
-        """Return unknowns near the solution: u = b_i + M (t - t0) + (sin phi - sin phi0) M J q_i is linear."""
+    def _initial_estimate(self) -> Floats:
+        """Return the solution of the linear model u = b_i + M (t - t0) + (sin phi - sin phi0) M J q_i."""
         n = len(self.names)
         design = np.zeros((len(self._seen), 2 + 2 * n))
         design[:, :2] = self._t - self._first[:2]
-        design[np.arange(len(self._seen)), 2 + self._which] = 1.0
-        design[np.arange(len(self._seen)), 2 + n + self._which] = np.sin(self._phi - self._first[2])
+        design[np.arange(len(self._seen)), 2 + self._mark_index] = 1.0
+        design[np.arange(len(self._seen)), 2 + n + self._mark_index] = np.sin(self._phi - self._first[2])
         scales = np.maximum(np.abs(design).max(axis=0), 1e-300)
         solution, _, rank, _ = np.linalg.lstsq(design / scales, self._seen, rcond=1e-9)
         solution = solution / scales[:, None]
         matrix = solution[:2].T
         if rank < design.shape[1] or abs(np.linalg.det(matrix)) < 1e-12 * (matrix**2).sum():
             self._refuse_moves()
-        arms = np.linalg.solve(matrix, solution[2 + n :].T).T  # R(phi0) J q
-        arms = arms @ np.array([[0.0, -1.0], [1.0, 0.0]])  # J' of each: row vectors times J
-        places = arms @ turned(self._first[2])
+        arms = np.linalg.solve(matrix, solution[2 + n :].T).T  # rows R(phi0) J q
+        arms = arms @ np.array([[0.0, -1.0], [1.0, 0.0]])  # J' of each row
+        places = arms @ rotation_matrix(self._first[2])
         return np.concatenate([solution[2], matrix.ravel(), np.zeros(self.first_place - 6), places.ravel()])
 
     def _scales(self) -> Floats:
-        """Return what each unknown is to be counted in, so that all are about as well determined."""
-        across = max(float(np.ptp(self._seen, axis=0).max()), 1.0)
-        way = max(float(np.ptp(self._t, axis=0).max()), 1e-9)
+        """Return a unit for each unknown, such that all are about equally well determined."""
+        span = max(float(np.ptp(self._seen, axis=0).max()), 1.0)
+        travel = max(float(np.ptp(self._t, axis=0).max()), 1e-9)
         turn = max(float(np.ptp(self._phi)), 1e-9)
-        bend = {"affine": [], "perspective": [1.0 / way] * 2, "radial": [1.0 / across**2]}[self._lens.lens]
-        places = [way / turn] * (2 * len(self.names))
-        return np.array([across] * 2 + [across / way] * 4 + bend + places)
+        bend = {"affine": [], "perspective": [1.0 / travel] * 2, "radial": [1.0 / span**2]}[self._lens.lens]
+        places = [travel / turn] * (2 * len(self.names))
+        return np.array([span] * 2 + [span / travel] * 4 + bend + places)
 
-    def _computed(self, x: Points) -> Points:
+    def _project(self, x: Points) -> Points:
+        """Return the computed pixels, (n, 2), for complex unknowns as well."""
+        # One expression for all poses: the Jacobian calls this once per unknown and iteration.
         places = x[self.first_place :].reshape(-1, 2)
-        q = places[self._which]
+        q = places[self._mark_index]
         c, s = np.cos(self._phi), np.sin(self._phi)
         at = self._t + np.stack([c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]], axis=1)
         bend = x[6 : self.first_place]
-        return project(at, self._origin(places[0]), x[:2], x[2:6].reshape(2, 2), bend, self._lens)
+        return project_with(at, self._origin(places[0]), x[:2], x[2:6].reshape(2, 2), bend, self._lens)
 
     def _jacobian(self, x: Floats) -> Floats:
-        """Return the derivatives by a complex step, exact to the last digit."""
+        """Return the derivatives of the computed pixels, by a complex step, which has no cancellation."""
         step = 1e-20
-        columns = [self._computed(x + 1j * step * axis).imag.ravel() / step for axis in np.eye(len(x))]
+        columns = [self._project(x + 1j * step * axis).imag.ravel() / step for axis in np.eye(len(x))]
         return np.stack(columns, axis=1)
 
 

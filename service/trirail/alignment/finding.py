@@ -1,8 +1,9 @@
-"""Finds marks in pictures to a small part of a pixel: a search by correlation, then a fit of the mark itself.
+"""Detection of marks in pictures with subpixel accuracy: a search by correlation, then a fit of the mark's shape.
 
-The picture around a mark is b(R'(p - p0) / s) c(p) + g(p): place p0, turn, size s and blur of the edges are fitted
-together with contrast c and ground g, which both have an even slope, by Gauss-Newton; so light, turn and focus do not
-move the place. The search is by normalised correlation (Lewis 1995, Fast Normalized Cross-Correlation).
+The model of the picture around a mark is b(R'(p - p0) / s) c(p) + g(p). Gauss-Newton fits place p0, turn, size s and
+the blur of the edges together with contrast c and ground g, both of which have a linear gradient; so uneven light,
+rotation and focus do not bias the place. The search uses normalised correlation (Lewis 1995, Fast Normalized
+Cross-Correlation).
 """
 
 from __future__ import annotations
@@ -13,66 +14,73 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trirail.alignment.rigid import Floats
+from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.shapes import MarkShape, brightness
 
-LIKE = 0.5
-"""Correlation from which on a place is taken for the mark."""
-FITS = 0.8
+MIN_CORRELATION = 0.5
+"""Correlation from which a place is a candidate for the mark."""
+MIN_EXPLAINED_SHARE = 0.8
 """Share of the picture's variation that the fitted mark must explain."""
-FAINT = 0.02
-"""Contrast, as a share of the picture's range of brightness, below which a mark is none."""
-AWAY = 0.5
-"""How far the fit may lead from what was searched, in sizes of the mark."""
-SIZES = (0.7, 1.4)
-"""How large the mark may be, in nominal sizes."""
-MARGIN = 0.3
-"""What is fitted of the picture around a mark, in its sizes."""
-START_BLUR = 1.2
-ROUNDS = 25
+MIN_CONTRAST_SHARE = 0.02
+"""Least contrast of a mark, as a share of the picture's range of brightness."""
+MAX_FIT_SHIFT = 0.5
+"""Greatest distance between the fitted and the searched place, in nominal sizes."""
+SIZE_RANGE = (0.7, 1.4)
+"""Accepted sizes, in nominal sizes."""
+WINDOW_MARGIN = 0.3
+"""Width of the fitted surroundings of a mark, in nominal sizes."""
+INITIAL_BLUR_PX = 1.2
+MAX_ITERATIONS = 25
 
 
-class FoundMark(NamedTuple):
-    """Where a mark is in a picture."""
+class DetectedMark(NamedTuple):
+    """Place and properties of a mark in a picture."""
 
     u: float
     """Column, 0 in the middle of the first pixel."""
     v: float
-    """Row."""
+    """Row, 0 in the middle of the first pixel."""
     turn: float
-    """Of the mark in the picture, from u to v [rad]; 0 for a disc."""
+    """Angle of the mark in the picture, from u to v [rad]; 0 for a disc."""
     size: float
-    """In nominal sizes."""
+    """Size, in nominal sizes."""
     contrast: float
-    """Its brightness less the ground's; negative for a dark mark."""
+    """Brightness of the mark minus that of the ground; negative for a dark mark."""
     fit: float
-    """Share of the picture's variation that it explains, up to 1."""
+    """Share of the picture's variation that the model explains, up to 1."""
 
 
-def find(picture: NDArray[np.generic], shape: MarkShape, turn: float = 0.0) -> FoundMark | None:
-    """Return where the mark is that looks most like a shape in pixels, turned by about `turn` [rad]; None for none.
+def find(picture: NDArray[np.generic], shape: MarkShape, turn: float = 0.0) -> DetectedMark | None:
+    """Return the mark that is most similar to a shape, None if there is none.
 
-    `picture` is grey, (rows, columns). A cross is found within about 15° of its turn, a corner within 20°.
+    Parameters
+    ----------
+    picture
+        Grey picture, (rows, columns).
+    shape
+        Shape of the mark, in pixels.
+    turn
+        Approximate angle [rad]. A cross is found within about 15° of it, a corner within 20°.
     """
     grey = np.asarray(picture, float)
-    if grey.ndim != 2 or min(grey.shape) < shape.size * (1.0 + 2.0 * MARGIN):
+    if grey.ndim != 2 or min(grey.shape) < shape.size * (1.0 + 2.0 * WINDOW_MARGIN):
         return None
-    near = _search(grey, shape, turn)
-    return None if near is None else _fit(grey, shape, near, turn)
+    start = _search(grey, shape, turn)
+    return None if start is None else _fit(grey, shape, start, turn)
 
 
-def _middle(shape: MarkShape, turn: float) -> tuple[float, float]:
-    """Return where the middle of what is looked at lies from the shape's point."""
+def _window_offset(shape: MarkShape, turn: float) -> tuple[float, float]:
+    """Return the offset u, v of the window's middle from the shape's origin [pixel]."""
     if shape.kind != "corner":
         return 0.0, 0.0
     half = shape.size / 2.0
     c, s = math.cos(turn), math.sin(turn)
-    # Twice as much of the ground as of the mark says nothing: the window is about the tip.
+    # Centred at the tip, the window would be three quarters ground, which carries no information: it moves inwards.
     return 0.3 * half * (c - s), 0.3 * half * (s + c)
 
 
-def _drawn(shape: MarkShape, u: Floats, v: Floats, x: Floats) -> Floats:
-    """Return the shape at pixels, for x = (u0, v0, size, blur, turn)."""
+def _render(shape: MarkShape, u: Floats, v: Floats, x: Floats) -> Floats:
+    """Return the brightness of the shape at pixels, for x = (u0, v0, size, blur, turn)."""
     c, s = math.cos(x[4]), math.sin(x[4])
     du, dv = u - x[0], v - x[1]
     size = x[2]
@@ -80,71 +88,76 @@ def _drawn(shape: MarkShape, u: Floats, v: Floats, x: Floats) -> Floats:
 
 
 def _search(grey: Floats, shape: MarkShape, turn: float) -> tuple[float, float] | None:
-    side = 2 * math.ceil(shape.size * (0.5 + MARGIN)) + 1
+    """Return the pixel u, v of the greatest correlation with the shape, None if that is too small."""
+    side = 2 * math.ceil(shape.size * (0.5 + WINDOW_MARGIN)) + 1
     half = side // 2
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
-    mu, mv = _middle(shape, turn)
-    template = _drawn(shape, u + mu, v + mv, np.array([0.0, 0.0, 1.0, START_BLUR, turn]))
+    mu, mv = _window_offset(shape, turn)
+    template = _render(shape, u + mu, v + mv, np.array([0.0, 0.0, 1.0, INITIAL_BLUR_PX, turn]))
     template -= template.mean()
     rows, columns = grey.shape
     if side > min(rows, columns):
         return None
+    # Zero padding to the full size keeps the circular convolution of the FFT from wrapping around.
     full = (rows + side - 1, columns + side - 1)
     flat = grey - grey.mean()
     product = np.fft.irfft2(np.fft.rfft2(flat, full) * np.fft.rfft2(template[::-1, ::-1], full), full)
     valid = product[side - 1 : rows, side - 1 : columns]
-    sums, squares = _box(flat, side), _box(flat * flat, side)
+    sums, squares = _window_sums(flat, side), _window_sums(flat * flat, side)
     spread = np.sqrt(np.maximum(squares - sums * sums / side**2, 0.0) * (template**2).sum())
+    # The floor keeps the rounding errors of nearly uniform windows from correlating with anything.
     floor = 1e-3 * spread.max() + 1e-9
-    like = np.abs(valid) / np.maximum(spread, floor)
-    best = np.unravel_index(int(like.argmax()), like.shape)
-    if like[best] < LIKE:
+    correlation = np.abs(valid) / np.maximum(spread, floor)
+    best = np.unravel_index(int(correlation.argmax()), correlation.shape)
+    if correlation[best] < MIN_CORRELATION:
         return None
     return float(best[1] + half - mu), float(best[0] + half - mv)
 
 
-def _box(values: Floats, side: int) -> Floats:
-    """Return the sums over squares of so many pixels a side."""
+def _window_sums(values: Floats, side: int) -> Floats:
+    """Return the sums over all square windows of `side` pixels."""
     total = np.pad(values.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     return np.asarray(total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side])
 
 
-def _fit(grey: Floats, shape: MarkShape, near: tuple[float, float], turn: float) -> FoundMark | None:
-    half = shape.size * (0.5 + MARGIN)
-    mu, mv = _middle(shape, turn)
+def _fit(grey: Floats, shape: MarkShape, start: tuple[float, float], turn: float) -> DetectedMark | None:
+    """Return the mark fitted from a start pixel u, v, None if the fit does not look like the mark."""
+    half = shape.size * (0.5 + WINDOW_MARGIN)
+    mu, mv = _window_offset(shape, turn)
     rows, columns = grey.shape
-    top, left = max(0, math.floor(near[1] + mv - half)), max(0, math.floor(near[0] + mu - half))
-    bottom, right = min(rows, math.ceil(near[1] + mv + half) + 1), min(columns, math.ceil(near[0] + mu + half) + 1)
+    top, left = max(0, math.floor(start[1] + mv - half)), max(0, math.floor(start[0] + mu - half))
+    bottom, right = min(rows, math.ceil(start[1] + mv + half) + 1), min(columns, math.ceil(start[0] + mu + half) + 1)
     v, u = np.mgrid[top:bottom, left:right].astype(float)
     window = grey[top:bottom, left:right].ravel()
-    plane = np.stack([np.ones(u.size), (u - near[0]).ravel() / half, (v - near[1]).ravel() / half], axis=1)
-    x = np.array([near[0], near[1], 1.0, START_BLUR, turn])
+    plane = np.stack([np.ones(u.size), (u - start[0]).ravel() / half, (v - start[1]).ravel() / half], axis=1)
+    x = np.array([start[0], start[1], 1.0, INITIAL_BLUR_PX, turn])
     steps = np.array([1e-3, 1e-3, 1e-4, 1e-3, 1e-4])
-    free = 4 if shape.kind == "disc" else 5
-    most = np.array([2.0, 2.0, 0.1, 0.5, 0.1])
-    for _ in range(ROUNDS):
-        design = np.hstack([_drawn(shape, u, v, x).reshape(-1, 1) * plane, plane])
+    free = 4 if shape.kind == "disc" else 5  # a disc has no turn
+    max_change = np.array([2.0, 2.0, 0.1, 0.5, 0.1])
+    for _ in range(MAX_ITERATIONS):
+        # Contrast and ground enter linearly: they are solved exactly for each estimate of the other parameters.
+        design = np.hstack([_render(shape, u, v, x).reshape(-1, 1) * plane, plane])
         linear = np.linalg.lstsq(design, window, rcond=None)[0]
         contrast = plane @ linear[:3]
-        slopes = []
+        derivatives = []
         for k in range(free):
             step = np.zeros(5)
             step[k] = steps[k]
-            change = _drawn(shape, u, v, x + step) - _drawn(shape, u, v, x - step)
-            slopes.append(contrast * change.ravel() / (2.0 * steps[k]))
-        rest = window - design @ linear
-        change_of = np.linalg.lstsq(np.column_stack([*slopes, design]), rest, rcond=None)[0][:free]
-        change_of = np.clip(change_of, -most[:free], most[:free])
-        x[:free] += change_of
+            difference = _render(shape, u, v, x + step) - _render(shape, u, v, x - step)
+            derivatives.append(contrast * difference.ravel() / (2.0 * steps[k]))
+        residual = window - design @ linear
+        change = np.linalg.lstsq(np.column_stack([*derivatives, design]), residual, rcond=None)[0][:free]
+        change = np.clip(change, -max_change[:free], max_change[:free])
+        x[:free] += change
         x[3] = min(max(x[3], 0.25), shape.size)
-        if abs(change_of[:2]).max() < 1e-4:
+        if abs(change[:2]).max() < 1e-4:
             break
-    design = np.hstack([_drawn(shape, u, v, x).reshape(-1, 1) * plane, plane])
+    design = np.hstack([_render(shape, u, v, x).reshape(-1, 1) * plane, plane])
     linear = np.linalg.lstsq(design, window, rcond=None)[0]
     ground = plane @ np.linalg.lstsq(plane, window, rcond=None)[0]
     fit = 1.0 - float(((window - design @ linear) ** 2).sum() / max(float(((window - ground) ** 2).sum()), 1e-12))
-    far = math.hypot(x[0] - near[0], x[1] - near[1]) > AWAY * shape.size
-    faint = abs(linear[0]) < FAINT * np.ptp(grey)
-    if fit < FITS or far or faint or not SIZES[0] < x[2] < SIZES[1]:
+    is_far = math.hypot(x[0] - start[0], x[1] - start[1]) > MAX_FIT_SHIFT * shape.size
+    is_faint = abs(linear[0]) < MIN_CONTRAST_SHARE * np.ptp(grey)
+    if fit < MIN_EXPLAINED_SHARE or is_far or is_faint or not SIZE_RANGE[0] < x[2] < SIZE_RANGE[1]:
         return None
-    return FoundMark(float(x[0]), float(x[1]), float(x[4]) if free == 5 else 0.0, float(x[2]), float(linear[0]), fit)
+    return DetectedMark(float(x[0]), float(x[1]), float(x[4]) if free == 5 else 0.0, float(x[2]), float(linear[0]), fit)

@@ -1,7 +1,7 @@
-"""Alignment and calibration as conversations: each asks for looks and motions, and ends with a result.
+"""Alignment and calibration procedures: generators that request looks and motions, and return a result.
 
-A generator yields what it wants, LOOK or a StageMotion, and is sent a Sighting; whoever drives it has the camera, the
-robot and the time. It moves nothing itself. It also yields a LookReport of each look, for which it wants nothing.
+A procedure yields LOOK or a StageMotion and receives an Observation. Its driver has the camera, the robot and the time;
+the procedure itself moves nothing. It also yields a LookReport after each look, whose answer it ignores.
 """
 
 from __future__ import annotations
@@ -13,226 +13,289 @@ from typing import Literal, NamedTuple
 import numpy as np
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.camera_calibration import CameraCalibration, Sight, calibrate
-from trirail.alignment.images import Lens, Pair
-from trirail.alignment.misplacement import DISTANCE, Misplacement, misplacement
+from trirail.alignment import arguments, fresh_pictures
+from trirail.alignment.alignment_request import LOOK, AlignmentRequest, LookReport, Observation, StageMotion
+from trirail.alignment.calibration_procedure import (
+    DEFAULT_MOVES,
+    PLATFORM_CENTRE,
+    ZERO_OFFSET,
+    calibrate_by_moves,
+    calibration_moves,
+    repeat_calibration,
+)
+from trirail.alignment.camera_calibration import CameraCalibration
+from trirail.alignment.fresh_pictures import observe_mean
+from trirail.alignment.images import Pair
+from trirail.alignment.misalignment import (
+    DEFAULT_DISTANCE_ERROR,
+    Misalignment,
+    check_targets_known,
+    measure_misalignment,
+)
 from trirail.alignment.results import Alignment, AlignmentCorrection, AlignmentEnd, Measurement
-from trirail.alignment.rigid import turned
-from trirail.alignment.wishes import LOOK, LookReport, Sighting, StageMotion, Wish
-from trirail.errors import AlignmentError, AlignmentFault
+from trirail.alignment.rigid_motion import rotation_matrix
+from trirail.errors import AlignmentError, AlignmentFault, RefusalCode, RefusedError
 
 __all__ = [
+    "DEFAULT_MOVES",
     "LOOK",
-    "MOVES",
     "Alignment",
     "AlignmentCorrection",
     "AlignmentEnd",
+    "AlignmentRequest",
+    "AlignmentTask",
     "Measurement",
-    "Sighting",
+    "Observation",
     "StageMotion",
-    "Task",
-    "Wish",
     "align",
-    "calibrated_first",
-    "calibration_again",
-    "calibration_by_moves",
-    "look_only",
-    "mean_look",
-    "moves_for",
+    "calibrate_and_align",
+    "calibrate_by_moves",
+    "calibration_moves",
+    "measure_part",
+    "observe_mean",
+    "repeat_calibration",
 ]
 
-MOVES: tuple[Triple, ...] = tuple(
-    (x * 1e-3, y * 1e-3, math.radians(turn))
-    for x, y, turn in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-)
-"""The moves of a calibration where none are given: 1 mm and 1°, each both ways, from where it begins."""
-NO_WAY: Triple = (0.0, 0.0, 0.0)
-CENTRE: Pair = (0.0, 0.0)
-"""Of the platform, in its own frame."""
-TOLERANCE, ANGLE = 1e-6, math.radians(5.0 / 3600.0)
-"""How far a mark may be from where it should be [m], and by what angle a part may be turned [rad]: 1 µm, 5 arcsec."""
-CORRECTIONS = 3
-BEYOND = 2.0
-"""The first correction with a calibration that is not confirmed moves no mark farther than so many times as its moves
-did."""
-CONFIRMS = 0.2
-"""A correction confirms the calibration where it misses what it was to leave by no more than this share of its way."""
+DEFAULT_TOLERANCE_M, DEFAULT_ANGLE_RAD = 1e-6, math.radians(5.0 / 3600.0)
+"""Tolerances of a mark's position and of the part's angle: 1 µm, 5 arcsec."""
+DEFAULT_CORRECTIONS = 3
+MAX_UNCONFIRMED_TRAVEL = 2.0
+"""Greatest travel of a mark in the first correction with an unconfirmed calibration, as a multiple of its travel in the
+calibration's moves."""
+NOISE_LIMIT_DEVIATIONS = 2.0
+"""Standard deviations of a look within which an error is not corrected further if its noise exceeds the tolerance."""
+CONFIRMATION_SHARE = 0.2
+"""Greatest miss of the predicted remaining error, as a share of the correction, with which it confirms the
+calibration."""
 
 
-class Task(NamedTuple):
-    """What is asked of an alignment."""
+class AlignmentTask(NamedTuple):
+    """Arguments of an alignment."""
 
     calibration: CameraCalibration
     targets: Mapping[str, Pair]
-    """Where marks should be in the pictures [pixel]."""
-    tolerance: float = TOLERANCE
-    angle: float = ANGLE
-    corrections: int = CORRECTIONS
-    distance: float = DISTANCE
+    """Targets of the marks [pixel]."""
+    tolerance: float = DEFAULT_TOLERANCE_M
+    angle: float = DEFAULT_ANGLE_RAD
+    corrections: int = DEFAULT_CORRECTIONS
+    distance: float = DEFAULT_DISTANCE_ERROR
     looks: int = 1
-    """Pictures a measurement."""
+    """Pictures per measurement."""
     approach: Triple | None = None
 
+    @property
+    def noise_share(self) -> float:
+        """Noise of a measurement, as a share of the noise of a look of the calibration."""
+        return math.sqrt(self.calibration.looks / self.looks)
 
-Conversation = Generator[Wish, Sighting, Alignment]
+    def check(self) -> None:
+        """Raise RefusedError, with the value and the allowed range, for the first invalid argument."""
+        calibration: object = self.calibration
+        if not isinstance(calibration, CameraCalibration):
+            text = f"calibration is {calibration!r:.100}: expected the CameraCalibration that calibrate_camera returns"
+            raise RefusedError(RefusalCode.MALFORMED, text)
+        arguments.check_targets(self.targets)
+        check_targets_known(calibration, self.targets)
+        arguments.check_above_zero(self.tolerance, "tolerance")
+        arguments.check_above_zero(self.angle, "angle")
+        arguments.check_above_zero(self.distance, "distance")
+        arguments.check_count(self.corrections, "corrections", 0)
+        arguments.check_count(self.looks, "looks", 1)
+        arguments.check_approach(self.approach)
 
 
-def moves_for(lens: Lens, by: float, turn: float) -> tuple[Triple, ...]:
-    """Return the moves that tell a lens: ±by along x and y [m], ±turn [rad], for a bent one into the corners too."""
-    straight = ((by, 0.0), (-by, 0.0), (0.0, by), (0.0, -by))
-    corners = () if lens == "affine" else ((by, by), (-by, by), (-by, -by), (by, -by))
-    ways = tuple((x, y, 0.0) for x, y in (*straight, *corners))
-    return (*ways, (0.0, 0.0, turn), (0.0, 0.0, -turn))
+AlignmentProcedure = Generator[AlignmentRequest, Observation, Alignment]
 
 
-def align(task: Task) -> Conversation:
-    """Measure, correct, measure again, until the part lies right, or no correction is left, or the error grows.
+def align(task: AlignmentTask) -> AlignmentProcedure:
+    """Measure and correct until the part is within tolerance, no correction is left, or the error grows.
 
-    With an approach the table comes from that side before the first look too. Raises AlignmentError where a look does
-    not tell how the part lies, before anything is moved because of it.
+    A look after a correction counts if the correction explains it. With an approach, the platform also moves to its
+    present pose from that side before the first look.
+
+    Raises
+    ------
+    RefusedError
+        An argument is invalid.
+    AlignmentError
+        The looks do not determine the part's pose; no motion follows from such a look.
     """
+    task.check()
     measurements: list[Measurement] = []
     corrections: list[AlignmentCorrection] = []
     confirmed = task.calibration.confirmed
     if task.approach is not None:
-        yield StageMotion(NO_WAY, CENTRE, task.approach)
+        yield StageMotion(ZERO_OFFSET, PLATFORM_CENTRE, task.approach)
+    look, misalignment = yield from _measure_first(task)
+    explained = True
     while True:
-        sight, found = yield from _measure(task, "alignment")
-        measurements.append(measured := _measurement(sight, found))
+        measurements.append(measurement := _measurement(look, misalignment))
         if len(measurements) > 1:
-            confirmed = confirmed or _as_meant(task, measurements, corrections[-1].share)
-        if (why := _ended(task, measurements)) is not None:
-            yield LookReport("alignment", sight, measured, end=why)
+            confirmed = confirmed or (explained and _is_as_predicted(task, measurements, corrections[-1].share))
+        end = _end_reason(task, measurements, misalignment.deviations(task.noise_share))
+        if end is not None:
+            # Pictures that no motion explains may be old ones: they must not report success.
+            if end is AlignmentEnd.REACHED and not explained:
+                raise (yield from _report_stale(look))
+            yield LookReport("alignment", look, measurement, end=end)
             seconds = measurements[-1].time - measurements[0].time
-            confirmed = confirmed and why is not AlignmentEnd.GROWING
-            return Alignment(why, tuple(measurements), tuple(corrections), seconds, confirmed)
-        share = 1.0 if confirmed else min(1.0, BEYOND * task.calibration.reach / max(found.worst, 1e-12))
-        motion = _motion(found, sight.pose, share, task.approach)
-        yield LookReport("alignment", sight, measured, motion.by)
+            confirmed = confirmed and end is not AlignmentEnd.GROWING
+            return Alignment(end, tuple(measurements), tuple(corrections), seconds, confirmed)
+        # A wrong sign or scale shows in the next look, so an unconfirmed calibration may only move about as far as it
+        # has moved the stage itself.
+        max_travel = MAX_UNCONFIRMED_TRAVEL * task.calibration.reach
+        share = 1.0 if confirmed else min(1.0, max_travel / max(misalignment.worst, 1e-12))
+        motion = _correction_motion(misalignment, look.pose, share, task.approach)
+        yield LookReport("alignment", look, measurement, motion.by)
         arrived = yield motion
-        corrections.append(AlignmentCorrection(motion.by, share, arrived.time - sight.time))
+        corrections.append(AlignmentCorrection(motion.by, share, arrived.time - look.time))
+        look, misalignment, explained = yield from _measure_again(task, look, misalignment)
 
 
-def calibrated_first(task: Callable[[CameraCalibration], Task], looks: int, approach: Triple | None) -> Conversation:
-    """Do the same with a calibration that is made first, by MOVES."""
-    calibration = yield from calibration_by_moves(looks=looks, approach=approach)
+def calibrate_and_align(
+    task: Callable[[CameraCalibration], AlignmentTask], looks: int, approach: Triple | None
+) -> AlignmentProcedure:
+    """Calibrate by DEFAULT_MOVES, then align with that calibration."""
+    calibration = yield from calibrate_by_moves(looks=looks, approach=approach)
     return (yield from align(task(calibration)))
 
 
-def look_only(task: Task) -> Generator[Wish, Sighting, Measurement]:
-    """Measure and move nothing."""
-    sight, found = yield from _measure(task, "check")
-    measured = _measurement(sight, found)
-    yield LookReport("check", sight, measured, end="checked")
-    return measured
+def measure_part(task: AlignmentTask) -> Generator[AlignmentRequest, Observation, Measurement]:
+    """Measure the part once, without a motion."""
+    task.check()
+    look = yield from observe_mean(task.looks)
+    misalignment = yield from _measure_misalignment(task, look, "check")
+    measurement = _measurement(look, misalignment)
+    yield LookReport("check", look, measurement, end="checked")
+    return measurement
 
 
-def calibration_by_moves(
-    moves: Sequence[Triple] = MOVES,
-    views: Mapping[str, str] | None = None,
-    lens: Lens = "affine",
-    centre: Pair = (0.0, 0.0),
-    looks: int = 1,
-    approach: Triple | None = None,
-) -> Generator[Wish, Sighting, CameraCalibration]:
-    """Look where the robot stands and after each move from there, return there, and calibrate.
+def _measure_first(task: AlignmentTask) -> Generator[AlignmentRequest, Observation, tuple[Observation, Misalignment]]:
+    """Return the first look, which no motion can show to be new, and the misalignment.
 
-    With an `approach` it comes to where it stands from that side before. Raises AlignmentError where the looks do not
-    tell it.
+    A look that shows an aligned part is compared with further pictures: a late camera shows the part before it.
     """
-    if approach is not None:
-        yield StageMotion(NO_WAY, CENTRE, approach)
-    first = yield from mean_look(looks)
-    sights = [first]
-    yield LookReport("calibration", first)
-    for move in moves:
-        yield StageMotion(_sum(first.pose, move), approach=approach)
-        sights.append((yield from mean_look(looks)))
-        yield LookReport("calibration", sights[-1])
-    yield StageMotion(first.pose, approach=approach)
+    pictures = yield from fresh_pictures.capture(task.looks)
+    for _ in range(fresh_pictures.MAX_STALE_PICTURES):
+        look = fresh_pictures.average(pictures)
+        newest, tolerance = pictures[-1], 0.5 * task.tolerance
+        if all(fresh_pictures.is_consistent(task.calibration, newest, each, 1, tolerance) for each in pictures):
+            misalignment = yield from _measure_misalignment(task, look, "alignment")
+            # A stale look that shows an error is found out by the correction; one that shows none would end it.
+            if not _is_within(task, misalignment):
+                return look, misalignment
+            tolerance = _miss_tolerance(task, misalignment)
+            pictures = yield from fresh_pictures.capture(max(fresh_pictures.MAX_STALE_PICTURES - 1, task.looks))
+            if all(
+                fresh_pictures.is_consistent(task.calibration, look, each, task.looks, tolerance) for each in pictures
+            ):
+                return look, misalignment
+            pictures = pictures[-task.looks :]
+        else:
+            pictures = yield from fresh_pictures.capture(task.looks)
+    raise (yield from _report_stale(look))
+
+
+def _measure_again(
+    task: AlignmentTask, before: Observation, previous: Misalignment
+) -> Generator[AlignmentRequest, Observation, tuple[Observation, Misalignment, bool]]:
+    """Return the look after a correction, its misalignment, and True if the correction explains the look.
+
+    Raises AlignmentError if the pictures show the marks unmoved.
+    """
+    tolerance = _miss_tolerance(task, previous)
+    fit = yield from fresh_pictures.capture_after_motion(task.calibration, before, task.looks, tolerance)
+    look = fresh_pictures.average(fit.pictures)
+    misalignment = yield from _measure_misalignment(task, look, "alignment")
+    deviation, _ = misalignment.deviations(task.noise_share)
+    if fit.still and not _has_grown(task, previous.worst, misalignment.worst, deviation):
+        raise (yield from _report_stale(look))
+    return look, misalignment, fit.explained
+
+
+def _report_stale(look: Observation) -> Generator[AlignmentRequest, Observation, AlignmentError]:
+    """Report that the pictures do not show the robot's present pose; return the error to raise."""
+    words = (
+        f"{fresh_pictures.MAX_STALE_PICTURES} pictures do not show the marks where the motion put them; take a new "
+        "picture at each look (a camera's buffer holds old ones), or remove backlash with an approach"
+    )
+    yield LookReport("alignment", look, end=AlignmentFault.STILL, words=words)
+    return AlignmentError(AlignmentFault.STILL, words)
+
+
+def _measure_misalignment(
+    task: AlignmentTask, look: Observation, purpose: Literal["alignment", "check"]
+) -> Generator[AlignmentRequest, Observation, Misalignment]:
+    """Return the misalignment shown by a look; report an error before it is raised."""
     try:
-        found = calibrate([Sight(each.pose, each.marks) for each in sights], views, lens, centre)
+        return measure_misalignment(task.calibration, look.marks, task.targets, task.distance)
     except AlignmentError as error:
-        yield LookReport("calibration", end=error.fault, words=str(error))
-        raise
-    yield LookReport("calibration", end="calibrated", noise=found.noise)
-    return found
-
-
-def calibration_again(kept: CameraCalibration, looks: int = 1) -> Generator[Wish, Sighting, CameraCalibration]:
-    """Calibrate the same views by the same moves, from where the robot stands."""
-    x, y, phi = kept.poses[0]
-    moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in kept.poses[1:]]
-    views = {name: mark.view for name, mark in kept.marks.items()}
-    view = next(iter(kept.views.values()))
-    return (yield from calibration_by_moves(moves, views, view.lens, view.centre, looks))
-
-
-def mean_look(pictures: int) -> Generator[Wish, Sighting, Sighting]:
-    """Return the mean of several pictures, for each mark over those that show it."""
-    taken = []
-    for _ in range(pictures):
-        taken.append((yield LOOK))  # noqa: PERF401 - a comprehension cannot yield
-    seen: dict[str, list[Pair]] = {}
-    for each in taken:
-        for name, pixel in each.marks.items():
-            seen.setdefault(name, []).append((float(pixel[0]), float(pixel[1])))
-    for name, pixels in seen.items():
-        if not np.isfinite(pixels).all():
-            raise AlignmentError(AlignmentFault.MISSING, f"mark {name} is at {pixels}: finite pixels are wanted")
-    marks = {
-        name: (math.fsum(u for u, _ in p) / len(p), math.fsum(v for _, v in p) / len(p)) for name, p in seen.items()
-    }
-    x, y, phi = np.mean([each.pose for each in taken], axis=0).tolist()
-    return Sighting(marks, (x, y, phi), taken[-1].time)
-
-
-def _measure(
-    task: Task, purpose: Literal["alignment", "check"]
-) -> Generator[Wish, Sighting, tuple[Sighting, Misplacement]]:
-    sight = yield from mean_look(task.looks)
-    try:
-        return sight, misplacement(task.calibration, sight.marks, task.targets, task.distance)
-    except AlignmentError as error:
-        yield LookReport(purpose, sight, end=error.fault, words=str(error))
+        yield LookReport(purpose, look, end=error.fault, words=str(error))
         raise
 
 
-def _measurement(sight: Sighting, found: Misplacement) -> Measurement:
-    error = found.error
-    errors = {name: _pair(e) for name, e in zip(found.names, (found.to - found.at).tolist(), strict=True)}
-    misfit = float(np.linalg.norm(error.misfit, axis=1).max())
-    shift = _pair(error.shift.tolist())
+def _miss_tolerance(task: AlignmentTask, misalignment: Misalignment) -> float:
+    """Return the miss of a mark's predicted position that is always accepted [m]: half of the tolerance."""
+    return 0.5 * min(task.tolerance, task.angle * misalignment.arm)
+
+
+def _is_within(task: AlignmentTask, misalignment: Misalignment) -> bool:
+    return misalignment.worst <= task.tolerance and abs(misalignment.motion.turn) <= task.angle
+
+
+def _has_grown(task: AlignmentTask, before: float, now: float, deviation: float) -> bool:
+    """Return True if an error has grown by more than the tolerance and the noise of both looks."""
+    return now > before + task.tolerance + fresh_pictures.NOISE_DEVIATIONS * math.sqrt(2.0) * deviation
+
+
+def _measurement(look: Observation, misalignment: Misalignment) -> Measurement:
+    motion = misalignment.motion
+    displacements = (misalignment.targets - misalignment.positions).tolist()
     return Measurement(
-        dict(sight.marks), errors, found.worst, shift, error.turn, misfit, found.distance, sight.pose, sight.time
+        marks=dict(look.marks),
+        errors={name: _pair(each) for name, each in zip(misalignment.names, displacements, strict=True)},
+        worst=misalignment.worst,
+        shift=_pair(motion.shift.tolist()),
+        turn=motion.turn,
+        misfit=float(np.linalg.norm(motion.misfit, axis=1).max()),
+        distance=misalignment.distance,
+        pose=look.pose,
+        time=look.time,
     )
 
 
-def _ended(task: Task, measurements: Sequence[Measurement]) -> AlignmentEnd | None:
-    now = measurements[-1]
-    if now.worst <= task.tolerance and abs(now.turn) <= task.angle:
+def _end_reason(
+    task: AlignmentTask, measurements: Sequence[Measurement], deviations: tuple[float, float]
+) -> AlignmentEnd | None:
+    """Return the reason to end, None to continue; `deviations` are those of the last `worst` [m] and `turn` [rad]."""
+    now, (place, turn) = measurements[-1], deviations
+    is_precise = place <= task.tolerance and turn <= task.angle
+    if is_precise and now.worst <= task.tolerance and abs(now.turn) <= task.angle:
         return AlignmentEnd.REACHED
-    if len(measurements) > 1 and now.worst > measurements[-2].worst + task.tolerance:
+    if len(measurements) > 1 and _has_grown(task, measurements[-2].worst, now.worst, place):
         return AlignmentEnd.GROWING
+    # Within its own noise a further correction is as likely to make the error larger as smaller.
+    is_near = (
+        now.worst <= task.tolerance + NOISE_LIMIT_DEVIATIONS * place
+        and abs(now.turn) <= task.angle + NOISE_LIMIT_DEVIATIONS * turn
+    )
+    if is_near and not is_precise:
+        return AlignmentEnd.NOISE
     return AlignmentEnd.CORRECTIONS if len(measurements) > task.corrections else None
 
 
-def _as_meant(task: Task, measurements: Sequence[Measurement], share: float) -> bool:
-    """Whether the newest correction, of a share of the error, has left what it was to leave."""
+def _is_as_predicted(task: AlignmentTask, measurements: Sequence[Measurement], share: float) -> bool:
+    """Return True if the last correction, of a share of the error, has left the predicted error."""
     before, now = (each.worst for each in measurements[-2:])
-    return abs(now - (1.0 - share) * before) <= max(task.tolerance, CONFIRMS * share * before)
+    return abs(now - (1.0 - share) * before) <= max(task.tolerance, CONFIRMATION_SHARE * share * before)
 
 
-def _motion(found: Misplacement, pose: Triple, share: float, approach: Triple | None) -> StageMotion:
-    """Return the correction about the marks' middle."""
-    error = found.error
-    x, y = (share * error.shift).tolist()
-    tool = turned(-pose[2]) @ (error.middle - pose[:2])
-    return StageMotion((x, y, share * error.turn), _pair(tool.tolist()), approach)
-
-
-def _sum(a: Triple, b: Triple) -> Triple:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+def _correction_motion(misalignment: Misalignment, pose: Triple, share: float, approach: Triple | None) -> StageMotion:
+    """Return the correction about the marks' centroid."""
+    motion = misalignment.motion
+    x, y = (share * motion.shift).tolist()
+    tool = rotation_matrix(-pose[2]) @ (motion.centroid - pose[:2])
+    return StageMotion((x, y, share * motion.turn), _pair(tool.tolist()), approach)
 
 
 def _pair(values: Sequence[float]) -> Pair:

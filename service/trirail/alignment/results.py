@@ -1,4 +1,4 @@
-"""What an alignment comes to: what each look told, the corrections between them, and why it ended."""
+"""Result of an alignment: the measurements, the corrections between them, and the reason of its end."""
 
 from __future__ import annotations
 
@@ -10,82 +10,84 @@ import numpy as np
 from trirail_drivers.interface import Triple
 
 from trirail.alignment.images import Pair
-from trirail.alignment.rigid import Floats
+from trirail.alignment.rigid_motion import Floats
 
 
 class AlignmentEnd(StrEnum):
-    """Why an alignment ended."""
+    """Reason of an alignment's end."""
 
     REACHED = "reached"
-    """Every mark is within the tolerance, and the part's angle."""
+    """Every mark and the part's angle are within tolerance."""
     CORRECTIONS = "corrections"
-    """As many corrections have been made as were allowed."""
+    """The allowed number of corrections is used up."""
     GROWING = "growing"
-    """The error grew by a correction: a sign, a mirror, or a camera that was moved."""
+    """A correction increased the error: a wrong sign, a mirrored picture, or a camera that was moved."""
+    NOISE = "noise"
+    """The noise of a look exceeds the tolerance, and the remaining error is within that noise."""
 
 
 class Measurement(msgspec.Struct, frozen=True):
-    """What one look told."""
+    """Error of the part measured by one look."""
 
     marks: dict[str, Pair]
-    """Pixels of the marks; the mean where several pictures were taken."""
+    """Pixels of the marks, the mean over the pictures of the look."""
     errors: dict[str, Pair]
-    """How far each mark has to go to its target, x, y in the base frame [m]."""
+    """Displacement of each mark to its target, x, y in the base frame [m]."""
     worst: float
-    """The greatest distance that a mark goes by the motion that aligns the part [m]."""
+    """Greatest distance of a mark's travel in the motion that aligns the part [m]."""
     shift: Pair
-    """How far the middle of the marks has to go [m]."""
+    """Displacement of the marks' centroid to its target [m]."""
     turn: float
-    """By what angle the part has to turn [rad]."""
+    """Angle between the part and its target, counterclockwise [rad]."""
     misfit: float
-    """The greatest distance of a mark from its target that no motion takes away [m]."""
+    """Greatest distance of a mark from its target after the best rigid motion [m]."""
     distance: float
-    """By how much the worst distance of two marks is wrong, as a share of it."""
+    """Relative error of the worst distance between two marks."""
     pose: Triple
-    """Of the platform, measured: x, y [m], phi [rad]."""
+    """Measured pose of the platform: x, y [m], phi [rad]."""
     time: float
-    """When, on the clock of who looked [s]."""
+    """Time of the look on the driver's clock [s]."""
 
 
 class AlignmentCorrection(msgspec.Struct, frozen=True):
-    """One motion that was made."""
+    """A completed correction motion."""
 
     by: Triple
-    """Of the marks' middle: x, y [m]; phi [rad]."""
+    """Motion of the marks' centroid: x, y [m]; phi [rad]."""
     share: float
-    """Of what the look before it told: below 1 for the first of a calibration that is not confirmed."""
+    """Share of the measured error: below 1 for the first correction with an unconfirmed calibration."""
     seconds: float
-    """From the look before it until the robot stood."""
+    """Time from the look before it until the robot is at rest."""
 
 
 class Alignment(msgspec.Struct, frozen=True):
-    """How an alignment went: one more measurement than corrections."""
+    """Course of an alignment; it has one more measurement than corrections."""
 
     why: AlignmentEnd
     measurements: tuple[Measurement, ...]
     corrections: tuple[AlignmentCorrection, ...]
     seconds: float
-    """From the first look to the last."""
+    """Time from the first look to the last."""
     confirmed: bool
-    """Whether a correction has gone where it should with this calibration, here or before."""
+    """True if a correction with this calibration, here or before, had the predicted effect."""
 
     @property
     def reached(self) -> bool:
-        """Whether the part lies right."""
+        """True if every mark and the part's angle are within tolerance."""
         return self.why is AlignmentEnd.REACHED
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """The marks that were seen, by name: the rows of `residuals`."""
+        """Names of the observed marks, sorted: the rows of `residuals`."""
         return tuple(sorted({name for each in self.measurements for name in each.errors}))
 
     @property
     def residuals(self) -> Floats:
-        """How far each mark was from its target at each look, (marks, looks) [m]; NaN where it was not seen."""
+        """Distance of each mark from its target at each look, (marks, looks) [m]; NaN for a mark that was not found."""
         errors = [[each.errors.get(name, (math.nan, math.nan)) for each in self.measurements] for name in self.marks]
         return np.asarray(np.linalg.norm(errors, axis=2))
 
     @property
     def angle(self) -> float:
-        """By what angle the part was still turned at the last look [rad]."""
+        """Angle of the part at the last look [rad]."""
         return self.measurements[-1].turn

@@ -1,4 +1,4 @@
-"""A camera that is not there: it draws the marks of a part on the table as the robot really stands."""
+"""A simulated camera, which renders the marks of a part on the table at the robot's real pose."""
 
 from __future__ import annotations
 
@@ -9,30 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.camera_calibration import placed
-from trirail.alignment.images import CameraView, Pair, pixels, slopes
-from trirail.alignment.rigid import Floats, turned
+from trirail.alignment.camera_calibration import to_base_frame
+from trirail.alignment.images import CameraView, Pair, project_points, projection_jacobians
+from trirail.alignment.rigid_motion import Floats, rotation_matrix
 from trirail.alignment.shapes import MarkShape, brightness
 
-INSTANTS = 15
-"""Into how many instants an exposure is divided."""
-BRIGHTEST = 255
+EXPOSURE_SAMPLES = 15
+MAX_BRIGHTNESS = 255
 
 
 class DrawnMark(NamedTuple):
     """A mark of the part on the table."""
 
     shape: MarkShape
-    """In metres."""
+    """Shape, in metres."""
     place: Pair
-    """In the platform's frame [m]."""
+    """Position in the platform's frame [m]."""
 
 
 class SimulatedCamera(NamedTuple):
-    """What a camera shows, and how badly.
+    """A camera's projection, its marks, and the imperfections of its pictures.
 
-    Light falls off towards the corners by `shade`, a share of it; `noise` is the standard deviation of a pixel's
-    brightness, of 255. What is read at a time was exposed for `exposure` seconds, which ended `delay` seconds before.
+    Light falls off towards the corners by a share `shade`; `noise` is the standard deviation of a pixel's brightness,
+    of 255. A picture is exposed for `exposure` seconds, which end `delay` seconds before it is read.
     """
 
     view: CameraView
@@ -49,38 +48,42 @@ class SimulatedCamera(NamedTuple):
     delay: float = 0.0
 
     def picture(self, pose_at: Callable[[float], Triple], time: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Return what is read from it at a time [s], grey, (rows, columns); `pose_at` is where the robot was when."""
+        """Return the grey picture read at a time [s], (rows, columns); `pose_at` gives the robot's pose at a time."""
         end = time - self.delay
         if self.exposure > 0.0:
-            instants = end - self.exposure * (np.arange(INSTANTS) + 0.5) / INSTANTS
+            instants = end - self.exposure * (np.arange(EXPOSURE_SAMPLES) + 0.5) / EXPOSURE_SAMPLES
         else:
             instants = np.array([end])
-        light = sum((self._marks_at(pose_at(float(t))) for t in instants), np.zeros((self.rows, self.columns)))
+        light = sum((self._render_marks(pose_at(float(t))) for t in instants), np.zeros((self.rows, self.columns)))
         shown = (self.ground + self.contrast * light / len(instants)) * self._shading()
         shown = shown + self.noise * rng.standard_normal(shown.shape)
-        return np.clip(np.rint(shown), 0, BRIGHTEST).astype(np.uint8)
+        return np.clip(np.rint(shown), 0, MAX_BRIGHTNESS).astype(np.uint8)
 
     def pixels_at(self, pose: Triple) -> dict[str, Pair]:
-        """Return where its marks are in the picture with the platform at a pose, exactly; also those outside of it."""
-        points = {name: pixels(self.view, placed(mark.place, pose)[None])[0] for name, mark in self.marks.items()}
+        """Return the exact pixels of the marks for a platform pose, including marks outside of the picture."""
+        points = {
+            name: project_points(self.view, to_base_frame(mark.place, pose)[None])[0]
+            for name, mark in self.marks.items()
+        }
         return {name: (float(u), float(v)) for name, (u, v) in points.items()}
 
     def _shading(self) -> Floats:
         v, u = np.mgrid[-1.0 : 1.0 : self.rows * 1j, -1.0 : 1.0 : self.columns * 1j]
         return np.asarray(1.0 - self.shade * (0.25 * (u * u + v * v) + 0.25 * (u + v)))
 
-    def _marks_at(self, pose: Triple) -> Floats:
+    def _render_marks(self, pose: Triple) -> Floats:
         light = np.zeros((self.rows, self.columns))
         for mark in self.marks.values():
-            at = placed(mark.place, pose)[None]
-            (u, v), slope = pixels(self.view, at)[0], slopes(self.view, at)[0]
-            reach = 1.5 * mark.shape.size * float(np.abs(slope).max()) + 5.0 * self.blur
+            at = to_base_frame(mark.place, pose)[None]
+            (u, v), jacobian = project_points(self.view, at)[0], projection_jacobians(self.view, at)[0]
+            reach = 1.5 * mark.shape.size * float(np.abs(jacobian).max()) + 5.0 * self.blur
+            # Only the window around a mark is rendered: beyond five blurs from its edges it adds nothing.
             top, bottom = (int(np.clip(v + d, 0, self.rows)) for d in (-reach, reach + 1))
             left, right = (int(np.clip(u + d, 0, self.columns)) for d in (-reach, reach + 1))
             if top >= bottom or left >= right:
                 continue
             y, x = np.mgrid[top:bottom, left:right].astype(float)
-            own = np.linalg.solve(slope @ turned(pose[2]), np.stack([(x - u).ravel(), (y - v).ravel()]))
+            own = np.linalg.solve(jacobian @ rotation_matrix(pose[2]), np.stack([(x - u).ravel(), (y - v).ravel()]))
             drawn = brightness(mark.shape, own[0], own[1], self.blur / self.view.scale).reshape(x.shape)
             light[top:bottom, left:right] = np.maximum(light[top:bottom, left:right], drawn)
         return light

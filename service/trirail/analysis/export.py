@@ -1,4 +1,4 @@
-"""A recording as one table, a row a cycle, for other programs: CSV or Parquet."""
+"""Export of a recording as a table with one row per cycle, CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -8,23 +8,34 @@ from pathlib import Path
 from pyarrow import csv, parquet
 
 from trirail.errors import ServiceError
-from trirail.telemetry.reading import Recording
-from trirail.telemetry.recording_table import table
+from trirail.telemetry.recording import Recording, table
 
 FORMATS = (".csv", ".parquet")
-"""What a file's name may end in."""
+"""Accepted file suffixes."""
 
 
 def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
-    """Write the table of a recording, as CSV or Parquet by the end of the file's name; return its rows.
+    """Write the table of a recording, as CSV or Parquet by the file's suffix; return the number of rows.
 
-    `columns` as trirail.telemetry.recording_table.table has them. Raises ServiceError where one is none, the name ends
-    otherwise, the file exists, or it cannot be written.
+    Parameters
+    ----------
+    recording
+        Recording to export.
+    path
+        File to write.
+    columns
+        Names of columns, as in trirail.telemetry.recording.table; all if empty.
+
+    Raises
+    ------
+    ServiceError
+        A column or the suffix is unknown, the file exists, or it cannot be written.
     """
     if path.suffix not in FORMATS:
         raise ServiceError(f"{path}: its name must end in {' or '.join(FORMATS)}")
     rows = table(recording, columns)
     try:
+        # Mode x: an existing file, say another export, is never overwritten.
         with path.open("xb") as file:
             if path.suffix == ".csv":
                 csv.write_csv(rows, file)

@@ -1,11 +1,12 @@
-"""A recorded session again, in process and without waiting: the same control, given the same, cycle by cycle.
+"""Replay of a recorded session in process, without waiting: the same control with the same inputs, cycle by cycle.
 
-What the control decides depends on its configuration, on what the drives say at each SYNC, and on what it is given:
-goals, commands, mishaps, and what the planner has answered. All of that is in a recording, with the cycle that it
-belongs to, so the setpoints must come out the same to the last bit. What the planner is asked comes of that as well: it
-is planned once more, and compared with what was answered. With another configuration the recorded answers of drives
-and planner mean nothing any more: then simulated drives take their place, on a clock that goes on by one period a
-cycle, and a planner that answers in the next one.
+The decisions of the control depend on its configuration, on the feedback of the drives at each SYNC, and on its inputs:
+goals, commands, disturbances and the planner's answers. A recording has all of these, each with its cycle, so that the
+setpoints must be the same to the last bit. The requests to the planner follow from them as well: the replay plans them
+again, and compares the result with the recorded answer.
+
+With another configuration the recorded answers of drives and planner are no longer valid. Their place is taken by
+simulated drives, on a clock that advances by one period per cycle, and a planner that answers in the next cycle.
 """
 
 from __future__ import annotations
@@ -19,7 +20,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.connection.opening import connect
-from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
+from trirail_drivers.interface import (
+    NAMES,
+    DriveFault,
+    DriveGroup,
+    Feedback,
+    MissingProtection,
+    PowerState,
+    Triple,
+    Unready,
+    UnreadyDrives,
+)
 
 from trirail.config import Config
 from trirail.control.control import Control, Given
@@ -27,68 +38,81 @@ from trirail.control.local_planner import LocalPlanner
 from trirail.errors import ServiceError
 from trirail.motion.motion_planner import MotionPlanner, revision
 from trirail.telemetry import provenance
-from trirail.telemetry.reading import Recording
+from trirail.telemetry.recording import Recording
 from trirail.wire.packets import ControlInput, DrivesFault, PlannerLost
 from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 from trirail.wire.vocabulary import MODES, Mode
 
-SETPOINTS = ("commanded_position", "commanded_velocity")
-"""The fields of a record that were sent to the drives."""
-_FLAGS = (("age", int), ("follows", bool), ("homed", bool))
+SETPOINT_FIELDS = ("commanded_position", "commanded_velocity")
+"""Fields of a record with the setpoints for the drives."""
+_FLAG_FIELDS = (("age", int), ("follows", bool), ("homed", bool))
 
 
 class Comparison(NamedTuple):
-    """How a session's setpoints came out again."""
+    """Comparison of a session's setpoints with those of its replay."""
 
     cycles: int
-    """So many were compared."""
+    """Number of compared cycles."""
     lacking: int
-    """So many at the end were not, since what came before them is not in the recording."""
+    """Cycles at the end that were not compared, as the recording has a gap before them."""
     requests: int
-    """Goals, commands and mishaps that were given."""
+    """Number of goals, commands and disturbances."""
     plans: int
-    """Answers of the planner that were given; none where it was asked anew instead."""
+    """Number of recorded answers of the planner; 0 if all plans are made by the replay."""
     plans_differing: int
-    """So many of them are not the same to the last bit when the same is planned again."""
+    """Recorded answers that differ from the replay's in any bit."""
     differing: int
-    """Cycles whose setpoints or mode are not the same to the last bit."""
+    """Cycles whose setpoints or mode differ in any bit."""
     first: int | None
-    """The first of them."""
+    """First of these cycles."""
     position: Triple
-    """Greatest difference of a setpoint, of each slider [m]."""
+    """Greatest difference of a setpoint for each slider [m]."""
     velocity: Triple
-    """Greatest difference of the velocity feed-forward, of each slider [m/s]."""
+    """Greatest difference of the velocity feed-forward for each slider [m/s]."""
 
 
-def again(recording: Recording, config: Config, *, simulated: bool) -> Comparison:
-    """Run a session once more and compare.
+def replay_session(recording: Recording, config: Config, *, simulated: bool) -> Comparison:
+    """Run a session again and compare the setpoints.
 
-    The drives are those of the recording or, if `simulated`, those of the configuration's simulation. Raises
-    ServiceError where the recording does not begin with a robot without power: what it did before is not known.
+    Parameters
+    ----------
+    recording
+        Session to replay.
+    config
+        Configuration of the control.
+    simulated
+        Use simulated drives of the configuration in place of the recorded ones.
+
+    Raises
+    ------
+    ServiceError
+        The recording does not begin with a disabled robot, so its earlier state is unknown, or its rate differs from
+        the configured one.
     """
-    records, given = _whole(recording)
-    _check(recording, records, config)
-    clock = _Clock(config.period)
-    drives = _simulated(records, config, clock) if simulated else _Recorded(records)
-    requests = [what for what in given if not isinstance(what.given, PlanAnswer | PlannerLost)]
+    records, inputs = _replayable_part(recording)
+    _check_recording(recording, records, config)
+    clock = _SimulatedClock(config.period)
+    drives = _simulated_drives(records, config, clock) if simulated else _RecordedDrives(records)
+    requests = [entry for entry in inputs if not isinstance(entry.given, PlanAnswer | PlannerLost)]
     planner: _RecordedPlanner | LocalPlanner
-    if len(requests) < len(given) and _plans_alike(recording, config):
+    if len(requests) < len(inputs) and _has_same_plans(recording, config):
         planner = _RecordedPlanner(config)
     else:
-        planner, given = LocalPlanner(config), requests
+        planner, inputs = LocalPlanner(config), requests
     try:
-        made, modes = _run(Control(config, drives, planner), drives, planner, clock, records, given)
+        setpoints, modes = _run(Control(config, drives, planner), drives, planner, clock, records, inputs)
     finally:
         clock.run()
         drives.close()
-    sent = np.stack([records[name] for name in SETPOINTS], axis=1)
-    differs = (made.view(np.int64) != sent.view(np.int64)).any(axis=(1, 2)) | (modes != records["mode"])
-    greatest = np.abs(made - sent).max(axis=0).tolist()
+    recorded = np.stack([records[name] for name in SETPOINT_FIELDS], axis=1)
+    # Compared as integers: the same bits, including the sign of a zero.
+    differs = (setpoints.view(np.int64) != recorded.view(np.int64)).any(axis=(1, 2)) | (modes != records["mode"])
+    greatest = np.abs(setpoints - recorded).max(axis=0).tolist()
     return Comparison(
         cycles=len(records),
         lacking=len(recording.records) - len(records),
         requests=len(requests),
-        plans=planner.given if isinstance(planner, _RecordedPlanner) else 0,
+        plans=planner.answers if isinstance(planner, _RecordedPlanner) else 0,
         plans_differing=planner.differing if isinstance(planner, _RecordedPlanner) else 0,
         differing=int(differs.sum()),
         first=int(records["cycle"][np.argmax(differs)]) if differs.any() else None,
@@ -101,99 +125,103 @@ def _run(
     control: Control,
     drives: DriveGroup,
     planner: _RecordedPlanner | LocalPlanner,
-    clock: _Clock,
+    clock: _SimulatedClock,
     records: NDArray[np.void],
-    given: Sequence[ControlInput],
+    inputs: Sequence[ControlInput],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return what is sent to the drives in each cycle, (N, 2, 3), and the modes, (N,)."""
+    """Return the setpoints of each cycle, position [m] and velocity [m/s], (N, 2, 3), and the modes, (N,)."""
     clock.step()
     drives.sync()
     control.start(drives.read())
     control.modes.cycle = int(records["cycle"][0])
-    waiting = deque(given)
-    made = np.zeros((len(records), 2, 3))
+    pending = deque(inputs)
+    setpoints = np.zeros((len(records), 2, 3))
     modes = np.zeros(len(records), np.uint8)
     for row in range(len(records)):
         clock.step()
         drives.sync()
-        _cycle(control, drives, planner, list(_due(waiting, control.cycles + 1)))
-        made[row] = control.setpoints.rows[:2]
+        _run_cycle(control, drives, planner, list(_due_inputs(pending, control.cycles + 1)))
+        setpoints[row] = control.setpoints.rows[:2]
         modes[row] = MODES.index(control.state.mode)
         control.conclude()
-    return made, modes
+    return setpoints, modes
 
 
-def _cycle(
-    control: Control, drives: DriveGroup, planner: _RecordedPlanner | LocalPlanner, given: Sequence[ControlInput]
+def _run_cycle(
+    control: Control, drives: DriveGroup, planner: _RecordedPlanner | LocalPlanner, entries: Sequence[ControlInput]
 ) -> None:
-    """Do what the loop does in a cycle after its SYNC."""
-    said = [what for what in given if not isinstance(what.given, DrivesFault)]
-    decided = [what for what in said if not what.urgent]
-    if isinstance(drives, _Recorded):
-        for what in given:
-            if isinstance(what.given, DrivesFault):
-                drives.fail(what.given.message)
+    """Run the steps of the loop's cycle that follow its SYNC."""
+    inputs = [entry for entry in entries if not isinstance(entry.given, DrivesFault)]
+    decided = [entry for entry in inputs if not entry.urgent]
+    if isinstance(drives, _RecordedDrives):
+        for entry in entries:
+            if isinstance(entry.given, DrivesFault):
+                drives.set_fault(entry.given)
+    # Inputs that arrived while the loop waited for its tick were decided separately, after the others.
     for waiting in (False, True):
-        heard = [what for what in decided if what.waiting is waiting]
-        inputs: list[Given] = [(what.given, what.now_ns) for what in heard]  # type: ignore[misc]
+        received = [entry for entry in decided if entry.waiting is waiting]
+        batch: list[Given] = [(entry.given, entry.now_ns) for entry in received]  # type: ignore[misc]
         if isinstance(planner, LocalPlanner):
-            inputs += [(answer, 0) for answer in planner.answers()]
+            batch += [(answer, 0) for answer in planner.answers()]
         else:
-            planner.compare(heard)
-        if inputs or not waiting:
-            control.decide(inputs)
-    for what in said:
-        if what.urgent:
-            control.handle(what.given, what.now_ns)  # type: ignore[arg-type]
+            planner.compare(received)
+        if batch or not waiting:
+            control.decide(batch)
+    for entry in inputs:
+        if entry.urgent:
+            control.handle(entry.given, entry.now_ns)  # type: ignore[arg-type]
     control.execute(drives.read())
     control.ledger.answers.clear()
     control.ledger.notices.clear()
 
 
-def _due(waiting: deque[ControlInput], cycle: int) -> Iterator[ControlInput]:
-    while waiting and waiting[0].cycle <= cycle:
-        yield waiting.popleft()
+def _due_inputs(pending: deque[ControlInput], cycle: int) -> Iterator[ControlInput]:
+    while pending and pending[0].cycle <= cycle:
+        yield pending.popleft()
 
 
-def _whole(recording: Recording) -> tuple[NDArray[np.void], list[ControlInput]]:
-    """Return the records up to the first gap, in them or in what the control was given, and what it was given."""
-    records, given = recording.records, recording.requests
+def _replayable_part(recording: Recording) -> tuple[NDArray[np.void], list[ControlInput]]:
+    """Return the records up to the first gap in the records or the inputs, and the inputs of these cycles."""
+    records, inputs = recording.records, recording.requests
     steps = np.diff(records["cycle"]) != 1
     length = int(np.argmax(steps)) + 1 if steps.any() else len(records)
     first, last = int(records["cycle"][0]), int(records["cycle"][length - 1])
-    known = [what for place, what in enumerate(given) if what.seq - given[0].seq == place]
-    if len(known) < len(given):  # something was given after the last one that is known, nobody knows when
+    known = [entry for index, entry in enumerate(inputs) if entry.seq - inputs[0].seq == index]
+    if len(known) < len(inputs):
+        # The missing input may belong to any cycle after that of the last known one.
         last = max(first, min(last, known[-1].cycle))
-    return records[: last - first + 1], [what for what in known if first <= what.cycle <= last]
+    return records[: last - first + 1], [entry for entry in known if first <= entry.cycle <= last]
 
 
-def _check(recording: Recording, records: NDArray[np.void], config: Config) -> None:
+def _check_recording(recording: Recording, records: NDArray[np.void], config: Config) -> None:
     begins, cycle = MODES[int(records["mode"][0])], int(records["cycle"][0])
     if begins is not Mode.DISABLED:
         raise ServiceError(
-            f"the recording begins at cycle {cycle} in mode {begins}, and what led there is not in it: a replay needs "
-            "one that begins disabled. Of a rotated one (-part2 and on) give all files; a black box, and what a "
-            "recorder wrote that was started again meanwhile, have none before: trirail report and export read it"
+            f"the recording begins at cycle {cycle} in mode {begins}; a replay needs one that begins disabled. Give "
+            "all files of a rotated recording (-part2 and on). Nothing precedes a black box, or the file of a recorder "
+            "that was restarted: read these with trirail report and trirail export"
         )
     rate = round(1.0 / float(np.median(np.diff(recording.t[:1000])))) if len(recording.t) > 1 else 0
     if rate and rate != config.loop.rate_hz:
-        raise ServiceError(f"loop.rate_hz = {config.loop.rate_hz}: the recording has {rate} cycles a second")
+        raise ServiceError(
+            f"loop.rate_hz: {config.loop.rate_hz} Hz, but the recording has {rate} cycles a second; set it to {rate}"
+        )
 
 
-def _plans_alike(recording: Recording, config: Config) -> bool:
-    """Whether what was planned in a recording can be used with a configuration: nothing that plans depend on differs.
+def _has_same_plans(recording: Recording, config: Config) -> bool:
+    """Return True if a configuration has the same values as the recorded one in all that plans depend on.
 
-    Where the recording has no configuration, the one that is given is taken for its own.
+    A recording without a configuration counts as one with the same.
     """
     recorded = provenance.configuration(recording.texts)
     return recorded is None or revision(recorded) == revision(config)
 
 
 class _RecordedPlanner:
-    """Plans what is asked again, and compares it with what was answered: its answers are those of the recording."""
+    """Planner whose answers come from the recording; it plans each request again to compare the result with them."""
 
     def __init__(self, config: Config) -> None:
-        self.given = 0
+        self.answers = 0
         self.differing = 0
         self._planner = MotionPlanner(config)
         self._planned: dict[int, PlanAnswer] = {}
@@ -202,16 +230,16 @@ class _RecordedPlanner:
         """See trirail.control.plan_requests.PlannerPort."""
         self._planned[request.number] = self._planner.plan(request)
 
-    def compare(self, given: Sequence[ControlInput]) -> None:
-        """Count the answers among what is given in a cycle, and those that would be others now."""
-        for what in given:
-            if isinstance(what.given, PlanAnswer):
-                self.given += 1
-                self.differing += self._planned.get(what.given.number) != what.given
+    def compare(self, entries: Sequence[ControlInput]) -> None:
+        """Count the answers among the inputs of a cycle, and those that differ from the replanned ones."""
+        for entry in entries:
+            if isinstance(entry.given, PlanAnswer):
+                self.answers += 1
+                self.differing += self._planned.get(entry.given.number) != entry.given
 
 
-class _Recorded:
-    """Drives that say what they said in the recording, and take anything: trirail_drivers.interface.DriveGroup."""
+class _RecordedDrives:
+    """DriveGroup with the recorded feedback, which ignores setpoints and commands."""
 
     bus_load = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
@@ -219,34 +247,37 @@ class _Recorded:
 
     def __init__(self, records: NDArray[np.void]) -> None:
         positions: list[Any] = records["position"].tolist()
-        flags: list[Any] = [map(tuple, records[name].astype(kind).tolist()) for name, kind in _FLAGS]
+        flags: list[Any] = [map(tuple, records[name].astype(kind).tolist()) for name, kind in _FLAG_FIELDS]
         homing = records["homing"].astype(bool).tolist()
         states: list[Any] = [tuple(map(PowerState, state)) for state in records["drive_state"].tolist()]
-        self._said = [
+        self._feedback = [
             Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now)
             for position, state, age, follows, homed, now in zip(positions, states, *flags, homing, strict=True)
         ]
         self._row = -1
         self._fault: DriveFault | None = None
+        self._unready: UnreadyDrives = (None, None, None)
 
-    def fail(self, message: str | None) -> None:
-        """Say from now on that something is wrong; with None, that nothing is."""
-        self._fault = DriveFault("", "recorded", 0, message) if message is not None else None
+    def set_fault(self, fault: DrivesFault) -> None:
+        """Report a fault, and the drives that are not ready, from now on."""
+        self._fault = DriveFault("", "recorded", 0, fault.message) if fault.message is not None else None
+        a, b, c = (Unready(f"drive {name} was not ready") if name in fault.unready else None for name in NAMES)
+        self._unready = a, b, c
 
     def sync(self) -> None:
-        """Go on by a cycle."""
+        """Advance by a cycle."""
         self._row += 1
 
     def read(self) -> Feedback:
-        """Return what was said in this one; before the first cycle, what is said in it."""
-        return self._said[max(0, self._row - 1)]._replace(fault=self._fault)
+        """Return the feedback of the present cycle; before the first cycle, that of the first."""
+        return self._feedback[max(0, self._row - 1)]._replace(fault=self._fault, unready=self._unready)
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
-        """Return that no drive has told of a fault: what was wrong is told by `read`."""
+        """None for each drive: `read` reports the faults."""
         return None, None, None
 
-    def configure(self, period: float, fastest: float | None = None) -> None:
+    def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """See trirail_drivers.interface.DriveGroup."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
@@ -274,28 +305,28 @@ class _Recorded:
         """See trirail_drivers.interface.DriveGroup."""
 
 
-class _Clock:
-    """The simulated drives' time, which a cycle moves on by one period; it runs by itself once that is over."""
+class _SimulatedClock:
+    """Clock of the simulated drives, which advances by one period per cycle, and by itself after the replay."""
 
     def __init__(self, period: float) -> None:
         self._now = 0.0
         self._period = period
-        self._over: float | None = None
+        self._released_at: float | None = None
 
     def __call__(self) -> float:
-        return self._now if self._over is None else self._now + time.monotonic() - self._over
+        return self._now if self._released_at is None else self._now + time.monotonic() - self._released_at
 
     def step(self) -> None:
-        """Go on by a period."""
+        """Advance by a period."""
         self._now += self._period
 
     def run(self) -> None:
-        """Run from now on: drives that are let go of have to come to stand."""
-        self._over = time.monotonic()
+        """Run by itself from now on: drives that close wait until they are at rest."""
+        self._released_at = time.monotonic()
 
 
-def _simulated(records: NDArray[np.void], config: Config, clock: _Clock) -> DriveGroup:
-    """Return simulated drives that stand where the recorded ones stood."""
+def _simulated_drives(records: NDArray[np.void], config: Config, clock: _SimulatedClock) -> DriveGroup:
+    """Return simulated drives that start at the recorded positions."""
     start: Any = tuple(records["position"][0].tolist())
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives

@@ -1,4 +1,4 @@
-"""What a recorded session comes to: its goals and how they ended, how well it was driven, and what went wrong."""
+"""Summary of a recorded session: goals and outcomes, tracking, timing, faults and warnings."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from trirail_drivers.interface import NAMES
 
 from trirail.naming import Labels
 from trirail.telemetry import provenance
-from trirail.telemetry.alignments import RecordedAlignment
-from trirail.telemetry.reading import Line, Recording
+from trirail.telemetry.journal import Line
+from trirail.telemetry.recording import RecordedAlignment, Recording
+from trirail.wire.goals import kind_name
 from trirail.wire.messages import Event
 from trirail.wire.packets import CommandRequest, GoalRequest
 from trirail.wire.state import Percentiles
 from trirail.wire.vocabulary import MODES, Mode
 
 ENABLED_MODES = tuple(MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING))
-"""Modes in which the sliders are to be where they are commanded."""
-UNKNOWN = "unknown"
-"""The outcome of a goal whose end is not in the recording."""
+"""Modes in which the drives follow the setpoints."""
+UNKNOWN_LABEL = "unknown"
+"""Outcome of a goal whose end is not recorded, and other texts that are not recorded."""
 
 
 class GoalSummary(msgspec.Struct, frozen=True):
-    """A goal, from when the control took it to its end; times are nominal, since the loop's start [s]."""
+    """A goal from its acceptance by the control to its end; times are nominal, since the loop's start [s]."""
 
     id: str
     user: str
@@ -36,32 +37,32 @@ class GoalSummary(msgspec.Struct, frozen=True):
     ended: float | None
     message: str
     settle: float | None = None
-    """From the end of its path until the robot was in position; None of one that did not settle."""
+    """Time from the end of the path until the robot was in position [s]; None for a goal that did not settle."""
 
 
 class AlignmentSummary(msgspec.Struct, frozen=True):
     """An alignment, a calibration of cameras, or a check."""
 
     id: str
-    """The ids of its goals begin with it."""
+    """Prefix of the ids of its goals."""
     user: str
     purpose: str
     end: str
-    """Why it ended; unknown where that was not told."""
+    """Reason of its end, "unknown" if that is not recorded."""
     message: str
-    """With an end by an error what that says."""
+    """Error message, for an end by an error."""
     began: float
     """Nominal time of its first look, since the loop's start [s]."""
     seconds: float
-    """From the first look to the end."""
+    """Time from the first look to the end."""
     looks: int
     corrections: int
     residuals: dict[str, list[float | None]]
-    """How far each mark was from its target at each look [m]; None where that is not known."""
+    """Distance of each mark from its target at each look [m]; None for a mark that was not found."""
 
 
 class Incident(msgspec.Struct, frozen=True):
-    """Something that went wrong."""
+    """A fault or a warning."""
 
     t: float
     """Nominal time since the loop's start [s]."""
@@ -71,7 +72,7 @@ class Incident(msgspec.Struct, frozen=True):
 
 
 class Tracking(msgspec.Struct, frozen=True):
-    """Following error of one slider while the drives were enabled [m]."""
+    """Following error of one slider with the drives enabled: greatest, root mean square, the latter in motion [m]."""
 
     slider: str
     max: float
@@ -80,39 +81,39 @@ class Tracking(msgspec.Struct, frozen=True):
 
 
 class Summary(msgspec.Struct, frozen=True):
-    """A session."""
+    """Summary of a session."""
 
     name: str
     began: str
     """Wall clock, ISO 8601, UTC."""
     duration: float
-    """From the first record to the last [s]."""
+    """Time from the first record to the last [s]."""
     cycles: int
     lacking: int
-    """Cycles between the first and the last whose records are not there."""
+    """Cycles between the first and the last without a record."""
     missed: int
-    """Ticks that the loop missed."""
+    """Ticks missed by the loop."""
     rate_hz: int
     software: str
     labels: Labels
-    """What people call the sliders A, B, C."""
+    """Configured labels of the sliders A, B, C."""
     modes: dict[str, float]
-    """Time in each mode that occurred [s]."""
+    """Time spent in each mode that occurred [s]."""
     distance: tuple[float, float, float]
-    """How far each slider moved [m]."""
+    """Distance travelled by each slider [m]."""
     tracking: list[Tracking]
     lateness_us: Percentiles
     cycle_us: Percentiles
     commands: dict[str, int]
-    """How often each command was given."""
+    """Number of times each command was given."""
     goals: list[GoalSummary]
     alignments: list[AlignmentSummary]
     faults: list[Incident]
     warnings: list[Incident]
 
 
-def summary(recording: Recording) -> Summary:
-    """Sum a session up."""
+def summarise(recording: Recording) -> Summary:
+    """Return the summary of a session."""
     records = recording.records
     period = _period(recording)
     cycles = records["cycle"]
@@ -126,7 +127,7 @@ def summary(recording: Recording) -> Summary:
         lacking=int(cycles[-1] - cycles[0]) + 1 - len(records),
         missed=int(records["overruns"][-1] - records["overruns"][0]),
         rate_hz=round(1.0 / period),
-        software=str(software) if software else UNKNOWN,
+        software=str(software) if software else UNKNOWN_LABEL,
         labels=provenance.labels(recording.texts),
         modes={str(MODES[mode]): float(count * period) for mode, count in zip(modes, counts, strict=True)},
         distance=tuple(np.abs(np.diff(records["position"], axis=0)).sum(axis=0).tolist()),
@@ -155,8 +156,8 @@ def _tracking(records: NDArray[np.void]) -> Iterator[Tracking]:
     error = np.abs(records["following_error"])
     moving = enabled & (records["commanded_velocity"] != 0.0).any(axis=1)
     for number, slider in enumerate(NAMES):
-        of_all, of_motion = error[enabled, number], error[moving, number]
-        yield Tracking(slider, float(of_all.max(initial=0.0)), _rms(of_all), _rms(of_motion))
+        enabled_error, moving_error = error[enabled, number], error[moving, number]
+        yield Tracking(slider, float(enabled_error.max(initial=0.0)), _rms(enabled_error), _rms(moving_error))
 
 
 def _rms(values: NDArray[np.float64]) -> float:
@@ -168,50 +169,50 @@ def _percentiles(nanoseconds: NDArray[np.int64]) -> Percentiles:
 
 
 def _commands(recording: Recording) -> dict[str, int]:
-    given = (what.given for what in recording.requests)
-    return dict(Counter(str(each.name) for each in given if isinstance(each, CommandRequest)))
+    requests = (entry.given for entry in recording.requests)
+    return dict(Counter(str(each.name) for each in requests if isinstance(each, CommandRequest)))
 
 
 def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
-    """Yield the goals in the order in which they were given; a jog's many velocities are one goal."""
+    """Yield the goals in the order of their requests; the many velocities of a jog are one goal."""
     ends: dict[str, Event] = {}
     for line in recording.events:
         if line.event is not None and line.event.kind == "goal" and line.event.id is not None:
             ends.setdefault(line.event.id, line.event)
     seen: set[str] = set()
-    for what in recording.requests:
-        request = what.given
+    for entry in recording.requests:
+        request = entry.given
         if not isinstance(request, GoalRequest) or request.id in seen:
             continue
         seen.add(request.id)
         end = ends.pop(request.id, None)
-        kind = type(request.goal).__name__.removesuffix("Goal").lower()
-        yield GoalSummary(request.id, request.user, kind, *_end(end, round(what.cycle * period, 6)))
+        yield GoalSummary(request.id, request.user, kind_name(request.goal), *_end(end, round(entry.cycle * period, 6)))
+    # Goals that were requested before the recording began.
     for name, end in ends.items():
-        yield GoalSummary(name, end.user or "", UNKNOWN, *_end(end, round(end.t, 6)))
+        yield GoalSummary(name, end.user or "", UNKNOWN_LABEL, *_end(end, round(end.t, 6)))
 
 
-def _end(event: Event | None, given: float) -> tuple[str, float, float | None, str, float | None]:
+def _end(event: Event | None, start: float) -> tuple[str, float, float | None, str, float | None]:
     if event is None:
-        return UNKNOWN, given, None, "its end is not in the recording", None
-    return event.outcome or UNKNOWN, given, round(event.t, 6), event.reason or event.message, event.settle
+        return UNKNOWN_LABEL, start, None, "its end is not in the recording", None
+    return event.outcome or UNKNOWN_LABEL, start, round(event.t, 6), event.reason or event.message, event.settle
 
 
-def _alignment(told: RecordedAlignment) -> AlignmentSummary:
-    last, seen = told.looks[-1], [bool(look.marks) for look in told.looks]
+def _alignment(recorded: RecordedAlignment) -> AlignmentSummary:
+    last, seen = recorded.looks[-1], [bool(look.marks) for look in recorded.looks]
     rows = {
         name: [None if np.isnan(way) else float(way) for way in row[seen]]
-        for name, row in zip(told.marks, told.residuals, strict=True)
+        for name, row in zip(recorded.marks, recorded.residuals, strict=True)
         if not np.isnan(row).all()
     }
-    corrections = sum(look.correction is not None for look in told.looks)
+    corrections = sum(look.correction is not None for look in recorded.looks)
     return AlignmentSummary(
-        told.id,
-        told.user,
-        told.purpose,
-        told.end,
+        recorded.id,
+        recorded.user,
+        recorded.purpose,
+        recorded.end,
         last.words,
-        round(told.t[0], 6),
+        round(recorded.t[0], 6),
         last.seconds,
         sum(seen),
         corrections,

@@ -10,12 +10,12 @@ import msgspec
 from cyclopts import App
 
 from trirail.cli import alignment_lines, notation, terminal
-from trirail.cli.mark_options import MarkSource
+from trirail.cli.mark_source import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 
 if TYPE_CHECKING:
-    from trirail.alignment.procedure import Sighting, Wish
+    from trirail.alignment.procedure import AlignmentRequest, Observation
     from trirail.client.calibration_file import CalibrationFile
 
 app = App(name="align", help="Lay a part right by marks in cameras, calibrated once.")
@@ -60,7 +60,7 @@ def calibrate(
     approach
         How far beyond each place to go first, X Y PHI [m, rad], so that backlash is always on the same side.
     """
-    from trirail.alignment.procedure import calibration_by_moves, mean_look, moves_for
+    from trirail.alignment.procedure import calibrate_by_moves, calibration_moves, observe_mean
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
 
@@ -68,12 +68,12 @@ def calibrate(
         raise TrirailError(
             "a radial lens wants --centre U V, the pixel on its axis: the middle of the picture for most"
         )
-    moves = moves_for(lens, by, notation.radians(angle, False))
+    moves = calibration_moves(lens, by, notation.radians(angle, False))
     with source.open_source() as (look, known), service.open() as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
-        wishes = calibration_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
+        wishes = calibrate_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
         found = drive(robot, look, _printed(wishes, service, len(moves) + 1), source.speed, source.wait)
-        targets = dict(drive(robot, look, mean_look(source.looks), source.speed, source.wait).marks)
+        targets = dict(drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks)
     old = calibration_file.keep_old(file)
     calibration_file.write(file, service.robot, found, targets)
     if service.json:
@@ -122,12 +122,12 @@ def run(
     approach
         As at the calibration: how far beyond each place to go first, X Y PHI.
     """
-    from trirail.alignment.procedure import Task, align
+    from trirail.alignment.procedure import AlignmentTask, align
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
 
     kept = _kept(file, service)
-    task = Task(
+    task = AlignmentTask(
         kept.calibration,
         kept.targets,
         tolerance,
@@ -172,19 +172,19 @@ def check(
     moves
         Make the calibration's moves again, with any part, and compare the cameras with how they were then.
     """
-    from trirail.alignment.changes import view_changes
-    from trirail.alignment.procedure import Task, calibration_again, look_only
+    from trirail.alignment.calibration_diff import compare_views
+    from trirail.alignment.procedure import AlignmentTask, measure_part, repeat_calibration
     from trirail.client.alignment import drive
 
     kept = _kept(file, service)
-    task = Task(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
+    task = AlignmentTask(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
     with source.open_source() as (look, _), service.open() as robot:
         if moves:
-            again = calibration_again(kept.calibration, source.looks)
+            again = repeat_calibration(kept.calibration, source.looks)
             now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), source.speed, source.wait)
-            changes = view_changes(kept.calibration, now)
+            changes = compare_views(kept.calibration, now)
         else:
-            found = drive(robot, look, look_only(task), source.speed, source.wait)
+            found = drive(robot, look, measure_part(task), source.speed, source.wait)
     if moves:
         if service.json:
             terminal.json({"views": [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]})
@@ -213,7 +213,7 @@ def _kept(file: Path, service: Service) -> CalibrationFile:
 
 
 def _printed(
-    wishes: Generator[Wish, Sighting, T], service: Service, looks: int | None = None
-) -> Generator[Wish, Sighting, T]:
+    wishes: Generator[AlignmentRequest, Observation, T], service: Service, looks: int | None = None
+) -> Generator[AlignmentRequest, Observation, T]:
     """Return what asks for the same, and tells a person of each look, where no program reads."""
     return wishes if service.json else alignment_lines.printed(wishes, looks)

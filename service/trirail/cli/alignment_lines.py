@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, TypeVar
 from trirail.cli import terminal
 
 if TYPE_CHECKING:
+    from trirail.alignment.alignment_request import LookReport
+    from trirail.alignment.calibration_diff import ViewChange
     from trirail.alignment.camera_calibration import CameraCalibration
-    from trirail.alignment.changes import ViewChange
-    from trirail.alignment.procedure import Alignment, Measurement, Sighting, Wish
-    from trirail.alignment.wishes import LookReport
+    from trirail.alignment.procedure import Alignment, AlignmentRequest, Measurement, Observation
     from trirail.analysis.summary import AlignmentSummary
 
 T = TypeVar("T")
@@ -60,24 +60,26 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
         )
 
 
-def printed(wishes: Generator[Wish, Sighting, T], looks: int | None) -> Generator[Wish, Sighting, T]:
+def printed(
+    wishes: Generator[AlignmentRequest, Observation, T], looks: int | None
+) -> Generator[AlignmentRequest, Observation, T]:
     """Wish for the same, and print each look as it comes; `looks` is how many there will be, where that is known."""
-    from trirail.alignment.wishes import LookReport
+    from trirail.alignment.alignment_request import LookReport
 
     number = 0
     try:
         wish = next(wishes)
         while True:
-            if isinstance(wish, LookReport) and wish.sighting is not None:
+            if isinstance(wish, LookReport) and wish.observation is not None:
                 number += 1
                 of = "" if looks is None else f" of {looks}"
-                terminal.say(f"look {number}{of}: {_what(wish, wish.sighting)}")
+                terminal.say(f"look {number}{of}: {_what(wish, wish.observation)}")
             wish = wishes.send((yield wish))
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
 
 
-def _what(report: LookReport, seen: Sighting) -> str:
+def _what(report: LookReport, seen: Observation) -> str:
     if report.measurement is None:
         return ", ".join(f"{name} ({u:.2f}, {v:.2f})" for name, (u, v) in seen.marks.items()) or "no marks"
     return measured(report.measurement) + ("; corrects it" if report.correction is not None else "")
@@ -98,6 +100,8 @@ def show_alignment(found: Alignment) -> None:
         "reached": "the part lies right",
         "corrections": "no correction is left: raise --corrections or --tolerance, or look at backlash and noise",
         "growing": "the error grew: the calibration is not of these cameras as they stand; calibrate anew",
+        "noise": "the pictures' noise is above the tolerance: raise --looks, --tolerance or --angle, or choose marks "
+        "farther apart",
     }
     made = terminal.counted(len(found.corrections), "correction")
     terminal.say(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")

@@ -32,8 +32,6 @@ from trirail.cli import (
     sessions_command,
     stop_commands,
     terminal,
-    typed,
-    workspace_command,
 )
 from trirail.cli.options import ALL_HERE, ConfigFile, Flag, Services
 from trirail.cli.tab_completion import Shell, script
@@ -216,7 +214,7 @@ app.command(config_commands.app)
 app.command(keys_command.app)
 app.command(math_commands.ik)
 app.command(math_commands.fk)
-app.command(workspace_command.workspace)
+app.command(math_commands.workspace)
 app.command(recording_commands.replay)
 app.command(recording_commands.report)
 app.command(recording_commands.export)
@@ -276,7 +274,10 @@ def main() -> None:
             if signal.getsignal(number) is signal.SIG_DFL:  # not where it is ignored, as under nohup
                 signal.signal(number, _terminated)
         code = app(
-            notation.numbers(typed.spread(words)), exit_on_error=False, print_error=False, result_action="return_value"
+            notation.numbers(notation.spread(words)),
+            exit_on_error=False,
+            print_error=False,
+            result_action="return_value",
         )
     except CycloptsError as error:
         terminal.complain(_wrong_usage(error, words))

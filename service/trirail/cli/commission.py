@@ -21,7 +21,7 @@ from trirail.cli.options import Flag
 from trirail.errors import ConfigError
 
 if TYPE_CHECKING:
-    from trirail.commissioning.judgement import Judged
+    from trirail.commissioning.judgement import Judgement
     from trirail.commissioning.person import Question
 
 VERDICTS = {"ok": "green", "wrong": "bold red", "failed": "red", "skipped": "yellow"}
@@ -64,7 +64,7 @@ def commission(
     from trirail.commissioning import report as reports
     from trirail.commissioning.guide import Guide
     from trirail.commissioning.opening import open_steps
-    from trirail.commissioning.person import Quit
+    from trirail.commissioning.person import QuitRequest
     from trirail.config import load
     from trirail.telemetry.provenance import software
 
@@ -74,19 +74,19 @@ def commission(
         option = "--yes" if yes else "--fault"
         raise ConfigError(f"{option} is for simulated drives: what real ones do a person has to look at")
     if out is not None and out.exists():
-        raise ConfigError(f"{out} exists already: name another file with --out")
+        raise ConfigError(f"{out} exists already; name another file with --out")
     name = f"commission-{settings.robot.name}-{time.strftime('%Y%m%d-%H%M%S')}.json"
     made = reports.CommissioningReport(settings.robot.name, str(config), reports.now(), simulated, str(software()))
-    keeper = reports.Keeper(made, report or Path(name))
+    keeper = reports.ReportFile(made, report or Path(name))
     person = Console(by_itself=yes, quiet=json)
     with interruption() as interrupted, open_steps(settings, fault, person, interrupted) as steps:
         guide = Guide(settings, config, steps, person, keeper)
         try:
-            with contextlib.suppress(Quit):
+            with contextlib.suppress(QuitRequest):
                 guide.run()
             guide.write(out)
         finally:
-            person.show(f"Report: {keeper.path} (for people: {keeper.text.name})")
+            person.show(f"Report: {keeper.path} (for people: {keeper.text_path.name})")
     if json:
         terminal.json(reports.content(made))
     return 0 if made.ok else 1
@@ -126,19 +126,19 @@ class Console:
         """Print a line."""
         self._shown.print(terminal.plain(line), soft_wrap=True)
 
-    def judged(self, judged: Judged) -> None:
+    def show_judgement(self, judgement: Judgement) -> None:
         """Print a verdict with its words, and under it what to do."""
-        first, *others = judged.words
-        verdict = f"[{VERDICTS[judged.verdict]}]{judged.verdict:8}[/]"
+        first, *others = judgement.words
+        verdict = f"[{VERDICTS[judgement.verdict]}]{judgement.verdict:8}[/]"
         self._shown.print(f"  {verdict} {terminal.plain(first)}", soft_wrap=True)
         for word in others:
             self._shown.print(f"  {'':8} {terminal.plain(word)}", soft_wrap=True)
-        if judged.remedy:
-            self._shown.print(f"  {'':8} -> {terminal.plain(judged.remedy)}", soft_wrap=True)
+        if judgement.remedy:
+            self._shown.print(f"  {'':8} -> {terminal.plain(judgement.remedy)}", soft_wrap=True)
 
     def ask(self, question: Question, idle: Callable[[], object]) -> str:
         """Print a question and take the next line; at the end of the input the person has left."""
-        from trirail.commissioning.person import Quit
+        from trirail.commissioning.person import QuitRequest
 
         if not self._echoes:
             # What was typed before the question, as Enter once too often, is no answer to it: it may ask for motion.
@@ -156,7 +156,7 @@ class Console:
             if answer or question.default is not None:
                 return answer or question.default or ""
             if not self._open and not self._typed:
-                raise Quit
+                raise QuitRequest
             self._shown.print("  an answer is wanted here, or q to leave: ", end="")
 
     def _next(self) -> str | None:
@@ -174,9 +174,9 @@ class Console:
 
     def _last(self) -> str:
         """Return what stands after the last line's end; where that was nothing, the person has left."""
-        from trirail.commissioning.person import Quit
+        from trirail.commissioning.person import QuitRequest
 
         line, self._typed = self._typed.decode(errors="replace").strip(), b""
         if not line:
-            raise Quit
+            raise QuitRequest
         return line

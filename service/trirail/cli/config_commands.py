@@ -99,7 +99,9 @@ def shipped_files() -> dict[str, str]:
 
 
 def _shipped() -> list[Path]:
-    files = [path for suffix in ("toml", "service", "yml", "json") for path in _folder().glob(f"*.{suffix}")]
+    files = [
+        path for suffix in ("toml", "service", "conf", "nft", "yml", "json") for path in _folder().glob(f"*.{suffix}")
+    ]
     return sorted(files) + sorted(_folder().glob("drives/*.toml"))
 
 

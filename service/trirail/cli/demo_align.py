@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from trirail_drivers.interface import Triple
 
-from trirail.alignment.camera_calibration import placed
+from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.finding import find
 from trirail.alignment.images import CameraView, Pair
 from trirail.alignment.procedure import Alignment
@@ -155,5 +155,5 @@ def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, part
 
 
 def _placed(error: Triple) -> dict[str, Pair]:
-    lying = {name: placed(place, error).tolist() for name, place in PLACES.items()}
+    lying = {name: to_base_frame(place, error).tolist() for name, place in PLACES.items()}
     return {name: (x, y) for name, (x, y) in lying.items()}

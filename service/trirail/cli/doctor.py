@@ -1,18 +1,107 @@
-"""Judges a machine for a configuration: each check is a function of what was read, see trirail.cli.probes."""
+"""Check a machine and its network for a configuration: each check is a function of what trirail.cli.probes has read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from trirail_drivers.bus.frames import bits_of
+from trirail_drivers.bus.load import HIGH_LOAD
+from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli import notation
-from trirail.cli.doctor_can import can_interface
 from trirail.cli.doctor_cycle import cycle
-from trirail.cli.doctor_network import metrics, network, routers
-from trirail.cli.machine import Machine
+from trirail.cli.key_folder import Issued
+from trirail.cli.machine import Gathered, Machine, Passed
 from trirail.config import Config, Findings, as_built, overlap
-from trirail.diagnosis import Check, diagnose, failed_checks
+from trirail.diagnosis import Check, Verdict, diagnose, failed_checks
+from trirail.wire.endpoints import ReachableBy, endpoint_of, reach, tcp_address
+from trirail.wire.vocabulary import Role
+
+
+def network(config: Config, machine: Machine) -> list[Check]:
+    """Return for each endpoint the users that can command the robot, and the findings on certificates and users."""
+    remedies = {
+        ReachableBy.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
+        ReachableBy.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
+    }
+    found = []
+    for endpoint in config.zenoh.listen:
+        by = reach(endpoint)
+        verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
+        found.append(Check("network", verdict, f"{endpoint}: {by} can command", remedies.get(by, "")))
+    if config.zenoh.tls is None:
+        return found
+    found.extend(_connection_limits(config, machine))
+    if isinstance(machine.guard, str):
+        return [*found, Check("certificates", "failure", machine.guard)]
+    if machine.guard is not None:
+        users = ", ".join(f"{user} {role}" for user, role in machine.guard.users.items())
+        found.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
+        warnings = machine.guard.certificate_warnings()
+        found += [Check("certificates", "warning", warning) for warning in warnings]
+        found += without_certificate(machine.guard.users, machine.issued)
+    return found
+
+
+def _connection_limits(config: Config, machine: Machine) -> list[Check]:
+    """Check that the firewall limits the connections of one address, as far as its rules can be read."""
+    ports = {address[1] for each in config.zenoh.listen if (address := tcp_address(each)) is not None}
+    if machine.limited_ports is None or not ports:
+        return []
+    if missing := ports - set(machine.limited_ports):
+        listed = ", ".join(map(str, sorted(missing)))
+        remedy = f"trirail config copy trirail.nft, set its ports to {listed}, nft -f trirail.nft"
+        return [Check("firewall", "warning", f"one address can keep others from connecting to port {listed}", remedy)]
+    return [Check("firewall", "ok", "limits the connections of one address")]
+
+
+def without_certificate(users: Mapping[str, Role], issued: Sequence[Issued] | None) -> list[Check]:
+    """Return the users with a role but no certificate, as far as the authority's folder is on this machine."""
+    if issued is None:
+        return []
+    known = {each.name: each for each in issued}
+    found = []
+    for user, role in users.items():
+        if user not in known:
+            found.append(
+                Check(
+                    "certificates",
+                    "warning",
+                    f"{user} has a role and no certificate",
+                    f"trirail keys add {user} --role {role}",
+                )
+            )
+        elif trouble := known[user].trouble():
+            found.append(Check("certificates", "warning", f"{user} cannot connect: {trouble}"))
+    return found
+
+
+def routers(found: Sequence[tuple[str, str]]) -> list[Check]:
+    """Check the routers through which users connect; without them the robot serves local users only."""
+    remedy = "start the router there, or correct zenoh.connect, zenoh.router and certificates"
+    return [
+        Check("router", "warning", f"{endpoint}: {why}", remedy)
+        if why
+        else Check("router", "ok", f"{endpoint} answers")
+        for endpoint, why in found
+    ]
+
+
+def metrics(config: Config) -> list[Check]:
+    """Check who can read the metrics, if they are on."""
+    telemetry = config.telemetry
+    if not telemetry.metrics_port:
+        return []
+    endpoint = endpoint_of(telemetry.metrics_address, telemetry.metrics_port)
+    by = reach(endpoint)
+    if by is ReachableBy.NETWORK and config.zenoh.tls is not None:
+        by = ReachableBy.CERTIFICATE
+    verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
+    remedy = "trirail keys init makes certificates for [zenoh.tls]" if by is ReachableBy.NETWORK else ""
+    return [Check("metrics", verdict, f"{endpoint}: {by} can read them", remedy)]
+
 
 RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
 """Clock sources that are read without leaving the processor, or its virtual machine."""
@@ -26,7 +115,7 @@ READS: Final = (
     "loop", "can", "zenoh", "watchdogs", "correction", "drives.protocol",
     "telemetry.metrics_port", "telemetry.metrics_address",
 )  # fmt: skip
-"""What of a configuration the machine is read and judged by."""
+"""Keys of a configuration on which the machine's checks depend."""
 
 
 def whole(path: Path, found: Findings, read: Callable[[Config], Machine]) -> list[Check]:
@@ -76,7 +165,7 @@ def kernel(machine: Machine, *, simulated: bool) -> Check:
 
 
 def rights(lacking: tuple[str, ...], realtime: str) -> Check:
-    """What loop.realtime asks for, and whether the loop would get it."""
+    """Check whether the loop gets the rights that loop.realtime requests."""
     if not lacking:
         return Check("rights", "ok", "SCHED_FIFO, locked memory, a processor of its own")
     if realtime == "off":
@@ -123,7 +212,95 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
 
 
 def corrected(config: Config) -> list[Check]:
-    """What as-built errors are corrected by: nobody should have to guess that it is on."""
+    """Report the correction of as-built errors, if one is on."""
     section = config.correction
     words = as_built.summary(section.map, section.as_built, section.backlash)
     return [] if words is None else [Check("correction", "ok", notation.correction(words, config.geometry.labels))]
+
+
+def can_interface(config: Config, machine: Machine) -> list[Check]:
+    """Check SocketCAN and the interface by the kernel's reports."""
+    section = config.can
+    if section.interface in {"simulated", "unix"}:
+        return [Check("CAN", "ok", f"{section.interface}: no hardware is used")]
+    if section.interface != "socketcan":
+        if machine.adapter:
+            return [Check("CAN", "failure", f"{section.interface} needs {machine.adapter}")]
+        found = f"{section.interface}, channel {section.channel or 'by default'}: its state cannot be read"
+        return [Check("CAN", "warning", found, "look at it with its maker's tools; SocketCAN tells its state")]
+    if not machine.af_can:
+        return [Check("CAN", "failure", "this kernel has no SocketCAN", "modprobe can_raw")]
+    return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine), *_traffic(config, machine.passed)]
+
+
+def _link(config: Config, machine: Machine) -> list[Check]:
+    name, bitrate, link = config.can.channel, config.can.bitrate, machine.link
+    virtual = name.startswith("vcan")
+    up = f"ip link set {name} up" + ("" if virtual else f" type can bitrate {bitrate}")
+    if link is None:
+        make = f"ip link add {name} type vcan && {up}" if virtual else "plug the adapter in, load its driver"
+        return [Check(name, "failure", "no such interface", make)]
+    if "UP" not in link.get("flags", ()):
+        return [Check(name, "failure", "down", up)]
+    info = link.get("linkinfo", {})
+    if info.get("info_kind") == "vcan":
+        return [Check(name, "ok", "up; virtual, without bitrate and error states")]
+    data = info.get("info_data", {})
+    queue = _queue(name, link.get("txqlen"), PROTOCOLS[config.drives.protocol].traffic.most_sent)
+    return [_bitrate(name, bitrate, data, up), _state(name, data, up), queue, *_coalescing(name, machine.gathered, up)]
+
+
+def _traffic(config: Config, passed: Passed | None) -> list[Check]:
+    """Report the present traffic of all nodes on the bus; the service itself counts only its own drives' frames."""
+    if passed is None:
+        return []
+    share = bits_of(passed.frames, passed.data) / passed.seconds / config.can.bitrate
+    name = f"{config.can.channel} traffic"
+    found = f"{share:.1%} of {config.can.bitrate} bit/s, {passed.frames} frames in {passed.seconds:.1f} s, by whomever"
+    if share <= HIGH_LOAD:
+        return [Check(name, "ok", found)]
+    return [Check(name, "warning", found, f"look who sends: candump {config.can.channel}")]
+
+
+def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:
+    found = data.get("bittiming", {}).get("bitrate")
+    if found == bitrate:
+        return Check(f"{name} bitrate", "ok", f"{bitrate} bit/s")
+    remedy = f"ip link set {name} down && {up}; the drives must have the same"
+    return Check(f"{name} bitrate", "failure", f"{found} bit/s; can.bitrate is {bitrate}", remedy)
+
+
+def _state(name: str, data: dict[str, Any], up: str) -> Check:
+    """The controller's state, ISO 11898-1: a node that sees too many errors leaves the bus."""
+    state = str(data.get("state", "unknown")).lower()
+    errors = data.get("berr_counter", {})
+    counted = f"; errors sent {errors['tx']}, received {errors['rx']}" if errors else ""
+    wiring = "look at termination (60 ohm across the bus without power), cable, and the bitrate of every node"
+    if state == "error-active":
+        return Check(f"{name} state", "ok", f"{state}{counted}")
+    if state == "bus-off":
+        return Check(f"{name} state", "failure", state, f"{wiring}; then ip link set {name} down && {up}")
+    verdict: Verdict = "warning" if state in {"error-warning", "error-passive"} else "failure"
+    return Check(f"{name} state", verdict, f"{state}{counted}", wiring)
+
+
+def _queue(name: str, length: int | None, most_sent: int) -> Check:
+    """The kernel's queue must take two cycles' frames, for a late one and the next on time come together."""
+    wanted = 2 * most_sent
+    if length is None or length >= wanted:
+        return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
+    found = f"{length} frames; two cycles may come together and take {wanted}"
+    return Check(f"{name} queue", "warning", found, f"ip link set {name} txqueuelen 100")
+
+
+def _coalescing(name: str, gathered: Gathered | None, up: str) -> list[Check]:
+    """A position that waits for frames after it is late, and the last of a cycle may wait for the next cycle."""
+    if gathered is None:
+        return []
+    waits = [f"{gathered.frames} frames"] if gathered.frames > 1 else []
+    waits += [f"{gathered.microseconds} µs"] if gathered.microseconds else []
+    if not waits:
+        return [Check(f"{name} coalescing", "ok", "each frame is handed over as it comes")]
+    # ethtool's way to say off: no time, and one frame (Linux, mcp251xfd_ring_alloc).
+    remedy = f"ip link set {name} down && ethtool -C {name} rx-usecs-irq 0 rx-frames-irq 1 && {up}"
+    return [Check(f"{name} coalescing", "warning", f"frames are handed over after {' or '.join(waits)}", remedy)]

@@ -6,11 +6,12 @@ from msgspec import Struct
 
 from trirail.config import Config
 from trirail.diagnosis import Check
-from trirail.diagnosis.bare_loop import Cycles, Spread, spread
+from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
+from trirail.wire.state import Percentiles
 
 SHARE = 0.5
 """Of a period, after which 999 of 1000 bare cycles are to be over: the rest is for the service's own arithmetic."""
-RATES = (100, 250, 500, 1000, 2000, 4000)
+RATES = (100, 250, 500, 1000, 2000)
 """Rates that are looked at beside the configured one [Hz]."""
 
 
@@ -19,11 +20,11 @@ class HeldRate(Struct, frozen=True):
 
     rate_hz: int
     cycles: int
-    lateness_us: Spread
+    lateness_us: Percentiles
     """How late they began, ticks missed before them included."""
-    cycle_us: Spread
+    cycle_us: Percentiles
     """From SYNC to the setpoints."""
-    over_us: Spread
+    over_us: Percentiles
     """From the deadline until they were over: the sum of both, cycle by cycle."""
     missed: int
     """Ticks."""
@@ -36,14 +37,14 @@ class HeldRate(Struct, frozen=True):
 
 def measured(cycles: Cycles) -> HeldRate:
     """What is to be said of cycles."""
-    over, rate = spread(cycles.lateness + cycles.work), 1_000_000_000 // cycles.period
+    over, rate = compute_percentiles(cycles.lateness + cycles.work), 1_000_000_000 // cycles.period
     missed = [int(each) for each in cycles.missed]
     held = [each for each in {*RATES, rate} if over.p999 <= SHARE * 1e6 / each]
     return HeldRate(
         rate_hz=rate,
         cycles=len(missed),
-        lateness_us=spread(cycles.lateness),
-        cycle_us=spread(cycles.work),
+        lateness_us=compute_percentiles(cycles.lateness),
+        cycle_us=compute_percentiles(cycles.work),
         over_us=over,
         missed=sum(missed),
         missed_in_a_row=_longest_streak(missed),

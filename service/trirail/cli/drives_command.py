@@ -1,21 +1,32 @@
-"""`trirail drives`: who is on the bus, and what its set-up would change."""
+"""`trirail drives`: drives on the bus, changes that their set-up would make, and their parameters in files."""
 
 from __future__ import annotations
 
 import time
-from typing import Annotated
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from cyclopts import App
+from cyclopts import App, Parameter
+from trirail_drivers.errors import DriveError, FileError
 
-from trirail.cli import drive_parameters, terminal
+from trirail.cli import terminal
 from trirail.cli.options import ConfigFile, Flag, Json
 
-app = App(name="drives", help="Show the drives; save, compare, restore their parameters.")
-for command in drive_parameters.COMMANDS:
-    app.command(command)
+if TYPE_CHECKING:
+    from trirail_drivers.cia402.backup import UnrestoredParameter
+    from trirail_drivers.cia402.parameter_file import ParameterDifference, SavedParameters
+    from trirail_drivers.cia402.parameters import Parameter as Held
+    from trirail_drivers.protocols import Protocol
 
+    from trirail.config import Config
+
+app = App(name="drives", help="Show the drives; save, compare, restore their parameters.")
 UNTRIED = "no make of drive was tried on hardware yet: go on with trirail commission, the hand on the emergency stop"
 """What the examples of makes say in their first line, too."""
+Axis = Literal["A", "B", "C"]
+_MOST_NAMED: Final = 8
+"""Greatest number of objects named in one line; --json and the file have all."""
 
 
 @app.default
@@ -33,7 +44,7 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
     from trirail_drivers.errors import DriveError
     from trirail_drivers.protocols import PROTOCOLS
 
-    from trirail.commissioning import drives_told
+    from trirail.commissioning import drive_report
     from trirail.config import SIM, load
     from trirail.diagnosis.check import is_simulated
 
@@ -51,10 +62,248 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
     else:
         for each in found:
             for line in (
-                *drives_told.identity(each, settings.geometry.labels),
-                *drives_told.differences(each, applied=apply),
+                *drive_report.format_identity(each, settings.geometry.labels),
+                *drive_report.format_differences(each, applied=apply),
             ):
                 terminal.say(line)
         if not is_simulated(settings.can):
             terminal.say(UNTRIED)
     return 0 if fit else 1
+
+
+def save(
+    folder: Path = Path(),
+    /,
+    *,
+    config: ConfigFile = None,
+    drive: Annotated[tuple[Axis, ...], Parameter(negative="", consume_multiple=False)] = ("A", "B", "C"),
+    json: Json = False,
+) -> int:
+    """Read every parameter of the drives into a file each, drive-A.dcf (CiA 306) and so on. Never over one that exists.
+
+    Left out is what no drive keeps: what is read-only, controlwords, targets, actual values, commands.
+
+    Parameters
+    ----------
+    folder
+        Where to write; the folder one is in, if absent.
+    drive
+        Which drive; may be repeated. All three if absent.
+    """
+    from trirail_drivers.cia402 import parameter_file
+
+    settings, protocol = _loaded(config)
+    paths: dict[str, Path] = {name: folder / f"drive-{name}.dcf" for name in sorted(set(drive))}
+    for path in paths.values():
+        if path.exists():
+            raise FileError(f"{path} exists already: name another folder")
+    if not folder.is_dir():
+        what = "a file, no folder; a configuration follows --config" if folder.is_file() else "no such folder"
+        raise FileError(f"{folder}: {what}")
+    ends = _read(settings, protocol, sorted(paths))
+    read = {name: end for name, end in ends.items() if not isinstance(end, DriveError)}
+    for name, saved in read.items():
+        parameter_file.write(paths[name], saved, settings.can.bitrate)
+    failed = {name: str(end) for name, end in ends.items() if isinstance(end, DriveError)}
+    if json:
+        files = {
+            name: {
+                "file": str(paths[name]),
+                "parameters": len(saved.parameters),
+                "unread": {_named(key): why for key, why in saved.unread.items()},
+            }
+            for name, saved in read.items()
+        }
+        terminal.json({"ok": not failed, "drives": files, "failed": failed})
+        return 1 if failed else 0
+    for name, saved in read.items():
+        terminal.say(f"drive {name}, node {saved.origin.node}: {len(saved.parameters)} parameters in {paths[name]}")
+        reasons: dict[str, list[str]] = {}
+        for key, why in saved.unread.items():
+            reasons.setdefault(why, []).append(_named(key))
+        for why, objects in reasons.items():
+            terminal.say(f"  {len(objects)} could not be read: {_some(objects)}: {why}")
+        if getattr(settings.drives, name).eds is None:
+            terminal.say(f"  named by the built-in servo.eds: its maker's own objects need drives.{name}.eds")
+    for words in failed.values():
+        terminal.complain(words)
+    return 1 if failed else 0
+
+
+def compare(
+    file: Path,
+    other: Path | None = None,
+    /,
+    *,
+    config: ConfigFile = None,
+    drive: Axis | None = None,
+    json: Json = False,
+) -> int:
+    """Show which parameters two files, or a file and the drive, do not have alike; exit 0 if none, 1 if any.
+
+    Parameters
+    ----------
+    file
+        DCF of trirail drives save or another program, or a TOML file of an earlier version.
+    other
+        Another one; the drive itself if absent.
+    drive
+        Which drive; the one with the file's node id if absent.
+    """
+    from trirail_drivers.cia402 import parameter_file
+
+    if other is not None:
+        one, two, heading = parameter_file.read(file), parameter_file.read(other), str(other)
+    else:
+        settings, protocol = _loaded(config)
+        name, one = _opened(file, drive, settings)
+        (end,) = _read(settings, protocol, [name]).values()
+        if isinstance(end, DriveError):
+            raise end
+        two, heading = end, f"drive {name}"
+    found = parameter_file.compare(one, two)
+    if json:
+        terminal.json(
+            {"ok": not found, "one": str(file), "other": heading, "differences": [_as_json(e) for e in found]}
+        )
+        return 1 if found else 0
+    for field in ("vendor", "product", "revision", "serial"):
+        mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
+        if mine != theirs:
+            terminal.say(f"{field}: {parameter_file.format_number(mine)} and {parameter_file.format_number(theirs)}")
+    if found:
+        _table(str(file), heading, [(each, "") for each in found])
+    terminal.say(f"{len(found)} of {len(parameter_file.comparable(one, two))} parameters differ")
+    return 1 if found else 0
+
+
+def restore(
+    file: Path,
+    /,
+    *,
+    config: ConfigFile = None,
+    drive: Axis | None = None,
+    replace: Annotated[bool, Flag] = False,
+    store: Annotated[bool, Flag] = False,
+    json: Json = False,
+) -> int:
+    """Write what differs from a file to the drive, read it back, and say what differs still: then exit 1.
+
+    Only without power and with no service or other master on the bus; what the set-up gives, node id and bitrate are
+    left as they are. A file of another product is refused.
+
+    Parameters
+    ----------
+    file
+        DCF of trirail drives save or another program, or a TOML file of an earlier version.
+    drive
+        Which drive; the one with the file's node id if absent.
+    replace
+        Also where the drive has another revision, serial number or node id, as one that takes a broken one's place,
+        and where the file does not say of which product it is.
+    store
+        Have the drive keep them without supply (object 1010h), once all of them are there.
+    """
+    from trirail_drivers.connection.opening import open_bus
+
+    settings, protocol = _loaded(config)
+    name, saved = _opened(file, drive, settings)
+    if protocol.restore is None:
+        raise _nothing(protocol)
+    with open_bus(settings.can, settings.drives) as bus:
+        done = protocol.restore(bus, settings.drives, time.monotonic, name, saved, replace=replace, store=store)
+    if json:
+        left = [_as_json(each.different) | {"why": each.why, "meant": each.intended} for each in done.left]
+        written = [_named(key) for key in done.written]
+        said = {"ok": done.ok, "drive": name, "written": written, "left": left, "stored": done.stored}
+        terminal.json(said | ({"not_stored": done.not_stored} if done.not_stored else {}))
+        return 0 if done.ok else 1
+    terminal.say(f"drive {name}: {len(done.written)} parameters written and read back")
+    _left(str(file), name, done.left)
+    if store:
+        terminal.say(f"  not stored: {done.not_stored}" if done.not_stored else "  stored in the drive")
+    return 0 if done.ok else 1
+
+
+for command in (save, compare, restore):
+    app.command(command)
+
+
+def _loaded(config: Path | None) -> tuple[Config, Protocol]:
+    from trirail_drivers.protocols import PROTOCOLS
+
+    from trirail.config import SIM, load
+
+    settings = load(config or SIM)
+    return settings, PROTOCOLS[settings.drives.protocol]
+
+
+def _opened(file: Path, drive: Axis | None, settings: Config) -> tuple[str, SavedParameters]:
+    """Return what a file has, and the drive that is meant: by name, or by the node id of the file."""
+    from trirail_drivers.cia402 import parameter_file
+
+    nodes: dict[str, int] = {name: getattr(settings.drives, name).node for name in ("A", "B", "C")}
+    saved = parameter_file.read(file, nodes[drive] if drive else None)
+    if drive:
+        return drive, saved
+    for name, node in nodes.items():
+        if node == saved.origin.node:
+            return name, saved
+    file_node = "no node id" if saved.origin.node is None else f"node id {saved.origin.node}"
+    raise DriveError(
+        f"{file} has {file_node}, the drives have {', '.join(map(str, nodes.values()))}; say which by --drive"
+    )
+
+
+def _read(settings: Config, protocol: Protocol, names: Sequence[str]) -> dict[str, SavedParameters | DriveError]:
+    """Return what drives hold, or why one could not be read."""
+    from trirail_drivers.connection.opening import open_bus
+
+    if protocol.save is None:
+        raise _nothing(protocol)
+    with open_bus(settings.can, settings.drives) as bus:
+        return protocol.save(bus, settings.drives, time.monotonic, names)
+
+
+def _nothing(protocol: Protocol) -> DriveError:
+    return DriveError(
+        f"drives of protocol {protocol.name} have no object dictionary to be saved: use their maker's tool"
+    )
+
+
+def _left(file: str, name: str, left: Iterable[UnrestoredParameter]) -> None:
+    intended = [_named(each.different.key) for each in left if each.intended]
+    if intended:
+        kinds = "the set-up's, node id, bitrate or no parameter"
+        terminal.say(f"  {len(intended)} left as they are, {kinds}: {_some(intended)}")
+    if others := [(each.different, each.why) for each in left if not each.intended]:
+        terminal.say(f"  {len(others)} differ still:")
+        _table(file, f"drive {name}", others)
+
+
+def _table(one: str, other: str, rows: Iterable[tuple[ParameterDifference, str]]) -> None:
+    table = terminal.table("object", "", one, other, "")
+    for each, why in rows:
+        values = (_value(each.one), _value(each.other))
+        table.add_row(_named(each.key), *map(terminal.plain, (each.name, *values, why)))
+    terminal.out.print(table)
+
+
+def _as_json(each: ParameterDifference) -> dict[str, Any]:
+    one, other = (None if held is None else held.value for held in (each.one, each.other))
+    return {"object": _named(each.key), "name": each.name, "one": one, "other": other}
+
+
+def _value(held: Held | None) -> str:
+    return "–" if held is None else str(held.value)
+
+
+def _some(objects: Sequence[str]) -> str:
+    more = len(objects) - _MOST_NAMED
+    return ", ".join(objects[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _named(key: tuple[int, int]) -> str:
+    from trirail_drivers.cia402.parameters import named
+
+    return named(key)

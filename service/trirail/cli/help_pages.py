@@ -19,8 +19,8 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail drives robot.toml",
             "trirail drives robot.toml --apply",
             "trirail drives save backup --config robot.toml",
-            "trirail drives compare backup/drive-A.toml --config robot.toml",
-            "trirail drives restore backup/drive-A.toml --config robot.toml",
+            "trirail drives compare backup/drive-A.dcf --config robot.toml",
+            "trirail drives restore backup/drive-A.dcf --config robot.toml",
         ),
         "commission": ("trirail commission robot.toml", "trirail commission robot.toml --yes --fault 'A reversed'"),
         "run": ("trirail run", "trirail run robot.toml", "trirail run robot.toml --record session.rrd"),
@@ -29,7 +29,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail keys add ann --role operator",
             "trirail keys list",
         ),
-        "router": ("trirail router router.toml", "trirail router router.toml --print-config"),
+        "router": ("trirail router router.toml",),
         "completion": ("trirail completion bash --install", "trirail completion zsh"),
     },
     "Power and stops": {
@@ -56,7 +56,6 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "sliders": ("trirail sliders 20mm 0 -10mm --wait",),
         "jog": (
             "trirail jog",
-            "trirail jog --gamepad",
             "trirail jog 10mm/s 0 0",
             "trirail jog 0 0 -2deg/s --seconds 3",
         ),
@@ -64,7 +63,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "teach": ("trirail teach pick",),
         "forget": ("trirail forget pick",),
         "poses": ("trirail poses", "trirail poses --json"),
-        "panel": ("trirail panel", "trirail panel --open", "trirail panel --port 9000"),
+        "panel": ("trirail panel", "trirail panel --open", "trirail panel --port 9000 --token panel.token"),
         "align": (
             "trirail align calibrate camera.json --program ./marks",
             "trirail align run camera.json --camera left=0 --camera right=1 --shape disc --size 80",
@@ -107,7 +106,6 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "replay": (
             "trirail replay session.rrd",
             "trirail replay session.rrd --config other.toml",
-            "trirail replay session.rrd --to tcp/127.0.0.1:7447",
         ),
     },
     "Mathematics": {
@@ -126,15 +124,24 @@ MORE: Final = "`trirail help all` shows the seldom needed commands too, `trirail
 
 
 def arrange(app: App) -> None:
-    """Put the commands of the command line into their groups, each with its examples."""
+    """Put the commands of the command line into their groups, each with its examples; new ones into a last one."""
     for name, commands in GROUPS.items():
         group = Group.create_ordered(name)
         for position, (command, examples) in enumerate(commands.items()):
             page = app[command]
             page.group, page.sort_key, page.show = (group,), position, command not in SELDOM
             page.help_epilogue = "```\n" + "\n".join(examples) + "\n```"
+    _arrange_others(app)
     app["help"].show = False
     app.help_epilogue = MORE
+
+
+def _arrange_others(app: App) -> None:
+    """Put the commands that no group names into a last one: a new command shows in the help without an entry here."""
+    listed = {"help", *(command for commands in GROUPS.values() for command in commands)}
+    others = [name for name in app if name not in listed and not name.startswith("-")]
+    for position, command in enumerate(others):
+        app[command].group, app[command].sort_key = (Group.create_ordered("Other commands"),), position
 
 
 @contextmanager

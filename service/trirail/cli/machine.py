@@ -63,3 +63,5 @@ class Machine(Struct, frozen=True):
     """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
     issued: tuple[Issued, ...] | None = None
     """The certificates of the authority whose folder is that of [zenoh.tls]; None where it is elsewhere."""
+    limited_ports: tuple[int, ...] | None = None
+    """Ports at which the firewall limits the connections of one address; None where it cannot be read."""

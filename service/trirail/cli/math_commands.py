@@ -1,8 +1,9 @@
-"""Commands that need no service: the inverse and forward kinematics of a configuration's robot."""
+"""Commands that need no service: kinematics and workspace of a configuration's robot."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from trirail.cli import notation, terminal
@@ -15,6 +16,14 @@ if TYPE_CHECKING:
     from trirail.kinematics.arrays import Array
     from trirail.kinematics.geometry import Geometry
     from trirail.motion.limits import Violation
+    from trirail.workspace.workspace import Extent
+
+STEPS = (1, 2, 5, 10, 15, 20, 30, 45)
+"""From one slice to the next, if no angles are asked for [°]."""
+CM2 = 1e4
+"""Areas are shown in cm²: a stage has some, a large robot a thousand."""
+SLICES = 8
+"""So many of them at most."""
 
 
 def ik(
@@ -64,7 +73,7 @@ def ik(
     sensitivities = sensitivity(robot, pose)
     isotropy, distance = float(conditioning(robot, pose)), float(distance_to_singularity(robot, pose))
     bounds = Bounds(config.limits, config.period, labels=robot.labels)
-    refused = bounds.pose(pose.tolist()), bounds.setpoint(list(solved.values()))
+    refused = bounds.pose_violation(pose.tolist()), bounds.setpoint_violation(list(solved.values()))
     warnings = [str(violation) for violation in refused if violation]
     if offline.json:
         derived = {"conditioning": isotropy, "distance_to_singularity": distance, "warnings": warnings}
@@ -99,7 +108,7 @@ def fk(a: notation.Length, b: notation.Length, c: notation.Length, /, *, offline
 
     config, robot = robot_of(offline)
     sliders = a, b, c
-    beyond = Bounds(config.limits, config.period, labels=robot.labels).setpoint([sliders])
+    beyond = Bounds(config.limits, config.period, labels=robot.labels).setpoint_violation([sliders])
     if beyond:
         raise _out_of_reach([beyond])
     pose = forward(robot, sliders)
@@ -131,7 +140,7 @@ def _check_reach(config: Config, robot: Geometry, pose: Array) -> None:
 def _out_of_reach(found: list[Violation]) -> KinematicsError:
     first = found[0]
     message = f"out of reach: {'; '.join(map(str, found))}"
-    return KinematicsError(message, leg=first.what if first.unit == "m" else "", value=first.value, limit=first.limit)
+    return KinematicsError(message, leg=first.axis if first.unit == "m" else "", value=first.value, limit=first.limit)
 
 
 def _print_pose(pose: Array) -> None:
@@ -154,3 +163,115 @@ def _print_joints(robot: Geometry, solved: dict[str, list[float]], sensitivities
     for axis, unit, values in zip("xyφ", ("mm/mm", "mm/mm", "mm/°"), columns.tolist(), strict=True):
         table.add_row(f"slider per {axis}", *(notation.number(value, 3) for value in values), unit)
     terminal.out.print(table)
+
+
+def workspace(
+    *,
+    plot: Path | None = None,
+    phi: notation.Angles = (),
+    deg: Annotated[bool, Flag] = False,
+    offline: Offline = DEFAULT,
+) -> int:
+    """Measure the workspace: what the service permits, and what the robot itself reaches.
+
+    The robot's own reach ends where sliders or platform edges do, and at the singularity margin. The service
+    permits what of it lies in the window of limits.platform.
+
+    Parameters
+    ----------
+    plot
+        Picture to draw: slices over phi with the conditioning as colour. Its suffix is its format: .png, .svg, .pdf.
+    phi
+        Angles of the slices [rad]; round numbers of degrees if absent.
+    deg
+        Angles without a unit are in degrees.
+    """
+    from trirail.workspace.workspace import measure_extent, permitted_slice, polygon_area, reachable_slice
+
+    config, robot = robot_of(offline)
+    limits = config.limits
+    service, reach = measure_extent(robot, limits, permitted_slice), measure_extent(robot, limits, reachable_slice)
+    angles = [notation.radians(angle, deg) for angle in phi] or _round_angles(*service.phi)
+    slices = [(angle, permitted_slice(robot, limits, angle), reachable_slice(robot, limits, angle)) for angle in angles]
+    at_zero = polygon_area(permitted_slice(robot, limits, 0.0)), polygon_area(reachable_slice(robot, limits, 0.0))
+    if plot:
+        _draw(plot, config, robot, angles, reach, service)
+    if offline.json:
+        terminal.json(
+            {
+                "robot": config.robot.name,
+                "permitted": _measures(service, at_zero[0]),
+                "reachable": _measures(reach, at_zero[1]),
+                "slices": [
+                    {
+                        "phi": angle,
+                        "permitted": {"area": polygon_area(inside), "polygon": inside.tolist()},
+                        "reachable": {"area": polygon_area(whole), "polygon": whole.tolist()},
+                    }
+                    for angle, inside, whole in slices
+                ],
+            }
+        )
+        return 0
+    _print_extents(service, reach, at_zero)
+    terminal.say("")
+    _print_slices([(angle, polygon_area(inside), polygon_area(whole)) for angle, inside, whole in slices])
+    if plot:
+        terminal.say("")
+        terminal.say(f"drawn to {plot}")
+    return 0
+
+
+def _round_angles(low: float, high: float) -> list[float]:
+    """Return the multiples [rad] of a round number of degrees in a range, few enough to look at together."""
+    for step in STEPS:
+        first, last = math.ceil(math.degrees(low) / step), math.floor(math.degrees(high) / step)
+        if last - first < SLICES:
+            break
+    return [math.radians(step * k) for k in range(first, last + 1)]
+
+
+def _draw(file: Path, config: Config, robot: Geometry, angles: list[float], reach: Extent, service: Extent) -> None:
+    with terminal.drawing(file):
+        from trirail.workspace import plots
+
+        plots.draw_workspace(
+            file, f"Workspace of robot {config.robot.name}", robot, config.limits, angles, reach, service
+        )
+
+
+def _measures(extent: Extent, area_at_zero: float) -> dict[str, object]:
+    return {
+        "x": extent.x,
+        "y": extent.y,
+        "phi": extent.phi,
+        "area_at_zero": area_at_zero,
+        "best": {"phi": extent.best_phi, "area": extent.best_area},
+        "volume": extent.volume,
+    }
+
+
+def _print_extents(service: Extent, reach: Extent, at_zero: tuple[float, float]) -> None:
+    table = terminal.table("", "the service permits", "the robot reaches", "")
+    both = service, reach
+    table.add_row("x", *(_range(each.x, 1e3) for each in both), "mm")
+    table.add_row("y", *(_range(each.y, 1e3) for each in both), "mm")
+    table.add_row("φ", *(_range(each.phi, math.degrees(1.0)) for each in both), "°")
+    table.add_row("area at φ = 0", *(notation.number(each * CM2, 3) for each in at_zero), "cm²")
+    table.add_row("greatest area", *(notation.number(each.best_area * CM2, 3) for each in both), "cm²")
+    table.add_row("  at φ =", *(notation.number(math.degrees(each.best_phi), 2) for each in both), "°")
+    table.add_row("volume", *(notation.number(each.volume * CM2, 3) for each in both), "cm² rad")
+    terminal.out.print(table)
+
+
+def _print_slices(slices: list[tuple[float, float, float]]) -> None:
+    table = terminal.table("slice at φ [°]", "permitted [cm²]", "reached [cm²]")
+    for angle, inside, whole in slices:
+        table.add_row(
+            notation.number(math.degrees(angle), 2), *(notation.number(each * CM2, 3) for each in (inside, whole))
+        )
+    terminal.out.print(table)
+
+
+def _range(ends: tuple[float, float], scale: float) -> str:
+    return " to ".join(notation.number(end * scale, 2) for end in ends)

@@ -11,6 +11,8 @@ from cyclopts import Parameter
 from trirail.cli import notation
 from trirail.wire.decoding import converted
 from trirail.wire.endpoints import DEFAULT_LOCATOR
+from trirail.wire.goal_kind import GoalKind, field_description
+from trirail.wire.goals import PoseGoal
 
 if TYPE_CHECKING:
     from cyclopts.completion._engine import CompletionContext
@@ -22,7 +24,15 @@ Flag = Parameter(negative="", show_default=False)
 Json = Annotated[bool, Flag, Parameter(help="Print one JSON object instead of words.")]
 ConfigFile = Annotated[Path | None, Parameter(help="Configuration file; the simulated robot if absent.")]
 Wait = Annotated[bool, Flag, Parameter(help="Show the progress; exit 0 only when the robot has arrived.")]
-Speed = Annotated[notation.Share, Parameter(help="Share of the limits, 0.001 to 1, or 5%.")]
+
+
+def described(kind: type[GoalKind], field: str, as_typed: str = "") -> Parameter:
+    """Return the help of an option: what its field of a kind of goal is for, and how it is typed."""
+    words = field_description(kind, field)
+    return Parameter(help=f"{words[0].upper()}{words[1:]}{as_typed}.")
+
+
+Speed = Annotated[notation.Share, described(PoseGoal, "speed", "; or as 5%")]
 
 
 def robots(context: CompletionContext) -> list[str]:

@@ -2,43 +2,65 @@
 
 from __future__ import annotations
 
+import os
+import re
+import secrets
 import signal
+import stat
+import time
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
+from trirail.cli import terminal
 from trirail.cli.options import HERE, Service
 from trirail.cli.robot_commands import show
+from trirail.errors import ConfigError, ServiceError
+
+RETRY_S = 1.0
+"""Time between two attempts to reach a service that is not up yet."""
+TOKEN_BYTES = 16
+TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
+"""Characters of a token: those of a URL, and enough of them not to be guessed."""
 
 
 def panel(
     *,
     port: int | None = None,
+    token: Path | None = None,
     open_: Annotated[bool, Parameter(name="--open", negative="", show_default=False)] = False,
     service: Service = HERE,
 ) -> int:
     """Serve the operator's page to browsers on this machine.
 
-    With it the robot is seen live, jogged, stopped and commanded. Ends by Ctrl-C.
+    The page shows the robot live, jogs, stops and commands it. The command waits for a service that is not up yet, and
+    ends by Ctrl-C.
 
-    Who has the address that is printed can move the robot; it is another one each time.
+    The address that is printed lets anybody move the robot. It is another one each time, unless --port and --token
+    fix it.
 
     Parameters
     ----------
     port
         Port of the loopback, 0 for any that is free; 9880 if absent, or any where that is taken.
+    token
+        File with the secret part of the address; it is made, for you alone, where there is none.
     open_
         Open it in the browser.
     """
+    from trirail.client.async_client import AsyncRobot
     from trirail.panel.server import Panel
     from trirail.processes.operating_system import Signals
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with service.open() as robot, Panel(robot, port) as served:
+    secret = read_token(token) if token is not None else None
+    wait_for_robot(service)
+    with Panel(AsyncRobot(service.robot, service.connect, tls=service.tls), port, secret) as served:
         show(
             service,
             {"url": served.url},
-            f"the panel of {robot.name}, on this machine alone, until Ctrl-C: {served.url}",
+            f"the panel of {service.robot}, on this machine alone, until Ctrl-C: {served.url}",
         )
         if open_:
             import webbrowser
@@ -47,3 +69,43 @@ def panel(
         with Signals() as ends:
             ends.first()
     return 0
+
+
+def wait_for_robot(service: Service) -> None:
+    """Wait for a service that is not up yet."""
+    is_announced = False
+    while True:
+        try:
+            with service.open() as robot:
+                robot.info()
+                return
+        except ServiceError as error:
+            if not is_announced:
+                terminal.complain(f"{error}; waiting for it, Ctrl-C ends")
+                is_announced = True
+            time.sleep(RETRY_S)
+
+
+def read_token(file: Path) -> str:
+    """Return the token of a file, and make the file, readable for its owner alone, where there is none.
+
+    Raises ConfigError where others may read it, or where it holds no token.
+    """
+    try:
+        with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as made:
+            made.write(f"{secrets.token_urlsafe(TOKEN_BYTES)}\n")
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror}") from error
+    try:
+        mode, text = stat.S_IMODE(file.stat().st_mode), file.read_text(encoding="ascii", errors="replace").strip()
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror}") from error
+    if mode & 0o077:
+        raise ConfigError(f"{file}: others may read this token (mode {mode:03o}): chmod 600 {file}")
+    if not TOKEN.fullmatch(text):
+        raise ConfigError(
+            f"{file}: no token: 16 to 128 letters, digits, - and _ are expected; delete the file to have one made"
+        )
+    return text

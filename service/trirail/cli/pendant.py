@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import select
 import signal
 import sys
@@ -19,9 +20,7 @@ from typing import Self
 from rich.live import Live
 from rich.text import Text
 
-from trirail.cli import gamepad, terminal
-from trirail.cli.gamepad import Gamepad, Pad
-from trirail.cli.keyboard import keys
+from trirail.cli import terminal
 from trirail.client.client import Robot
 from trirail.client.goal import Velocity
 from trirail.client.held_jog import SPEEDS, USUAL, HeldJog
@@ -31,6 +30,26 @@ from trirail.wire.decoding import converted
 from trirail.wire.goals import Tool
 from trirail.wire.state import State
 from trirail.wire.text import printable
+
+_ARROWS = {"A": "up", "B": "down", "C": "right", "D": "left"}
+# An arrow comes as ESC [ A, or ESC O A where the terminal is in application mode, with modifiers as ESC [ 1 ; 2 A.
+_KEY = re.compile(r"\x1b[\[O](?P<parameters>[0-9;]*)(?P<final>[@-~])|(?P<escape>\x1b)|(?P<character>.)", re.DOTALL)
+
+
+def keys(typed: bytes) -> Iterator[str]:
+    """Yield the keys in what was read: up, down, left, right, escape, or a character in lower case, with = for +.
+
+    Other keys' sequences are skipped as a whole: none of their characters is taken for a key.
+    """
+    for found in _KEY.finditer(typed.decode("utf-8", errors="ignore")):
+        if found["final"]:
+            if arrow := _ARROWS.get(found["final"]):
+                yield arrow
+        elif found["escape"]:
+            yield "escape"
+        else:
+            yield {"=": "+", "_": "-"}.get(found["character"], found["character"].lower())
+
 
 REPEAT = 0.15
 """A key that has not come again for so long is let go [s]: a terminal tells of no key's end, and repeats one that is
@@ -138,22 +157,20 @@ class _Newest:
             self.state = None
 
 
-def run(robot: Robot, pad: Pad | None = None, tool: Tool | None = None) -> int:
-    """Serve the operator, at his terminal and a gamepad, until he leaves or his terminal is gone; return the exit code.
+def run(robot: Robot, tool: Tool | None = None) -> int:
+    """Serve the operator at the terminal until they leave or the terminal is gone; return the exit code.
 
     What moves is a tool, the platform's centre where there is none. Raises ServiceError where standard input is no
-    terminal, nobody answers, or the gamepad is gone.
+    terminal, or nobody answers.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
     top = converted(robot.info().limits, Limits).platform.velocity
     pendant = Pendant(robot, top, tool)
-    if pad is not None:
-        pendant.said = f"{pad.name}: {gamepad.HELP}"
     with _Newest(robot) as newest:
         try:
             with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
-                _serve(pendant, newest, live, pad)
+                _serve(pendant, newest, live)
         except (KeyboardInterrupt, _HungUp, OSError):
             pass  # an OSError is that of a terminal that is gone
         finally:
@@ -161,45 +178,26 @@ def run(robot: Robot, pad: Pad | None = None, tool: Tool | None = None) -> int:
     return 0
 
 
-def _serve(pendant: Pendant, newest: _Newest, live: Live, pad: Pad | None) -> None:
+def _serve(pendant: Pendant, newest: _Newest, live: Live) -> None:
     descriptor = sys.stdin.fileno()
     drawn, last = -math.inf, time.monotonic()
     while not pendant.over:
-        ready, _, _ = select.select([descriptor, *([pad] if pad else [])], [], [], REPEAT / 5.0)
+        ready, _, _ = select.select([descriptor], [], [], REPEAT / 5.0)
         now = time.monotonic()
-        if pad is not None:
-            pad.poll(now)
         if now - last > STALLED:  # stopped and continued: what waits in the terminal is from before
             pendant.let_go()
             termios.tcflush(descriptor, termios.TCIFLUSH)
-            if pad is not None:
-                pad.gamepad.let_go()
         elif descriptor in ready:
             typed = os.read(descriptor, 1024)
             if not typed:
                 return  # the terminal is gone
             for key in keys(typed):
                 pendant.press(key, now)
-        if pad is not None:
-            follow(pendant, pad.gamepad, now)
         pendant.tick(now)
         last = now
         if now - drawn > DRAWN:
             live.update(_shown(pendant, newest.state), refresh=True)
             drawn = now
-
-
-def follow(pendant: Pendant, gamepad: Gamepad, now: float) -> None:
-    """Have the pendant do what a gamepad says."""
-    while gamepad.keys:
-        pendant.press(gamepad.keys.pop(0), now)
-    direction = gamepad.direction(now)
-    if direction is not None:
-        pendant.hold(direction, now)
-        gamepad.moving = True
-    elif gamepad.moving:
-        pendant.let_go()
-        gamepad.moving = False
 
 
 def _shown(pendant: Pendant, state: State | None) -> Text:

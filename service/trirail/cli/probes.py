@@ -35,9 +35,11 @@ PROCESSES = Path("/proc")
 _SIOCETHTOOL, _GCOALESCE, _COALESCE = 0x8946, 0x0E, 23
 """A request of linux/sockios.h, a command of linux/ethtool.h, and the 32-bit words of its struct ethtool_coalesce."""
 MEASURED = 10.0
-"""How long cycles are measured [s]."""
+"""Duration of the measurement of cycles [s]."""
+COMMAND_WITHIN = 5.0
+"""Timeout of a command that reads the machine [s]."""
 COUNTED = 1.0
-"""How long frames are counted where cycles are not measured [s]."""
+"""Duration of counting frames where cycles are not measured [s]."""
 
 
 def machine(config: Config, *, quick: bool = False, progress: Callable[[float], None] | None = None) -> Machine:
@@ -75,9 +77,10 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         cycles=cycles,
         passed=passed(before, counted(channel)),
         gathered=gathered(channel) if channel else None,
-        adapter=adapters.lacking(config.can.interface),
+        adapter=adapters.missing_support(config.can.interface),
         guard=door,
         issued=issued(config),
+        limited_ports=limited_ports() if config.zenoh.tls is not None else None,
         routers=()
         if isinstance(door, str)
         else tuple((each, door.why_not_linked(each)) for each in config.zenoh.connect),
@@ -90,6 +93,23 @@ def guard(config: Config) -> Guard | str:
         return Guard(config)
     except ServiceError as error:
         return str(error)
+
+
+def limited_ports() -> tuple[int, ...] | None:
+    """Read at which ports the rules of configs/trirail.nft limit connections; None without nft or the right to ask."""
+    try:
+        listed = subprocess.run(
+            ("nft", "--json", "list", "tables"), capture_output=True, check=True, timeout=COMMAND_WITHIN
+        )
+        tables = [each["table"] for each in json.loads(listed.stdout)["nftables"] if "table" in each]
+        if not any(table["family"] == "inet" and table["name"] == "trirail" for table in tables):
+            return ()
+        command = ("nft", "--json", "list", "set", "inet", "trirail", "ports")
+        listed = subprocess.run(command, capture_output=True, check=True, timeout=COMMAND_WITHIN)
+        (ports,) = [each["set"] for each in json.loads(listed.stdout)["nftables"] if "set" in each]
+        return tuple(ports.get("elem", ()))
+    except (OSError, ValueError, KeyError, subprocess.SubprocessError):
+        return None
 
 
 def issued(config: Config) -> tuple[Issued, ...] | None:
@@ -113,7 +133,7 @@ def processors(text: str) -> tuple[int, ...]:
 
 
 def link(name: str) -> dict[str, Any] | None:
-    """What the kernel says of a network interface, None if it has no such. Raises ServiceError without `ip`."""
+    """Return the kernel's report of a network interface; None if there is none. Raises ServiceError without `ip`."""
     if not (SYSTEM / "class/net" / name).exists():
         return None
     command = ("ip", "-details", "-json", "link", "show", "dev", name)
@@ -130,7 +150,7 @@ def link(name: str) -> dict[str, Any] | None:
 
 
 def gathered(name: str) -> Gathered | None:
-    """How a network interface hands over what it receives; None where its driver does not say (linux/ethtool.h)."""
+    """Return the receive coalescing of a network interface; None where its driver does not tell (linux/ethtool.h)."""
     said = (ctypes.c_uint32 * _COALESCE)(_GCOALESCE)
     request = struct.pack("16sP", name.encode(), ctypes.addressof(said))
     try:
@@ -143,7 +163,7 @@ def gathered(name: str) -> Gathered | None:
 
 
 def counted(name: str) -> Passed | None:
-    """What a network interface has sent and received since it is there; None where the kernel does not say."""
+    """Return the counters of a network interface since its creation; None where the kernel has none."""
     at = time.monotonic()
     statistics = SYSTEM / "class/net" / name / "statistics"
     texts = [_text(statistics / file) for file in ("rx_packets", "tx_packets", "rx_bytes", "tx_bytes")] if name else []
@@ -154,14 +174,14 @@ def counted(name: str) -> Passed | None:
 
 
 def passed(before: Passed | None, after: Passed | None) -> Passed | None:
-    """What passed from one count to the next; None where there is none."""
+    """Return the traffic between two counts; None without both."""
     if before is None or after is None:
         return None
     return Passed(after.seconds - before.seconds, after.frames - before.frames, after.data - before.data)
 
 
 def governors() -> dict[int, str]:
-    """How the frequency of each processor is governed; those without scaling are left out."""
+    """Return the frequency governor of each processor that has one."""
     files = SYSTEM.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor")
     found = {int(file.parts[-3].removeprefix("cpu")): _text(file) for file in files}
     return {cpu: name for cpu, name in sorted(found.items()) if name}

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from trirail.analysis.replay import Comparison
     from trirail.analysis.summary import GoalSummary, Summary
     from trirail.telemetry.provenance import Software
-    from trirail.telemetry.reading import Recording
+    from trirail.telemetry.recording import Recording
 
 Recordings = Annotated[Path, Parameter(required=True)]
 """One recording at least."""
@@ -28,15 +28,12 @@ Recordings = Annotated[Path, Parameter(required=True)]
 def replay(
     *file: Recordings,
     config: Path | None = None,
-    to: str | None = None,
-    robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT")] = "demo",
     json: Json = False,
 ) -> int:
     """Give a recorded session to the control once more, cycle by cycle, and compare the setpoints.
 
     With the recorded configuration and the recorded answers of the drives they come out the same to the last
-    bit: exit 1 if they do not, and the software is the same. With --to, its goals and commands are sent to a
-    running service instead, which moves that robot.
+    bit: exit 1 if they do not, and the software is the same.
 
     Parameters
     ----------
@@ -44,23 +41,17 @@ def replay(
         Recording, or all files of one that was rotated.
     config
         Configuration to try instead of the recorded one; the drives are then simulated ones.
-    to
-        Zenoh locator of a service to send the session to.
-    robot
-        Name of its robot.
     """
-    from trirail.analysis.replay import again
+    from trirail.analysis.replay import replay_session
     from trirail.config import load
     from trirail.telemetry import provenance
 
     recording = _read(file)
-    if to is not None:
-        return _resend(recording, robot, to, json)
     settings = load(config) if config else provenance.configuration(recording.texts)
     if settings is None:
         raise ServiceError(f"{file[0]}: its configuration is not in it: was it made by an older version? Use --config")
     by, here = provenance.recorded_by(recording.texts), provenance.software()
-    compared = again(recording, settings, simulated=config is not None)
+    compared = replay_session(recording, settings, simulated=config is not None)
     if json:
         same = {"same_software": by == here, "simulated_drives": config is not None}
         terminal.json({"name": recording.name} | compared._asdict() | same)
@@ -84,10 +75,10 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
     json
         Print one JSON object, in SI units, instead of words.
     """
-    from trirail.analysis.summary import summary
+    from trirail.analysis.summary import summarise
 
     recording = _read(file)
-    summed = summary(recording)
+    summed = summarise(recording)
     if plot:
         _draw(plot, recording, summed)
     if json:
@@ -141,25 +132,6 @@ def export(
         terminal.json({"file": str(path), "rows": rows})
     else:
         terminal.say(f"{rows} rows written to {path}")
-    return 0
-
-
-def _resend(recording: Recording, name: str, locator: str, json: bool) -> int:
-    from trirail.analysis.resend import resend
-    from trirail.client.client import Robot
-
-    with Robot(name, locator) as robot:
-        labels = robot.info().labels
-        motions = resend(recording, robot, (lambda _: None) if json else terminal.say)
-    if json:
-        terminal.json([motion._asdict() for motion in motions])
-        return 0
-    lines = _Lines()
-    for motion in motions:
-        longer = f", one is {motion.lacking} cycles longer" if motion.lacking else ""
-        lines.add(terminal.plain(motion.id), f"{motion.outcome}, {motion.cycles} cycles compared{longer}")
-        lines.add("  differ at most", _each(labels, motion.position, 1e6, "µm"))
-    lines.show()
     return 0
 
 

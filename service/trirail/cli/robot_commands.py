@@ -7,9 +7,8 @@ import inspect
 import itertools
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 from cyclopts import CycloptsError, Parameter, validators
@@ -23,6 +22,7 @@ from trirail.cli.options import (
     Speed,
     Wait,
     axes_names,
+    described,
     frame_names,
     taught_poses,
     tool_names,
@@ -30,7 +30,7 @@ from trirail.cli.options import (
 from trirail.cli.options import poses as poses_of_robot
 from trirail.naming import Labels
 from trirail.wire import boundary
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal
 from trirail.wire.messages import CommandReply
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.units import LENGTH, quantity
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from trirail.client.client import GoalHandle, Robot
     from trirail.wire.messages import Event
 
-Tool = Annotated[notation.ToolPoint, Parameter(completer=tool_names)]
-
+Tool = Annotated[notation.ToolPoint, Parameter(completer=tool_names), described(PoseGoal, "tool", "; typed U V")]
+Blend = Annotated[notation.Distance, described(PoseGoal, "blend")]
 
 NO_END = "the jog has no known end"
 
@@ -54,9 +54,9 @@ def goto(
     *,
     wait: Wait = False,
     speed: Speed = 1.0,
-    blend: notation.Distance | None = None,
+    blend: Blend | None = None,
     tool: Tool | None = None,
-    frame: Annotated[str, Parameter(completer=frame_names)] = "base",
+    frame: Annotated[str, Parameter(completer=frame_names), described(PoseGoal, "frame")] = "base",
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
@@ -70,13 +70,6 @@ def goto(
         Likewise along y.
     phi
         Angle of the platform, counterclockwise [rad], or with a unit: 10deg, 50mrad.
-    blend
-        The next goto waits for this one, and begins that near to its end [m], instead of preempting it.
-    tool
-        The point of the platform that goes there instead of the centre: U V in the platform's own frame [m], or its
-        name in [frames.tool].
-    frame
-        A frame of [frames.work] in which the pose is given.
     deg
         An angle without a unit is in degrees.
     """
@@ -109,7 +102,7 @@ def move(
     wait: Wait = False,
     speed: Speed = 1.0,
     tool: Tool | None = None,
-    frame: Annotated[str, Parameter(completer=axes_names)] = "base",
+    frame: Annotated[str, Parameter(completer=axes_names), described(MoveGoal, "frame")] = "base",
     measured: Annotated[bool, Flag] = False,
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
@@ -124,11 +117,6 @@ def move(
         Along y.
     dphi
         By what angle to turn, counterclockwise [rad], or with a unit: 1deg.
-    tool
-        The point of the platform that moves so far, and about which it turns: U V in the platform's own frame [m], or
-        its name in [frames.tool].
-    frame
-        Along whose axes: base, platform, or a frame of [frames.work].
     measured
         From where the robot is measured to be, instead of where it was sent.
     deg
@@ -191,7 +179,6 @@ def jog(
     *,
     seconds: notation.Time | None = None,
     tool: Tool | None = None,
-    gamepad: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
     """Move at a velocity until Ctrl-C, or while keys are held.
@@ -208,23 +195,14 @@ def jog(
         Rate of the platform's angle [rad/s], or with a unit: 2deg/s.
     seconds
         How long [s].
-    tool
-        The point of the platform that moves so, and about which it turns: U V in the platform's own frame [m], or its
-        name in [frames.tool].
-    gamepad
-        By a gamepad too, whose sticks move the robot while one of its shoulder buttons is held.
     """
     if vx is None:
         from trirail.cli import pendant
-        from trirail.cli.gamepad import Pad
 
-        with ExitStack() as opened:
-            pad = opened.enter_context(Pad.first()) if gamepad else None
-            return pendant.run(opened.enter_context(service.open()), pad, tool)
-    if vy is None or w is None or gamepad:
-        raise CycloptsError(
-            msg="jog takes VX, VY and W, or none of them: then keys, or a gamepad, move the robot while they are held"
-        )
+        with service.open() as robot:
+            return pendant.run(robot, tool)
+    if vy is None or w is None:
+        raise CycloptsError(msg="jog takes VX, VY and W, or none of them: then keys move the robot while they are held")
     with service.open() as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w, tool=tool) as jogging:
@@ -433,22 +411,32 @@ COMMANDS = (goto, move, goal, sliders, jog, follow, teach, forget, poses, status
 
 
 def command_line_of(name: Command) -> Callable[..., int]:
-    """Return the command of the command line that sends one, with the numbers that it cannot come without."""
+    """Return the command of the command line that sends one; each required field of its content is an argument."""
 
-    def send_command(*values: float, service: Service = HERE) -> int:
+    def send_command(*values: object, service: Service = HERE) -> int:
         with service.open() as robot:
             reply = robot.command(name, name.content(*values) if values else None)
         confirmed(service, name, reply)
         return 0
 
     signature = inspect.signature(send_command)
-    needed = [field.name for field in msgspec.structs.fields(name.content) if field.required]
-    taken = Annotated[float, Parameter(help=f"Of what it takes: {name.content.words}.")]
-    each = [inspect.Parameter(field, inspect.Parameter.POSITIONAL_ONLY, annotation=taken) for field in needed]
+    help_text = Parameter(help=f"Of its content: {name.content.words}.")
+    each = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.POSITIONAL_ONLY, annotation=Annotated[_plain_type(field.type), help_text]
+        )
+        for field in msgspec.structs.fields(name.content)
+        if field.required
+    ]
     send_command.__signature__ = signature.replace(  # type: ignore[attr-defined]  # where cyclopts looks
         parameters=[*each, signature.parameters["service"].replace(annotation=Service)]
     )
     return send_command
+
+
+def _plain_type(kind: Any) -> Any:
+    """Return the type of a field without its constraints, which are checked where the content is made."""
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 
 def confirmed(service: Service, name: Command, reply: CommandReply) -> None:

@@ -1,27 +1,22 @@
-"""A router between robots and users, `trirail router`: Zenoh's own, out of the wheel, with the roles of its users."""
+"""A router between robots and users: its file, and the configuration of Zenoh's own program that follows from it."""
 
 from __future__ import annotations
 
-import signal
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import zenoh
 from msgspec import Meta, Struct
 from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
-from trirail.config import UserName, Zenoh, check_reach, explain, toml_tables
-from trirail.errors import ConfigError, RefusedError, ServiceError
-from trirail.wire import boundary, zenoh_session
+from trirail.config import UserName, Zenoh, check_reach, toml_tables, wrong_values
+from trirail.errors import ConfigError, ServiceError
+from trirail.wire import zenoh_session
 from trirail.wire.access import router_access_control
 from trirail.wire.credentials import Credentials, revoked, with_role
 from trirail.wire.decoding import converted, prepare
-from trirail.wire.messages import RoleReply
 
 
 class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
@@ -70,14 +65,13 @@ def load(path: Path) -> RouterConfig:
 
 def _parsed(text: str) -> RouterConfig:
     raw = toml_tables(text)
-    try:
-        return converted(raw, RouterConfig)
-    except msgspec.ValidationError as error:
-        raise ConfigError(explain(str(error), raw, RouterConfig)) from error
+    if wrong := wrong_values(raw, RouterConfig):
+        raise ConfigError(wrong[0].text)
+    return converted(raw, RouterConfig)
 
 
 def settings(config: RouterConfig) -> dict[str, Any]:
-    """Return the settings of Zenoh's router. Raises ServiceError for certificates that are no good."""
+    """Return the configuration of zenohd. Raises ServiceError for certificates that are no good."""
     thinned = {zenoh_session.key(robot, "state"): config.state_hz for robot in config.all_robots}
     listen, connect = config.zenoh.listen, config.zenoh.connect
     if config.zenoh.tls is None:
@@ -96,45 +90,3 @@ def settings(config: RouterConfig) -> dict[str, Any]:
         )
     rules = router_access_control(config.behind, with_role(config.zenoh.users, folder), config.zenoh.router)
     return zenoh_session.router(listen, own, rules, connect, thinned)
-
-
-@contextmanager
-def routing(config: RouterConfig) -> Iterator[zenoh.Session]:
-    """Route while the context lasts. Raises ServiceError where an address cannot be listened on."""
-    session = zenoh_session.open_router(settings(config))
-    try:
-        if config.zenoh.tls is not None:
-            _tell_roles(session, config, Path(config.zenoh.tls.directory))
-        yield session
-    finally:
-        zenoh_session.close(session)
-
-
-def run(config: RouterConfig, up: Callable[[], None]) -> None:
-    """Route until SIGTERM or SIGINT; `up` is called once it does."""
-    ends = {signal.SIGTERM, signal.SIGINT}
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ends)  # before Zenoh's threads begin, that they have it too
-    try:
-        with routing(config):
-            up()
-            signal.sigwait(ends)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-
-def _tell_roles(session: zenoh.Session, config: RouterConfig, folder: Path) -> None:
-    """Answer every certificate that asks for its role: the robots know only their router."""
-    users = with_role(config.zenoh.users, folder)
-    asked = zenoh_session.key("*", "role", "*")
-
-    def answer(query: zenoh.Query) -> None:
-        with query:
-            _, robot, *_ = str(query.key_expr).split("/")
-            try:
-                (user,) = boundary.names(str(query.key_expr), zenoh_session.key(robot, "role"), ("user",))
-            except RefusedError:
-                return
-            reply = RoleReply(user, users.get(user))
-            query.reply(query.key_expr, msgspec.json.encode(reply), encoding=boundary.JSON)
-
-    session.declare_queryable(asked, zenoh.handlers.Callback(answer, indirect=False))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sqlite3
 import sys
 import time
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from trirail.wire.messages import Outcome
 from trirail.wire.text import quoted, wall_clock
 
 if TYPE_CHECKING:
-    from trirail.telemetry.session_index import RecordedSession, SessionIndex
+    from trirail.telemetry.sessions import RecordedSession
 
 FOLDER = Path("recordings")
 """Where a service records that was started in this folder."""
@@ -60,7 +59,7 @@ def sessions(
 
     When, whose goals ended how, faults, why a black box was kept.
 
-    What the index of the folder lacks, as after a kill, is read first.
+    A recording without a usable .json beside it, as after a kill, is read first.
 
     Parameters
     ----------
@@ -81,31 +80,25 @@ def sessions(
     last
         At most so many, the newest; 0 for all.
     rebuild
-        Throw the index away and read every recording.
+        Read every recording, and write the .json beside it again.
     """
-    from trirail.telemetry.session_index import SessionIndex, Wanted
+    from trirail.telemetry.sessions import Wanted, fault_codes, find, recorded
 
     if not folder.is_dir():
         raise ServiceError(f"{folder}: no such folder: name that of [telemetry] directory")
     wanted = Wanted(
         robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
     )
-    index = SessionIndex(folder)
-    try:
-        if rebuild:
-            index.clear()
-        _update(index)
-        found = index.find(wanted)
-        recorded = index.faults() if fault is not None and not index.find(Wanted(fault=fault)) else []
-    except (sqlite3.Error, OSError) as error:
-        raise ServiceError(f"{folder}: the index of its recordings cannot be used: {error}") from error
+    files = recorded(folder, reread=rebuild, on_read=_ReadingReport())
+    found = find(files, wanted)
+    known = fault_codes(files) if fault is not None and not find(files, Wanted(fault=fault)) else []
     shown = found[-last:] if last else found
     if json:
         terminal.json({"folder": str(folder), "found": len(found), "sessions": msgspec.to_builtins(shown)})
         return 0
     _print(shown, len(found))
-    if recorded:
-        terminal.say(f"no recorded fault says {quoted(fault or '')}: there are {', '.join(recorded)}")
+    if known:
+        terminal.say(f"no recorded fault says {quoted(fault or '')}: there are {', '.join(known)}")
     return 0
 
 
@@ -115,17 +108,22 @@ def _check_code(words: str | None) -> None:
         raise ValueError(f"{quoted(words)!r} is no code such as 0x8700")
 
 
-SAID_EVERY = 1.0
-"""How often it is said how far reading has come [s]."""
+REPORT_EVERY = 1.0
+"""How often progress of reading recordings is printed [s]."""
 
 
-def _update(index: SessionIndex) -> None:
-    """Read what the index lacks, and say so where that takes long."""
-    due = time.monotonic() + SAID_EVERY
-    for number, path in enumerate(index.update(), 1):
-        if time.monotonic() >= due:
-            due = time.monotonic() + SAID_EVERY
-            print(f"reading {path.name}, recording {number} that the index lacks", file=sys.stderr)  # noqa: T201
+class _ReadingReport:
+    """Prints which recording is read, where that takes long."""
+
+    def __init__(self) -> None:
+        self._due = time.monotonic() + REPORT_EVERY
+        self._count = 0
+
+    def __call__(self, path: Path) -> None:
+        self._count += 1
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + REPORT_EVERY
+            print(f"reading {path.name}, recording {self._count} without a usable .json", file=sys.stderr)  # noqa: T201
 
 
 def _print(found: list[RecordedSession], of: int) -> None:

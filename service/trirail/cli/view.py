@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
+from trirail_drivers import files
+
 from trirail.client.client import Robot
 from trirail.errors import ServiceError
 from trirail.processes.operating_system import python
@@ -143,8 +145,8 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 @contextlib.contextmanager
 def _settings() -> Iterator[dict[str, str]]:
     """Yield an environment in which Rerun's programs send no analytics: 0.41 reads that in a file, and no variable."""
-    with tempfile.TemporaryDirectory(prefix="trirail-view-") as folder:
-        file = Path(folder) / "rerun" / "analytics.json"
+    with files.temporary_folder() as folder:
+        file = folder / "rerun" / "analytics.json"
         file.parent.mkdir()
         settings = {
             "analytics_enabled": False,
@@ -153,7 +155,7 @@ def _settings() -> Iterator[dict[str, str]]:
             "data_dir_path": str(file.parent),
         }
         file.write_text(json.dumps(settings))
-        yield os.environ | {"XDG_CONFIG_HOME": folder}
+        yield os.environ | {"XDG_CONFIG_HOME": str(folder)}
 
 
 def _web_port() -> int:

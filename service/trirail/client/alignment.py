@@ -1,99 +1,115 @@
-"""What drives an alignment: the user's camera and a connection to the robot, with a thread or in an event loop."""
+"""Alignments: the user's camera and a connection to the robot carry out the steps, and report looks to the service.
+
+Recordings, reports and panels get the looks from the service. A failed report never ends an alignment, but causes a
+single warning.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import inspect
+import itertools
 import time
-from collections.abc import Awaitable, Callable, Generator, Iterator
-from typing import TYPE_CHECKING, TypeVar
+import uuid
+import warnings
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator
+from typing import Any, Protocol, TypeVar, cast
 
+import msgspec
 from msgspec import structs
 from trirail_drivers.interface import Triple
 
+from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Observation, StageMotion
+from trirail.alignment.arguments import check_wait
 from trirail.alignment.camera_calibration import Marks
-from trirail.alignment.wishes import LookReport, Sighting, StageMotion, Wish
+from trirail.alignment.results import Measurement
 from trirail.client.goal import Result
-from trirail.client.look_reports import LookReports
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal
-
-if TYPE_CHECKING:
-    from trirail.client.async_client import AsyncRobot
-    from trirail.client.client import Robot
+from trirail.wire.looks import AlignmentLook, LookEnd, LookError, SeenMark
+from trirail.wire.state import State
+from trirail.wire.text import quoted
 
 T = TypeVar("T")
 Look = Callable[[], Marks | Awaitable[Marks]]
 """Takes a picture, or one of each camera, and returns where it shows the marks, {name: (u, v)} [pixel]; in an event
 loop it may be a coroutine function."""
-NOTHING_SEEN = Sighting({}, (0.0, 0.0, 0.0), 0.0)
+NOTHING_SEEN = Observation({}, (0.0, 0.0, 0.0), 0.0)
 GOAL_WITHIN = 60.0
-"""How long one motion may take [s]."""
+"""Longest time of one motion [s]."""
 STANDS = ("done", "unsettled")
-"""Outcomes with which the robot stands where it was to be, or nearly: the next look tells."""
+"""Outcomes with which the robot is at its target, or near it: the next look measures the distance."""
 
 
-def drive(robot: Robot, look: Look, wishes: Generator[Wish, Sighting, T], speed: float, wait: float) -> T:
-    """Do what a conversation wishes, and return what it ends with.
+class SentMotion(Protocol):
+    """A goal of an alignment that the service has accepted: GoalHandle or AsyncGoalHandle."""
 
-    `wait` is how long a camera needs after a motion until it shows what is [s]. Whatever ends it before, as Ctrl-C,
-    stops the motion. Raises RefusedError where a motion is refused or ends otherwise, and what `look` raises.
+    @property
+    def result(self) -> Result | None:
+        """Result of the goal; None before its end."""
+
+    def wait(self, timeout: float | None = None) -> Result | Awaitable[Result]:
+        """Wait for its end."""
+
+
+class StageRobot(Protocol):
+    """Calls of a connection to the robot that an alignment needs: of Robot, or of AsyncRobot, which are awaited."""
+
+    def send(self, make: Goal, /) -> SentMotion | Awaitable[SentMotion]:
+        """Send a goal."""
+
+    def stop(self) -> Awaitable[None] | None:
+        """Stop the robot."""
+
+    def state(self) -> State | Awaitable[State]:
+        """Return the newest state."""
+
+    def _report_look(self, look: bytes, /) -> Awaitable[None] | None: ...
+
+
+def drive(
+    robot: StageRobot, look: Look, wishes: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
+) -> T:
+    """Carry out the requests of a conversation by a robot that is called without an event loop; return its result.
+
+    Otherwise like drive_async; Ctrl-C stops the motion.
     """
-    sight = NOTHING_SEEN
-    reports = LookReports()
-    ids = reports.goal_ids()
+
+    def take_picture() -> Marks:
+        seen = look()
+        if inspect.isawaitable(seen):
+            raise TypeError("look is a coroutine function: it is for AsyncRobot")
+        return seen
+
+    return finish(drive_async(robot, take_picture, wishes, speed, wait, time.sleep))
+
+
+def finish(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Return the result of a coroutine that never suspends, since every call in it blocks."""
     try:
-        wish = next(wishes)
-        while True:
-            if isinstance(wish, LookReport):
-                _report(robot, reports, reports.message(wish))
-            else:
-                if isinstance(wish, StageMotion):
-                    for goal in goals(wish, speed):
-                        _go(robot, goal, next(ids))
-                    time.sleep(wait)
-                    marks = sight.marks
-                else:
-                    marks = _marks(look)
-                sight = Sighting(marks, robot.state().pose, time.monotonic())
-            wish = wishes.send(sight)
+        coroutine.send(None)
     except StopIteration as end:
-        return end.value  # type: ignore[no-any-return]
-    except BaseException as error:
-        _report(robot, reports, reports.failure(error))
-        raise
-
-
-def _marks(look: Look) -> Marks:
-    seen = look()
-    if inspect.isawaitable(seen):
-        raise TypeError("look is a coroutine function: it is for AsyncRobot")
-    return seen
-
-
-def _report(robot: Robot, reports: LookReports, message: bytes | None) -> None:
-    if message is None:
-        return
-    try:
-        robot._report_look(message)
-    except TrirailError as error:
-        reports.lost(error)
-
-
-def _go(robot: Robot, goal: Goal, goal_id: str) -> None:
-    handle = robot.send(structs.replace(goal, id=goal_id))
-    try:
-        check(handle.wait(GOAL_WITHIN))
-    except BaseException:
-        if handle.result is None:
-            robot.stop()
-        raise
+        return cast(T, end.value)
+    coroutine.close()
+    raise RuntimeError("it waits for an event loop, and there is none")
 
 
 async def drive_async(
-    robot: AsyncRobot, look: Look, wishes: Generator[Wish, Sighting, T], speed: float, wait: float
+    robot: StageRobot,
+    look: Look,
+    wishes: Generator[AlignmentRequest, Observation, T],
+    speed: float,
+    wait: float,
+    sleep: Callable[[float], Awaitable[None] | None] = asyncio.sleep,
 ) -> T:
-    """Do the same in an event loop; `look` may be a coroutine function. A call that is cancelled stops the motion."""
+    """Carry out the requests of a conversation, and return its result.
+
+    `wait` is the time that a camera needs after a motion until its picture is current [s]. An earlier end, such as
+    cancellation, stops the motion.
+
+    Raises RefusedError where a motion is refused or does not reach its target, and the errors of `look`.
+    """
+    check_wait(wait)
     sight = NOTHING_SEEN
     reports = LookReports()
     ids = reports.goal_ids()
@@ -101,41 +117,45 @@ async def drive_async(
         wish = next(wishes)
         while True:
             if isinstance(wish, LookReport):
-                await _report_async(robot, reports, reports.message(wish))
+                await _report(robot, reports, reports.message(wish))
             else:
                 if isinstance(wish, StageMotion):
                     for goal in goals(wish, speed):
-                        await _go_async(robot, goal, next(ids))
-                    await asyncio.sleep(wait)
+                        await _move(robot, goal, next(ids))
+                    await _done(sleep(wait))
                     marks = sight.marks
                 else:
-                    seen = look()
-                    marks = await seen if inspect.isawaitable(seen) else seen
-                sight = Sighting(marks, (await robot.state()).pose, time.monotonic())
+                    marks = await _done(look())
+                sight = Observation(marks, (await _done(robot.state())).pose, time.monotonic())
             wish = wishes.send(sight)
     except StopIteration as end:
-        return end.value  # type: ignore[no-any-return]
+        return cast(T, end.value)
     except BaseException as error:
-        await _report_async(robot, reports, reports.failure(error))
+        await _report(robot, reports, reports.failure(error))
         raise
 
 
-async def _report_async(robot: AsyncRobot, reports: LookReports, message: bytes | None) -> None:
+async def _done(called: Any) -> Any:
+    """Return the result of a call, awaited if it is of AsyncRobot."""
+    return await called if inspect.isawaitable(called) else called
+
+
+async def _report(robot: StageRobot, reports: LookReports, message: bytes | None) -> None:
     if message is None:
         return
     try:
-        await robot._report_look(message)
+        await _done(robot._report_look(message))
     except TrirailError as error:
         reports.lost(error)
 
 
-async def _go_async(robot: AsyncRobot, goal: Goal, goal_id: str) -> None:
-    handle = await robot.send(structs.replace(goal, id=goal_id))
+async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
+    handle: SentMotion = await _done(robot.send(structs.replace(goal, id=goal_id)))
     try:
-        check(await handle.wait(GOAL_WITHIN))
+        check(await _done(handle.wait(GOAL_WITHIN)))
     except BaseException:
         if handle.result is None:
-            await robot.stop()
+            await _done(robot.stop())
         raise
 
 
@@ -152,7 +172,7 @@ def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
 
 
 def check(result: Result) -> None:
-    """Raise RefusedError for a motion after which the robot does not stand where it was to be."""
+    """Raise RefusedError for a motion after which the robot is not at its target."""
     if result.outcome not in STANDS:
         raise RefusedError(RefusalCode.FAILED, f"a motion of the alignment ended {result.outcome}: {result.message}")
 
@@ -163,3 +183,78 @@ def _sum(a: Triple, b: Triple) -> Triple:
 
 def _negative(a: Triple) -> Triple:
     return -a[0], -a[1], -a[2]
+
+
+class UnrecordedAlignmentWarning(UserWarning):
+    """The service did not accept the report of an alignment; recordings and panels lack it."""
+
+
+class LookReports:
+    """Messages of one alignment, and the ids of its goals, which begin with its own."""
+
+    def __init__(self) -> None:
+        self.id = f"align-{uuid.uuid4().hex[:8]}"
+        self._goals = itertools.count(1)
+        self._last: LookReport | None = None
+        self._number = 0
+        self._began = 0.0
+        self._lost = False
+
+    def goal_ids(self) -> Iterator[str]:
+        """Yield the ids of its goals."""
+        return (f"{self.id}-{number}" for number in self._goals)
+
+    def message(self, report: LookReport) -> bytes | None:
+        """Return the message of a look; None where it cannot be encoded, or an earlier one was not accepted."""
+        if self._last is None or self._last.purpose != report.purpose:
+            self._number, self._began = 0, _time(report)
+        self._number = max(1, self._number + (report.observation is not None))
+        self._last = report
+        try:
+            return None if self._lost else msgspec.json.encode(self._message(report))
+        except (ValueError, TypeError) as error:
+            self.lost(error)
+            return None
+
+    def failure(self, error: BaseException) -> bytes | None:
+        """Return the message of an end by an error; None where the end was reported, or before the first look."""
+        if self._last is None or self._last.end is not None:
+            return None
+        return self.message(LookReport(self._last.purpose, end="failed", words=str(error) or type(error).__name__))
+
+    def lost(self, error: Exception) -> None:
+        """Warn, once, that the service does not accept the report."""
+        if not self._lost:
+            self._lost = True
+            words = f"this alignment is not in the service's recording: {error}"
+            warnings.warn(words, UnrecordedAlignmentWarning, stacklevel=4)
+
+    def _message(self, report: LookReport) -> AlignmentLook:
+        observation, measured = report.observation, report.measurement
+        return AlignmentLook(
+            id=self.id,
+            purpose=report.purpose,
+            number=self._number,
+            marks=() if observation is None else tuple(_marks(observation, measured)),
+            error=None if measured is None else _error(measured),
+            pose=None if observation is None else observation.pose,
+            correction=report.correction,
+            end=cast(LookEnd | None, report.end and str(report.end)),  # tests/wire/test_looks.py holds them together
+            words=quoted(report.words),
+            noise=report.noise,
+            seconds=max(0.0, _time(report) - self._began),
+        )
+
+
+def _time(report: LookReport) -> float:
+    return time.monotonic() if report.observation is None else report.observation.time
+
+
+def _marks(observation: Observation, measured: Measurement | None) -> Iterator[SeenMark]:
+    to_go = {} if measured is None else measured.errors
+    for name, pixel in observation.marks.items():
+        yield SeenMark(str(name), pixel, to_go.get(name))
+
+
+def _error(measured: Measurement) -> LookError:
+    return LookError(measured.worst, measured.shift, measured.turn, measured.misfit, measured.distance)

@@ -1,4 +1,4 @@
-"""The file of a camera calibration: JSON, of a version, with its date, the robot, and the looks that made it."""
+"""File of a camera calibration: JSON, of a version, with its date, the robot, and the looks that made it."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ VERSION: Literal[1] = 1
 
 
 class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is in it."""
+    """Content of the file."""
 
     version: Literal[1]
     robot: str
     made: datetime
-    """With its time zone."""
+    """Time of the calibration, with its time zone."""
     calibration: CameraCalibration
     targets: dict[str, Pair] = {}
-    """Where marks should be [pixel]: where they were at the calibration's first look, until others are taught."""
+    """Targets of the marks [pixel]: their pixels at the calibration's first look, until others are taught."""
 
 
 prepare(CalibrationFile)
 
 
 def write(path: Path, robot: str, calibration: CameraCalibration, targets: Marks, made: datetime | None = None) -> None:
-    """Write it such that a power cut leaves the old file or the new one. Raises FileError."""
+    """Write the file such that a power cut leaves the old or the new one. Raises FileError."""
     content = CalibrationFile(VERSION, robot, made or datetime.now(UTC), calibration, dict(targets))
     try:
         files.replace(path, msgspec.json.format(msgspec.json.encode(content)) + b"\n")
@@ -43,9 +43,9 @@ def write(path: Path, robot: str, calibration: CameraCalibration, targets: Marks
 
 
 def keep_old(path: Path) -> Path | None:
-    """Keep the file that is there beside it, as NAME.old, for targets that were taught; return that. Raises FileError.
+    """Save a copy of an existing file as NAME.old, for the taught targets; return its path. Raises FileError.
 
-    None where there is none.
+    Return None where there is no file.
     """
     if not path.exists():
         return None
@@ -57,7 +57,7 @@ def keep_old(path: Path) -> Path | None:
 
 
 def read(path: Path) -> CalibrationFile:
-    """Read it. Raises FileError with the file, the field and what would be right."""
+    """Read the file. Raises FileError with the file, the field and the expected value."""
     if not path.exists():
         raise FileError(f"{path}: no such file; trirail align calibrate makes it")
     text = files.text(path)

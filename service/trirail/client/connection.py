@@ -1,9 +1,8 @@
-"""Zenoh as one client of one robot uses it: it asks the service, and hears what that publishes."""
+"""Zenoh session of one client of one robot: queries to the service, and its publications by callbacks."""
 
 from __future__ import annotations
 
 import contextlib
-import queue
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -26,31 +25,34 @@ from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Role
 
 ROLE_WITHIN = 0.8
-"""How long the answer may take which role a user has [s]."""
+"""Time-out of the answer with a user's role [s]."""
 REPLY_WITHIN = 20.0
-"""How long a command may take to be carried out [s]."""
+"""Time-out for carrying out a command [s]."""
 HERE_WITHIN = 1.0
-"""How long the answer may take who is connected [s]."""
+"""Time-out of the answer with the connected users [s]."""
 POST_WITHIN = 2.0
-"""How long the answer may take to what is posted [s]."""
+"""Time-out of the answer to a posted query [s]."""
+CLOSED = "the connection is closed: open a new one, as Robot(…)"
 ZENOHS_TIMEOUT = b"Timeout"
-"""What Zenoh itself answers to a query whose time is over."""
+"""Answer of Zenoh itself to a query after its time-out."""
 OVERTAKEN_WITHIN = 1.0
-"""How long a state may be on its way that an answer or an event has overtaken [s]; a service that was started again
-within it, and counts from one, is heard after it."""
+"""Longest delay of a state that an answer or an event has overtaken [s].
+
+States of a service that was restarted within it, and counts from one, are accepted after it.
+"""
 
 T = TypeVar("T", bound=msgspec.Struct)
 Said = TypeVar("Said")
 
 
 class SilenceError(ServiceError):
-    """A query that nobody has answered."""
+    """Error of a query that nobody has answered."""
 
 
 class Connection:
     """A session to the service of a robot at a Zenoh locator. Raises ServiceError where that cannot be reached.
 
-    Whose it is, if that is said, all others see while it lasts.
+    Its user, if given, is visible to all others while it lasts.
     """
 
     def __init__(
@@ -62,58 +64,42 @@ class Connection:
         self._opened = zenoh_session.open_client(connect, credentials)
         # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
         self.close = weakref.finalize(self, zenoh_session.close, self._opened)
-        """End it; calls after the first do nothing."""
+        """End the session; calls after the first do nothing."""
         self._reader = SampleReader()
         self._known = 0, 0.0
-        self._here = self._opened.liveliness().declare_token(self._key("here", user)) if user is not None else None
+        self._here = self._opened.liveliness().declare_token(self.key("here", user)) if user is not None else None
 
     @property
     def skipped(self) -> int:
-        """How often something was published on this robot's keys that was none of its messages."""
+        """Number of publications on this robot's keys that were not valid messages."""
         return self._reader.skipped
 
     # ------------------------------------------------------------------ asking
 
-    def fetch(
-        self,
-        parts: tuple[str, ...],
-        kind: type[T],
-        payload: bytes | None = None,
-        within: float = REPLY_WITHIN,
-        copy: str | None = None,
-    ) -> T:
-        """Query the key of these parts and decode the first reply that can be read as a message of `kind`.
-
-        `copy` is the id by which the service knows the copies of a stop for one.
-
-        Raises RefusedError where the service says no, ServiceError where nobody answers within so many seconds: nobody
-        is there, or may be asked. A reply has the quality of service of its query: one that may be dropped would have
-        an answer that may be.
-        """
-        unreadable: ServiceError | None = None
-        for reply in self._session.get(**self.query(parts, payload, within), attachment=copy):
-            answer = self.read(reply, kind)
-            if not isinstance(answer, ServiceError):
-                return answer
-            unreadable = answer
-        raise unreadable or self.nobody(*parts)
+    def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
+        """Query the key of these parts without waiting for an answer."""
+        handler = zenoh.handlers.Callback(_ignore, indirect=False)
+        self.session.get(**self.query(parts, payload, REPLY_WITHIN), handler=handler)
 
     def query(self, parts: tuple[str, ...], payload: bytes | None, within: float) -> dict[str, Any]:
-        """Return how the key of these parts is asked, as arguments of a session's `get`."""
+        """Return the query of the key of these parts, as arguments of a session's `get`.
+
+        A reply has the quality of service of its query: the reply to a droppable query would be droppable.
+        """
         boundary.check_size(len(payload or b""))
         return {
-            "selector": self._key(*parts),
+            "selector": self.key(*parts),
             "payload": payload,
             "encoding": boundary.JSON if payload else None,
             "timeout": within,
-            "consolidation": zenoh.ConsolidationMode.NONE,  # at once, however many more were asked
+            "consolidation": zenoh.ConsolidationMode.NONE,  # deliver each reply without waiting for others
             "congestion_control": zenoh.CongestionControl.BLOCK,
             "priority": zenoh.Priority.REAL_TIME,
             "express": True,
         }
 
     def read(self, reply: zenoh.Reply, kind: type[T]) -> T | ServiceError:
-        """Return the message of a reply, ServiceError where it holds none. Raises RefusedError where that is a no."""
+        """Return the message of a reply; ServiceError where it holds none. Raises RefusedError for a refusal."""
         if reply.ok is not None:
             try:
                 answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
@@ -131,23 +117,9 @@ class Connection:
             raise refused
         return refused
 
-    def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
-        """Ask for a stop, quick_stop or disable, over Zenoh and at the door beside it; return the first answer.
-
-        Raises as `ask`.
-        """
-        came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
-        with self.copies(StopOrder.of(self.robot, user, name, content, within), came.put) as outcomes:
-            try:
-                while (reply := outcomes.decide(came.get())) is None:
-                    pass
-            except SilenceError as error:
-                raise self.nobody("cmd", user, name) from error
-        return reply
-
     @contextlib.contextmanager
     def copies(self, stop: StopOrder, deliver: Callable[[Outcome], None]) -> Iterator[Outcomes]:
-        """Send all copies of a stop, and have what comes of each taken, by whatever thread; until the context ends."""
+        """Send all copies of a stop, and deliver the outcome of each, from any thread, until the context ends."""
         at_door = stop.at_door(self._connect, self._credentials, lambda outcome: deliver(self._noted(outcome)))
         try:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
@@ -160,7 +132,7 @@ class Connection:
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
-        """Query the key of these parts without waiting: `deliver` gets a message of `kind`, or why there is none.
+        """Query the key of these parts without waiting: `deliver` gets a message of `kind`, or the error.
 
         It is called once, by a thread of the connection: it must be quick.
         """
@@ -181,40 +153,31 @@ class Connection:
             deliver(answers[0] if answers else silent)
 
         handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
-        self._session.get(**query, handler=handler)
-
-    def nobody(self, *parts: str) -> ServiceError | RefusedError:
-        """Return what to raise where nobody answers on the key of these parts.
-
-        Zenoh drops what a role does not allow without a word, as it does what nobody listens to. Every certificate
-        may ask for its role: the answer, within ROLE_WITHIN, tells which it was.
-        """
-        user = self.to_be_asked_for_role(*parts)
-        try:
-            reply = self.fetch(("role", user), RoleReply, within=ROLE_WITHIN) if user else None
-        except (ServiceError, RefusedError):
-            reply = None
-        return self.why_nobody(parts, reply)
+        self.session.get(**query, handler=handler)
 
     def to_be_asked_for_role(self, *parts: str) -> str | None:
-        """Return the user whose role tells why nobody answers on the key of these parts; None where none does."""
+        """Return the user whose role may explain why nobody answers on the key of these parts; None for no user."""
         user = self._credentials.name if self._credentials is not None else ""
         return user if is_name(user) and parts[0] != "role" else None
 
     def why_nobody(self, parts: tuple[str, ...], reply: RoleReply | None) -> ServiceError | RefusedError:
-        """Return what to raise where nobody answers, and this did when the user's role was asked for."""
+        """Return the error to raise where nobody answers, by the reply to the query for the user's role.
+
+        Zenoh silently drops queries that a role does not allow, as it does those without a receiver. Every certificate
+        may ask for its role: the answer, within ROLE_WITHIN, distinguishes the two.
+        """
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
             self._silent("is its service up, is the name right (--robot), is it linked to the router if this is one?")
         )
 
     def _silent(self, why: str) -> str:
-        """Return the words for nobody answering."""
+        """Return the message that nobody answers."""
         if is_starting(self._connect):
             why = "the service there is starting; try again when it says that it is up"
         return f"no robot {self.robot!r} answers at {self._connect}: {why}"
 
     def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:
-        """Return the refusal where the user's role does not allow to use the key of these parts."""
+        """Return the refusal if the user's role does not allow the key of these parts, else None."""
         needed = least_role(*parts)
         if role is None:
             problem = f"{user} has no role at {self.robot}: its [zenoh.users] does not name him, or he is revoked"
@@ -226,65 +189,41 @@ class Connection:
 
     # ------------------------------------------------------------------ hearing
 
-    def states(self, timeout: float | None) -> Iterator[State]:
-        """Yield states as they come, the newest where this is too slow; end after `timeout` seconds without one."""
-        received: queue.Queue[State] = queue.Queue(maxsize=1)
-
-        def keep_newest(state: State) -> None:
-            with contextlib.suppress(queue.Empty):
-                received.get_nowait()
-            with contextlib.suppress(queue.Full):
-                received.put_nowait(state)
-
-        with self.subscribe_to_states(keep_newest):
-            yield from _until_silent(received, timeout)
-
     def overtaken(self, state: State) -> bool:
-        """Whether a state is of before the newest answer or event that this client has."""
+        """Whether a state is older than this client's newest answer or event."""
         return state.seq < self._known[0] and not self._forgets()
 
-    def events(self, history: bool, timeout: float | None) -> Iterator[Event]:
-        """Yield events in order, each once, with `history` the past first; end after `timeout` seconds without one."""
-        received: queue.Queue[Event] = queue.Queue()
-        with self.subscribe_to_events(once(received.put), history=history):
-            yield from _until_silent(received, timeout)
-
     def subscribe_to_states(self, deliver: Callable[[State], None]) -> zenoh.Subscriber[None]:
-        """Have every state taken, until the subscriber's context ends."""
-        return self._session.declare_subscriber(self._key("state"), self._reader.messages(State, deliver))
+        """Deliver every state, until the subscriber's context ends."""
+        return self.session.declare_subscriber(self.key("state"), self._reader.messages(State, deliver))
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
-        """Have every event taken, with `history` the past too, that of a gateway that was started again as well."""
+        """Deliver every event, with `history` past ones too, also those of a restarted gateway."""
         return declare_advanced_subscriber(
-            self._session,
-            self._key("event"),
+            self.session,
+            self.key("event"),
             self._reader.messages(Event, lambda event: deliver(self._noted(event))),
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
 
     def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
-        """Have every batch of records taken, until the subscriber's context ends."""
-        return self._session.declare_subscriber(self._key("records"), self._reader.batches(deliver))
+        """Deliver every batch of records, until the subscriber's context ends."""
+        return self.session.declare_subscriber(self.key("records"), self._reader.batches(deliver))
 
-    def users(self) -> list[str]:
-        """Return the users who have a session to this robot, by name."""
-        here = self._session.liveliness().get(self._key("here", "*"), timeout=HERE_WITHIN)
-        return sorted({str(reply.ok.key_expr).rpartition("/")[2] for reply in here if reply.ok is not None})
+    def key(self, *parts: str) -> str:
+        """Return the robot's key of these parts."""
+        return zenoh_session.key(self.robot, *parts)
 
     @property
     def session(self) -> zenoh.Session:
-        """The session, for who does not wait for its answers in a thread. Raises ServiceError once it is closed."""
-        return self._session
-
-    @property
-    def _session(self) -> zenoh.Session:
+        """Zenoh session. Raises ServiceError once it is closed."""
         if not self.close.alive:
-            raise ServiceError("the connection is closed: open a new one, as Robot(…)")
+            raise ServiceError(CLOSED)
         return self._opened
 
     def _noted(self, said: Said) -> Said:
-        """Note from which state on shows what the service has said; return it."""
+        """Note the first state that reflects a message of the service; return the message."""
         seq = said.seq if isinstance(said, CommandReply) else said.cycle if isinstance(said, Event) else 0
         if seq and (seq > self._known[0] or self._forgets()):
             self._known = seq, time.monotonic()
@@ -293,14 +232,15 @@ class Connection:
     def _forgets(self) -> bool:
         return time.monotonic() - self._known[1] > OVERTAKEN_WITHIN
 
-    def _key(self, *parts: str) -> str:
-        return zenoh_session.key(self.robot, *parts)
+
+def _ignore(_reply: zenoh.Reply) -> None:
+    """Discard an answer for which nobody waits."""
 
 
 def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
-    """Return what takes events of which some come again: each is taken once, in order.
+    """Return a receiver of events that delivers each once, in order, even if some are repeated.
 
-    A gateway that was started again tells the past once more; a service that was, counts from one.
+    A restarted gateway repeats past events; a restarted service counts from one.
     """
     last = 0, 0.0
 
@@ -314,7 +254,7 @@ def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
 
 
 def robots_at(connect: str) -> list[str]:
-    """Return the names of the robots whose services answer at a Zenoh locator. Raises ServiceError if none can."""
+    """Return the names of the robots that answer at a Zenoh locator. Raises ServiceError if it cannot be reached."""
     session = zenoh_session.open_client(connect)
     try:
         alive = session.liveliness().get(zenoh_session.key("*", "alive"), timeout=1.0)
@@ -323,17 +263,8 @@ def robots_at(connect: str) -> list[str]:
         zenoh_session.close(session)
 
 
-def _until_silent(received: queue.Queue[T], timeout: float | None) -> Iterator[T]:
-    """Yield what is received, until nothing is for `timeout` seconds: only what is to be yielded may be put there."""
-    while True:
-        try:
-            yield received.get(timeout=timeout)
-        except queue.Empty:
-            return
-
-
 def refusal(payload: bytes) -> RefusedError | ServiceError:
-    """Return what to raise for an error reply: ServiceError if it is none, but words of somebody else's."""
+    """Return the error to raise for an error reply; ServiceError if it is not a reply of the service."""
     try:
         error: ErrorReply = boundary.decode(payload, ErrorReply, "not an error reply")
     except RefusedError:

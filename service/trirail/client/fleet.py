@@ -1,4 +1,4 @@
-"""All robots that a user may see at a locator, mostly a router: the newest summary of each, and who needs somebody."""
+"""All robots that a user may see at a locator, mostly a router: their newest summaries, and need for attention."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from trirail.wire.state import RobotSummary
 from trirail.wire.vocabulary import Mode
 
 SILENT: Final = 3.0
-"""A robot from which, or a loop from which its gateway, has heard nothing for so long is silent [s]: a summary comes
-once a second. Liveliness tokens outlive an unclean death, so they are not asked."""
+"""Age of the newest data of a robot's loop from which the robot is silent [s]: a summary arrives once a second.
+
+Liveliness tokens outlive an unclean death, so they are not used.
+"""
 
 
 class Attention(IntEnum):
-    """How much a robot needs somebody, the most first."""
+    """Need of a robot for attention, the greatest first."""
 
     SILENT = 0
     FAULT = 1
@@ -36,21 +38,21 @@ class Member(NamedTuple):
     robot: str
     summary: RobotSummary
     heard: float
-    """When that came, by the monotonic clock here [s]."""
+    """Time of its arrival, by the monotonic clock here [s]."""
 
     def age(self, now: float) -> float:
-        """How old what is known of it is: since its loop has said something [s]."""
+        """Return the time since the last data of its loop [s]."""
         return now - self.heard + self.summary.age
 
     def need(self, now: float) -> Attention:
-        """Whether it needs somebody."""
+        """Return its need for attention."""
         if self.age(now) > SILENT:
             return Attention.SILENT
         return Attention.FAULT if self.summary.mode == Mode.FAULT else Attention.NOTHING
 
 
 class Fleet:
-    """Listens to every robot's summary while the context lasts. Raises ServiceError where nobody answers."""
+    """Subscription to every robot's summary while the context lasts. Raises ServiceError where nobody answers."""
 
     def __init__(
         self,
@@ -73,7 +75,7 @@ class Fleet:
         zenoh_session.close(self._session)
 
     def members(self) -> list[Member]:
-        """Return the robots that have been heard, who needs somebody most first; among equals by name."""
+        """Return the robots with a summary, sorted by need for attention, then by name."""
         now = self._clock()
         with self._lock:
             return sorted(self._members.values(), key=lambda member: (member.need(now), member.robot))
@@ -82,7 +84,7 @@ class Fleet:
         _, robot, *_ = str(sample.key_expr).split("/")
         try:
             summary = boundary.decode(sample.payload.to_bytes(), RobotSummary, "not a summary", str(sample.encoding))
-        except RefusedError:  # nobody but the robot should publish there; what is no summary is not heard
+        except RefusedError:  # only the robot should publish there; ignore anything but summaries
             return
         with self._lock:
             self._members[robot] = Member(robot, summary, self._clock())

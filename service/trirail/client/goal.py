@@ -1,60 +1,78 @@
-"""What a client holds of a goal that the service has accepted: how it goes on, and how it ended."""
+"""Goals that the service has accepted, until their end, and jogs."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import threading
 import uuid
-from collections.abc import Callable
-from typing import Generic, NamedTuple, Self, TypeVar
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from typing import NamedTuple, Self
 
 import msgspec
 
 from trirail.client.outgoing import number, seconds
-from trirail.errors import RefusalCode, RefusedError, TrirailError
+from trirail.errors import RefusalCode, RefusedError, TrirailError, WaitTimeoutError
 from trirail.wire.goals import Goal, Tool, VelocityGoal
-from trirail.wire.messages import GoalReply, Residual
+from trirail.wire.messages import Event, GoalReply, Residual
 from trirail.wire.vocabulary import Command, Stop
 
 STANDS_WITHIN = 10.0
-"""How long the end of a jog may take beyond its own time-out [s]."""
+"""Time that the end of a jog may take beyond its own time-out [s]."""
 LETTING_GO = 0.05
-"""The time-out of a jog's last renewal, whose velocity is zero: it brakes at once [s]."""
+"""Time-out of a jog's last renewal, whose velocity is zero [s]."""
 
 Velocity = tuple[float, float, float]
-"""Of x, y [m/s] and phi [rad/s], in the base frame."""
+"""Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
 
 
 class Result(NamedTuple):
-    """How a goal ended; every goal does, exactly once."""
+    """End of a goal; every goal has exactly one."""
 
     id: str
     outcome: str
-    """done, rejected, preempted, stopped, expired, faulted or unsettled."""
+    """One of done, rejected, preempted, stopped, expired, faulted and unsettled."""
     message: str
-    """One line for people: why."""
+    """Reason, in one line for people."""
     settle: float | None = None
-    """Where it is done: time from the end of its path until the robot was in position, to the first cycle of the dwell
-    [s]. None, as the two below, where it was not to settle: a jog, a goal that was passed on the way to the next, a
-    trajectory with `settle` False."""
+    """Time of a goal that is done from the end of its path until the robot was in position, to the first cycle of the
+    dwell [s]. None, as the two below, for goals that do not settle: a jog, a goal that was passed on the way to the
+    next, a trajectory with `settle` False."""
     residual: Residual | None = None
-    """How far the robot was from the target when it ended, done or unsettled: `sliders` [m], and `pose` [m, m, rad]."""
+    """Distance from the target at its end, done or unsettled: `sliders` [m], and `pose` [m, m, rad]."""
     overshoot: tuple[float, float, float] | None = None
-    """How far the sliders A, B, C were beyond their targets at most since the end of the path [m]."""
+    """Greatest overshoot of the sliders A, B, C since the end of the path [m]."""
 
 
-class AcceptedGoal:
-    """What is known of a goal that the service has accepted. It is the service's from then on."""
+def result_of(event: Event) -> Result | None:
+    """Return the result in an event of a goal's end; None for any other event."""
+    if event.id is None or event.outcome is None:
+        return None
+    return Result(event.id, event.outcome, event.message, event.settle, event.residual, event.overshoot)
 
-    def __init__(self, goal_id: str) -> None:
+
+class AsyncGoalHandle:
+    """A goal that the service has accepted: this object only follows it.
+
+    `command` sends a command with its content: AsyncRobot.command.
+    """
+
+    def __init__(self, goal_id: str, command: Callable[[Command, bytes], Awaitable[object]]) -> None:
         self.id = goal_id
         self.reply = GoalReply(goal_id, 0.0)
-        """What the service said of it."""
+        """Reply of the service."""
+        self._command = command
         self._result: Result | None = None
+        self._ended = asyncio.Event()
+
+    def __repr__(self) -> str:
+        """Return class, id and, once there is one, the outcome."""
+        outcome = f" {self._result.outcome}" if self._result is not None else ""
+        return f"<{type(self).__name__} {self.id}{outcome}>"
 
     @property
     def result(self) -> Result | None:
-        """How it ended, None while it has not."""
+        """Result of the goal; None before its end."""
         return self._result
 
     @property
@@ -65,127 +83,150 @@ class AcceptedGoal:
 
     @property
     def expected(self) -> str:
-        """How long it is expected to take, for people."""
+        """Expected duration, for people."""
         return f"{self.duration:.2f} s" if self.duration is not None else "no expected end while the override is 0"
 
+    async def cancel(self) -> None:
+        """Stop it, under way or waiting for another one; return when the robot is at rest, or it no longer waits.
 
-class GoalHandle(AcceptedGoal):
-    """A goal that the service has accepted: this object only follows it.
-
-    `command` sends a command with its content, as Robot.command does.
-    """
-
-    def __init__(self, goal_id: str, command: Callable[[Command, bytes], object]) -> None:
-        super().__init__(goal_id)
-        self._command = command
-        self._ended = threading.Event()
-
-    def cancel(self) -> None:
-        """Stop it, if it is under way or waits for another one; return when the robot stands, or it waits no more.
-
-        Other goals go on, but those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
-        ServiceError if nobody answers.
+        Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
+        ServiceError if nobody answers. Cancelling a task that waits for it does not stop it.
         """
-        self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
+        await self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
 
-    def wait(self, timeout: float | None = None) -> Result:
+    async def wait(self, timeout: float | None = None) -> Result:
         """Wait for its end, however it ends; look at `outcome` of the result.
 
-        Raises TimeoutError if that takes longer than `timeout` seconds; the goal itself goes on.
+        Raises WaitTimeoutError, a TimeoutError, if that takes longer than `timeout` seconds; the goal itself continues.
         """
         within = seconds(timeout)
-        if not self._ended.wait(within) or self._result is None:
-            raise TimeoutError(f"goal {self.id} has not ended within {within:g} s")
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within):
+                await self._ended.wait()
+        if self._result is None:
+            raise WaitTimeoutError(f"goal {self.id} has not ended within {within:g} s")
         return self._result
 
     def end(self, result: Result) -> None:
-        """Take in how it ended; the connection's own thread does that."""
+        """Set its result, and release the waiting tasks."""
         self._result = result
         self._ended.set()
 
 
-Handle = TypeVar("Handle", bound=AcceptedGoal)
+class OpenGoals:
+    """Handles of the goals that a client has sent and whose end has not been reported yet.
+
+    Calls with one id share one handle: renewals of a jog, and goals that the service refuses because their id has been
+    used. A refusal concerns its own call alone, so a handle is kept while another call with its id is under way or has
+    been accepted.
+    """
+
+    def __init__(self) -> None:
+        self._handles: dict[str, AsyncGoalHandle] = {}
+        self._calls: Counter[str] = Counter()
+        self._accepted: set[str] = set()
+
+    def __len__(self) -> int:
+        return len(self._handles)
+
+    def open(self, handle: AsyncGoalHandle) -> AsyncGoalHandle:
+        """Register a goal that is sent now; return its handle, an earlier one where its id has one."""
+        self._calls[handle.id] += 1
+        return self._handles.setdefault(handle.id, handle)
+
+    def accept(self, handle: AsyncGoalHandle, reply: GoalReply) -> None:
+        """Keep the handle of a goal until its end: the service has accepted it."""
+        handle.reply = reply
+        self._end_call(handle.id)
+        if self._handles.get(handle.id) is handle:  # else it has ended already
+            self._accepted.add(handle.id)
+
+    def refuse(self, goal_id: str) -> bool:
+        """Forget a call that was refused or not answered; return whether its handle is forgotten with it."""
+        self._end_call(goal_id)
+        if goal_id in self._accepted or goal_id in self._calls:
+            return False
+        return self._handles.pop(goal_id, None) is not None
+
+    def end(self, result: Result) -> None:
+        """End the handle of a goal, if it is one of these."""
+        self._accepted.discard(result.id)
+        if (handle := self._handles.pop(result.id, None)) is not None:
+            handle.end(result)
+
+    def _end_call(self, goal_id: str) -> None:
+        self._calls[goal_id] -= 1
+        if self._calls[goal_id] == 0:
+            del self._calls[goal_id]
 
 
-class HeldVelocity(Generic[Handle]):
-    """A jog, whether a thread or a task renews it: what is sent of it, and what the service says."""
+class AsyncJog:
+    """A velocity that is kept alive while the context lasts; `result` is its end afterwards.
 
-    def __init__(self, velocity: Velocity, timeout: float, tool: Tool | None) -> None:
-        self._velocity = velocity
-        self._timeout = number(timeout, "timeout")
-        self._tool = tool
-        self._id = uuid.uuid4().hex[:12]
-        self._goal: Handle | None = None
-        self.error: Exception | None = None
-        """Why it could not be renewed any more."""
-
-    @property
-    def reply(self) -> GoalReply | None:
-        """What the service last said of it, None before it was taken: how much it is `slowed`, for one."""
-        return self._goal.reply if self._goal else None
-
-    @property
-    def result(self) -> Result | None:
-        """How it ended, None while it has not."""
-        return self._goal.result if self._goal else None
-
-    @property
-    def _moves(self) -> bool:
-        return self._goal is not None and self.result is None and self.error is None
-
-    def _message(self, velocity: Velocity, timeout: float) -> Callable[[str], Goal]:
-        return lambda name: VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool)
-
-    def _renewal_failed(self, error: TrirailError) -> None:
-        at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
-        self.error = None if at_limit else error  # at a limit it has ended as it should
-
-
-class Jog(HeldVelocity[GoalHandle]):
-    """A velocity that is kept alive while the context lasts; `result` tells afterwards how it ended.
-
-    It is renewed three times in each time-out, by a thread of its own. A program that hangs or dies renews it no more,
-    and the robot brakes: the time-out is real time, at every override. What has run out or was paused is over; begin
-    a new one. `error` tells whether it could not be renewed. Leaving the context brakes at once and waits for the
-    standstill.
-
-    `velocity` is that of x, y [m/s] and phi [rad/s] in the base frame, of a `tool`, `timeout` in seconds. Entering the
-    context raises RefusedError where the service does not take it, leaving it TimeoutError where no end is heard.
-    `send` sends a goal that it is given the id for, as Robot.send does.
+    A task renews it three times in each time-out; the rest is as for trirail.client.blocking.Jog. `velocity` is that of
+    x, y [m/s] and phi [rad/s] in the base frame, of a `tool`, `timeout` in seconds. `send` sends a goal with an id:
+    AsyncRobot.send.
     """
 
     def __init__(
         self,
-        send: Callable[[Callable[[str], Goal], str], GoalHandle],
+        send: Callable[[Callable[[str], Goal], str], Awaitable[AsyncGoalHandle]],
         velocity: Velocity,
         timeout: float,
         tool: Tool | None = None,
     ) -> None:
-        super().__init__(velocity, timeout, tool)
         self._send_goal = send
-        self._over = threading.Event()
-        self._renewing = threading.Thread(target=self._renew, name="jog", daemon=True)
+        self._velocity = velocity
+        self._timeout = number(timeout, "timeout")
+        self._tool = tool
+        self._id = uuid.uuid4().hex[:12]
+        self._goal: AsyncGoalHandle | None = None
+        self._over = asyncio.Event()
+        self._renewing: asyncio.Task[None] | None = None
+        self.error: Exception | None = None
+        """Error of the last renewal, if it failed."""
 
-    def __enter__(self) -> Self:
-        self._goal = self._send(self._velocity, self._timeout)
-        self._renewing.start()
+    @property
+    def reply(self) -> GoalReply | None:
+        """Latest reply of the service, with `slowed` for one; None before the first."""
+        return self._goal.reply if self._goal else None
+
+    @property
+    def result(self) -> Result | None:
+        """Result of the goal; None before its end."""
+        return self._goal.result if self._goal else None
+
+    async def __aenter__(self) -> Self:
+        self._goal = await self._send(self._velocity, self._timeout)
+        self._renewing = asyncio.create_task(self._renew(), name="jog")
         return self
 
-    def __exit__(self, *_: object) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._over.set()
-        self._renewing.join()
-        if self._goal is not None and self._moves:
-            with contextlib.suppress(TrirailError):  # it has ended, or does by its time-out
-                self._send((0.0, 0.0, 0.0), LETTING_GO)
-            self._goal.wait(self._timeout + STANDS_WITHIN)
+        if self._renewing is not None:
+            await self._renewing  # a renewal that has been sent is not cancelled
+        if self._goal is not None and self.result is None and self.error is None:
+            with contextlib.suppress(TrirailError):  # it has ended, or will by its time-out
+                await self._send((0.0, 0.0, 0.0), LETTING_GO)
+            await self._goal.wait(self._timeout + STANDS_WITHIN)
 
-    def _send(self, velocity: Velocity, timeout: float) -> GoalHandle:
-        return self._send_goal(self._message(velocity, timeout), self._id)
+    async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:
+        return await self._send_goal(
+            lambda name: VelocityGoal(*velocity, timeout=timeout, id=name, tool=self._tool), self._id
+        )
 
-    def _renew(self) -> None:
-        while not self._over.wait(self._timeout / 3.0):
+    async def _renew(self) -> None:
+        while not await self._is_over(self._timeout / 3.0):
             try:
-                self._send(self._velocity, self._timeout)
+                await self._send(self._velocity, self._timeout)
             except TrirailError as error:
-                self._renewal_failed(error)
+                at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
+                self.error = None if at_limit else error  # the end at a limit is regular
                 return
+
+    async def _is_over(self, within: float) -> bool:
+        try:
+            async with asyncio.timeout(within):
+                return await self._over.wait()
+        except TimeoutError:
+            return False

@@ -1,11 +1,11 @@
-"""The lease as a client holds it: taken, kept by signs of life, and given back."""
+"""The lease of a client: taken, kept by signs of life, and released."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import threading
 import uuid
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Self
 
 import msgspec
@@ -16,54 +16,62 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
 SIGNS = 4
-"""Signs of life in each time-out: so many may be lost, but one."""
+"""Signs of life in each time-out: all but one may be lost."""
 
 
-class Lease:
-    """The lease while the context lasts; `lost` tells whether it was taken over, released or came to its end before.
+class AsyncLease:
+    """The lease while the context lasts, as trirail.client.blocking.Lease; a task sends the signs of life.
 
-    Entering raises RefusedError where another holds it, and returns when what others had under way has come to rest.
-    A program that hangs or dies gives no signs of life any more: the robot stops and the lease is free. Leaving gives
-    it back, and returns when the robot stands. `command` sends a command with its content, as Robot.command does.
+    If entering is cancelled no sign follows, and the lease ends by its time-out. `command` sends a command with its
+    content: AsyncRobot.command.
     """
 
-    def __init__(self, command: Callable[[Command, bytes], CommandReply], *, force: bool, timeout: float) -> None:
+    def __init__(
+        self, command: Callable[[Command, bytes], Awaitable[CommandReply]], *, force: bool, timeout: float
+    ) -> None:
         self._command = command
         self._sign = AcquireLease(uuid.uuid4().hex[:12], number(timeout, "timeout"))
         self._force = force
-        self._over = threading.Event()
-        self._keeping = threading.Thread(target=self._keep, name="lease", daemon=True)
+        self._over = asyncio.Event()
+        self._keeping: asyncio.Task[None] | None = None
         self.lost: TrirailError | None = None
-        """Why it is not held any more."""
+        """Error that ended the lease; None while it is held."""
 
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is lost, for so many seconds at most; whether it is."""
-        return self._over.wait(seconds(timeout))
+    async def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it is lost, for `timeout` seconds at most; return whether it is."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds(timeout)):
+                await self._over.wait()
+        return self._over.is_set()
 
-    def __enter__(self) -> Self:
+    async def __aenter__(self) -> Self:
         asked = msgspec.structs.replace(self._sign, force=self._force)
-        reply = self._command(Command.ACQUIRE, msgspec.json.encode(asked))
-        self._keeping.start()
+        reply = await self._command(Command.ACQUIRE, msgspec.json.encode(asked))
+        self._keeping = asyncio.create_task(self._keep(), name="lease")
         if reply.mode == Mode.STOPPING:
             try:
-                self._command(Command.STOP, b"")  # answered when the robot stands
+                await self._command(Command.STOP, b"")  # answered when the robot stands
             except BaseException:
-                self.__exit__()
+                await self.__aexit__()
                 raise
         return self
 
-    def __exit__(self, *_: object) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._over.set()
-        self._keeping.join()
+        if self._keeping is not None:
+            self._keeping.cancel()
+            await asyncio.wait([self._keeping])
         if self.lost is None:
-            with contextlib.suppress(TrirailError):  # nobody answers any more: then it ends by its time-out
-                self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
+            with contextlib.suppress(TrirailError):  # without an answer it ends by its time-out
+                await self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
 
-    def _keep(self) -> None:
+    async def _keep(self) -> None:
         sign = msgspec.json.encode(self._sign)
-        while not self._over.wait(self._sign.timeout / SIGNS):
+        while True:
+            await asyncio.sleep(self._sign.timeout / SIGNS)
             try:
-                self._command(Command.ACQUIRE, sign)
+                await self._command(Command.ACQUIRE, sign)
             except TrirailError as error:
                 self.lost = error
                 self._over.set()
+                return

@@ -1,13 +1,15 @@
-"""A stop by a program that has no session yet: it does not wait for one, which a flooded port may not give."""
+"""A stop by a program without a session: it does not wait for one, which a flooded port may not give."""
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import threading
 from pathlib import Path
 
-from trirail.client.client import identity
+from trirail.client.async_connection import AsyncConnection
 from trirail.client.connection import REPLY_WITHIN, Connection
+from trirail.client.identity import identity
 from trirail.client.stop_call import Outcome, Outcomes, StopOrder
 from trirail.errors import ServiceError, TrirailError
 from trirail.wire.credentials import Credentials
@@ -15,7 +17,7 @@ from trirail.wire.messages import CommandReply
 
 
 class NewStop:
-    """A stop, quick_stop or disable: asked for at the door, while a session opens that asks for it too.
+    """A stop, quick_stop or disable: requested at the door, while a session opens that requests it too.
 
     Raises as Robot does.
     """
@@ -29,11 +31,11 @@ class NewStop:
         at_door = stop.at_door(connect, credentials, self._came.put)
         self._outcomes = Outcomes(1 if at_door is None else 2)
         self.opening = threading.Thread(target=self._query, args=(stop, connect, credentials), daemon=True)
-        """Has a session of its own while it lives. Zenoh cannot be told to give up opening one."""
+        """Thread with its own session. Opening a session cannot be cancelled in Zenoh."""
         self.opening.start()
 
     def wait(self) -> CommandReply:
-        """Return the first answer. Raises RefusedError for a no, ServiceError where nobody answers."""
+        """Return the first answer. Raises RefusedError for a refusal, ServiceError where nobody answers."""
         while (reply := self._outcomes.decide(self._came.get())) is None:
             pass
         return reply
@@ -42,10 +44,15 @@ class NewStop:
         try:
             connection = Connection(stop.robot, connect, credentials)
             try:
-                self._came.put(connection.fetch(stop.parts, CommandReply, stop.content, stop.within, stop.id))
+                self._came.put(asyncio.run(_fetch(connection, stop)))
             finally:
                 connection.close()
         except TrirailError as error:
             self._came.put(error)
-        except Exception as error:  # noqa: BLE001 - whoever waits gets an outcome, whatever it is
+        except Exception as error:  # noqa: BLE001 - the waiting thread gets an outcome in any case
             self._came.put(ServiceError(f"no session at {connect}: {error!r}"))
+
+
+async def _fetch(connection: Connection, stop: StopOrder) -> CommandReply:
+    asking = AsyncConnection(connection)
+    return await asking.fetch(stop.parts, CommandReply, stop.content, stop.within, copy=stop.id)

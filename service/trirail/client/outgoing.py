@@ -1,6 +1,6 @@
-"""What a program hands to a client becomes a message: any library's numbers and arrays, checked as the service does.
+"""Messages from a program's values: numbers and arrays of any library, checked as by the service.
 
-A number is what has `__float__` or `__index__`, as numpy's and fractions have; truth values and texts are none.
+A number has `__float__` or `__index__`, as those of numpy and fractions; truth values and texts are no numbers.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 import threading
 import uuid
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -19,13 +20,15 @@ from msgspec import structs
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, TrajectoryGoal
+from trirail.wire.kinds.trajectory import parts
+from trirail.wire.sizes import MAX_POINTS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Command, CommandContent
 
 
 def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
-    """Return what `make` makes, of a kind, as JSON that the service can read. Raises RefusedError, with `what`."""
+    """Return the message of a kind that `make` returns, as JSON for the service. Raises RefusedError, with `what`."""
     try:
         payload = _ENCODER.encode(make())
     except (TypeError, ValueError, ArithmeticError) as error:
@@ -35,30 +38,59 @@ def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
 
 
 def id_of(goal: Goal | Callable[[str], Goal]) -> str:
-    """Return the id that a goal has, or a new one."""
+    """Return the id of a goal, or a new one."""
     return (goal.id if isinstance(goal, Goal) else None) or uuid.uuid4().hex[:12]
 
 
-def goal_message(make: Goal | Callable[[str], Goal], goal_id: str) -> bytes:
-    """Return a goal with an id, or the one that `make` makes for it, as JSON. RefusedError for one that cannot be."""
-    with_id = (lambda: structs.replace(make, id=goal_id)) if isinstance(make, Goal) else (lambda: make(goal_id))
-    return message(with_id, Goal, "not a goal")
+def goal_message(make: Callable[[str], Goal], goal_id: str) -> bytes:
+    """Return the goal that `make` returns for an id, as JSON. Raises RefusedError for an invalid one."""
+    return message(lambda: make(goal_id), Goal, "not a goal")
+
+
+def goal_messages(make: Goal | Callable[[str], Goal], goal_id: str) -> list[bytes]:
+    """Return a goal with an id, or the one that `make` returns for it, as JSON in as many messages as needed.
+
+    Raises RefusedError for an invalid goal.
+    """
+    try:
+        goal = structs.replace(make, id=goal_id) if isinstance(make, Goal) else make(goal_id)
+        sent = parts(goal) if isinstance(goal, TrajectoryGoal) else [goal]
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise RefusedError(RefusalCode.MALFORMED, f"not a goal: {quoted(str(error))}") from error
+    if isinstance(goal, TrajectoryGoal) and (why := too_many(len(goal.points))):
+        raise RefusedError(RefusalCode.MALFORMED, f"not a goal: points: {why}")
+    return [message(partial(_itself, part), Goal, "not a goal") for part in sent]
+
+
+def _itself(goal: Goal) -> Goal:
+    return goal
+
+
+def too_many(number: int) -> str:
+    """Return why a trajectory with this number of points cannot be sent, and what to do; "" where it can."""
+    if number <= MAX_POINTS:
+        return ""
+    step = -(-number // MAX_POINTS)
+    return (
+        f"{number} points, a trajectory has {MAX_POINTS} at most: take every {step}th and the last, since paths are "
+        "quintic between points, or send parts that each end at rest"
+    )
 
 
 def content_message(name: str, content: CommandContent | bytes | None) -> bytes | None:
-    """Return what a command carries, as JSON; None for nothing. Raises RefusedError for what it cannot."""
+    """Return the content of a command as JSON; None without content. Raises RefusedError for a wrong type."""
     if content is None or isinstance(content, bytes):
         return content
     return made_content(Command(name), lambda: content)
 
 
 def made_content(command: Command, make: Callable[[], CommandContent]) -> bytes:
-    """Return what a command carries, as JSON, once it can be made. Raises RefusedError for what it cannot."""
+    """Return the content of a command that `make` returns, as JSON. Raises RefusedError for an invalid one."""
     return message(make, command.accepts, f"not for {command}")
 
 
 def number(value: object, what: str) -> float:
-    """Return a number as Python's own. Raises RefusedError, with `what` it is."""
+    """Return a number as a Python float. Raises RefusedError, with `what` as its name."""
     try:
         plain = value if isinstance(value, bool) else _plain(value)
         if isinstance(plain, (int, float)) and not isinstance(plain, bool):
@@ -69,7 +101,7 @@ def number(value: object, what: str) -> float:
 
 
 def seconds(value: object) -> float | None:
-    """Return a time-out [s], None for none and for one that is longer than can be waited. Raises RefusedError."""
+    """Return a time-out [s]; None for none, and for one beyond threading.TIMEOUT_MAX. Raises RefusedError."""
     if value is None or (isinstance(value, float) and value == math.inf):
         return None
     wait = number(value, "timeout")
@@ -79,8 +111,8 @@ def seconds(value: object) -> float | None:
 
 
 def _plain(value: Any) -> Any:
-    """Return what a message has for it. Raises TypeError where it has nothing, ValueError for no finite one."""
-    numpy = sys.modules.get("numpy")  # who hands over its numbers has imported it
+    """Return a value as a message's type. Raises TypeError where there is none, ValueError if it is not finite."""
+    numpy = sys.modules.get("numpy")  # a program with numbers of numpy has imported it
     if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
         if value.dtype.kind == "f" and not numpy.isfinite(value).all():
             raise ValueError(f"{value!r} is not finite")

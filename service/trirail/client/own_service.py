@@ -1,4 +1,4 @@
-"""A service in a process of its own, for programs that bring theirs along: started, waited for, and ended."""
+"""A service in its own process, for programs with their own service: started, waited for, and ended."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ PATIENT = {
     "heartbeat": "1.0",
     "gateway_timeout": "1.0",
 }
-"""Keys of a configuration with which nobody gives up on a process that a busy machine keeps waiting for a second."""
+"""Keys of a configuration that tolerates processes stalled for a second by a busy machine."""
 START_WITHIN = 300.0
-"""How long it may take to come up, or at the very first start to compile a function [s]."""
+"""Time-out of the start, or, at the very first start, of the compilation of one function [s]."""
 END_WITHIN = 20.0
-"""How long it may take to stop the robot and end [s]."""
+"""Time-out for stopping the robot and ending [s]."""
 
 Process = subprocess.Popen[bytes]
 
 
 @contextlib.contextmanager
 def service(config: Path, recording: Path, report_start: Callable[[str], None] = lambda _: None) -> Iterator[Process]:
-    """Run a service of a configuration file that is up, and records to a file; end it when the context ends.
+    """Run a service with a configuration file, which records to a file; end it when the context ends.
 
-    `report_start` is called with what it says of its start: how far the very first one's compiling is.
+    The context begins when the service is up. `report_start` gets its messages about the start: the progress of
+    compilation at the very first one.
 
-    Raises ServiceError if it cannot start. Where the context ends with an error that is no refusal, what the service
-    said goes to standard error first.
+    Raises ServiceError if it cannot start. If the context ends with an error that is no refusal, the service's output
+    is first written to standard error.
     """
     with tempfile.TemporaryFile() as log:
         process = None
@@ -50,7 +51,7 @@ def service(config: Path, recording: Path, report_start: Callable[[str], None] =
             process = start(config, log, "--record", str(recording), report_start=report_start)
             yield process
         except RefusedError:
-            raise  # it works, and has said why not
+            raise  # the service works, and has given the reason
         except TrirailError:
             log.seek(0)
             sys.stderr.write(log.read().decode())
@@ -67,11 +68,11 @@ def start(
     report_start: Callable[[str], None] = lambda _: None,
     **environment: str,
 ) -> Process:
-    """Start a service, and wait until it is up; the caller has to `end` it.
+    """Start a service, and wait until it is up; the caller must `end` it.
 
-    `arguments` are more of `trirail run`, `environment` more variables; what it says goes to `log`. It is up when it
-    says so, as to systemd: asking on its port instead could find another service, and move that. Raises ServiceError
-    if it ends before it is up, or nothing goes on for START_WITHIN seconds; then it has been ended.
+    `arguments` are added to `trirail run`, `environment` to the variables; its output is written to `log`. It is up
+    when it reports so, as to systemd: a query on its port could find another service, and move that. Raises
+    ServiceError if it ends before it is up, or makes no progress for START_WITHIN seconds; then it has been ended.
     """
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
         ready.bind(f"{folder}/ready")
@@ -92,7 +93,7 @@ def start(
 
 
 def end(process: Process) -> int:
-    """Tell a service to stop the robot and end, and return its exit code: 0 where it did so in order.
+    """Have a service stop the robot and end; return its exit code: 0 for a regular end.
 
     Raises subprocess.TimeoutExpired if it has not ended within END_WITHIN seconds.
     """
@@ -101,9 +102,9 @@ def end(process: Process) -> int:
 
 
 def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
-    """Write the configuration of the simulated robot for a service that nobody else can reach, nor see without a port.
+    """Write the simulated robot's configuration for a service that nobody else can reach, nor see without a port.
 
-    It goes on where a busy machine stalls it for a second, since only simulated sliders move. Returns the file, in
+    It tolerates stalls of a second by a busy machine, since only simulated sliders move. Returns the file, in
     `folder`, and the locator to connect to.
     """
     locator = f"unixsock-stream/{folder}/zenoh"

@@ -1,4 +1,4 @@
-"""A robot where it stands, as a line of text and as HTML with a drawing, for notebooks."""
+"""State of a robot as a line of text, and as HTML with a drawing, for notebooks."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from trirail.workspace import part_positions
 from trirail.workspace.part_positions import RobotParts
 
 WIDTH = 360
-"""Of the drawing [px]."""
+"""Width of the drawing [px]."""
 MARGIN = 0.08
-"""Around it, as a share of the robot's size."""
+"""Margin around the drawing, as a share of the robot's size."""
 LINE, THICK = 0.005, 0.02
-"""How wide lines are drawn, likewise."""
+"""Widths of lines, as shares of the robot's size."""
 
 
 def line(name: str, state: State) -> str:
-    """Say where a robot is and what it does, in one line."""
+    """Return mode, goal, fault and pose of a robot in one line."""
     goal = f" to {state.goal.id}" if state.goal is not None else ""
     fault = f": {state.faults[0]}" if state.faults else ""
     return f"<Robot {name}: {state.mode}{goal}{fault}, {_pose(state.pose)}>"
 
 
 def html(info: Info, state: State) -> str:
-    """Return the same with a drawing of rails, sliders and platform: that commanded is pale."""
+    """Return the state with a drawing of rails, sliders and platform; the commanded platform is pale."""
     robot = ShownRobot.of_info(info)
     mode = palette.code(next(colour for mode, colour in palette.MODES.items() if str(mode) == state.mode))
     goal = f" to <b>{escape(state.goal.id)}</b>" if state.goal is not None else ""
@@ -46,28 +46,30 @@ def html(info: Info, state: State) -> str:
 
 def drawing(robot: ShownRobot, state: State) -> str:
     """Return the robot at a state as an SVG picture, x to the right and y upwards."""
-    parts = RobotParts.of(robot.geometry, robot.limits.slider)
-    placed = part_positions.placed(parts.outline, state.pose)
+    parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
+    placed = part_positions.transform_lines(parts.outline, state.pose)
     everything = np.concatenate([parts.bounds, *placed])
     (left, bottom), (right, top) = everything.min(axis=0), everything.max(axis=0)
     size = max(right - left, top - bottom)
     edge, thin = MARGIN * size, LINE * size
     width, height = right - left + 2.0 * edge, top - bottom + 2.0 * edge
     pose = np.array([state.pose])
-    carriages = part_positions.sliders(robot.geometry, np.array([state.sliders.position]))
-    slides = part_positions.cross_slides(robot.geometry, parts, carriages, pose[:, 2])[0]
-    held = part_positions.pivots(robot.geometry, carriages, pose)[0]
+    carriages = part_positions.slider_points(robot.geometry, np.array([state.sliders.position]))
+    slides = part_positions.cross_slide_lines(robot.geometry, parts, carriages, pose[:, 2])[0]
+    held = part_positions.pivot_points(robot.geometry, carriages, pose)[0]
     colours = palette.SLIDERS
     shapes = [
         *_lines(parts.rails, [palette.FRAME] * 3, 2.0 * thin),
         *_lines(parts.travel, colours, thin),
         *_lines(parts.stops, [palette.LIMIT] * 6, thin),
         *_lines(
-            part_positions.placed(parts.outline, state.commanded.pose), [palette.COMMANDED] * len(placed), 4.0 * thin
+            part_positions.transform_lines(parts.outline, state.commanded.pose),
+            [palette.COMMANDED] * len(placed),
+            4.0 * thin,
         ),
         *_lines(list(slides), colours, THICK * size),
         *_lines(placed, [palette.ARMS] * len(placed), 2.0 * thin),
-        *_lines(part_positions.placed(parts.arms, state.pose), [palette.ARMS] * 3, thin),
+        *_lines(part_positions.transform_lines(parts.arms, state.pose), [palette.ARMS] * 3, thin),
         *(_disc(at, THICK * size, colour) for at, colour in zip(carriages[0], colours, strict=True)),
         *(_disc(at, 1.5 * thin, palette.PIN) for at in held),
         _disc(state.pose[:2], 2.5 * thin, palette.CENTRE),

@@ -1,4 +1,4 @@
-"""What a client hears of what is published: what is no message is skipped, counted, and said once."""
+"""Reading of published samples by a client: invalid ones are skipped, counted, and reported once."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _LOG = logging.getLogger("trirail")
 
 
 class SampleReader:
-    """Reads samples for one client: makes callbacks of Zenoh's, each for one kind of content.
+    """Reader of samples for one client, by Zenoh's callbacks, each for one kind of content.
 
-    Anybody on the network may publish anything on any key: no content raises, in whichever thread it is read.
+    Anybody on the network may publish anything on any key: no content raises an error, in any thread.
     """
 
     def __init__(self) -> None:
         self.skipped = 0
-        """Samples that were no messages."""
+        """Number of samples that were not valid messages."""
 
     def messages(self, kind: type[T], deliver: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return what decodes messages of a `kind`, JSON or msgpack by their encoding, and hands them to `deliver`.
+        """Return a callback that decodes messages of a `kind`, JSON or msgpack by their encoding, for `deliver`.
 
-        That is called at once and in the connection's own thread: it must be quick.
+        `deliver` is called directly in the connection's own thread: it must be quick.
         """
 
         def read(sample: zenoh.Sample) -> T:
@@ -41,7 +41,7 @@ class SampleReader:
         return self._handler(read, deliver)
 
     def batches(self, deliver: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return what hands over batches of records, likewise: whole ones, packed as wire.records has them."""
+        """Return a callback that delivers whole batches of records, packed as in wire.records, in the same way."""
         from trirail.wire import records  # with numpy, which most commands do without
 
         return self._handler(lambda sample: records.checked(sample.payload.to_bytes()), deliver)
@@ -57,7 +57,7 @@ class SampleReader:
             else:
                 deliver(content)
 
-        # Not indirect: that would be a thread of Zenoh's that keeps Python from ending.
+        # Not indirect: that would start a thread of Zenoh that keeps Python from ending.
         return zenoh.handlers.Callback(on_sample, indirect=False)
 
     def _skip(self, key: str, refusal: RefusedError) -> None:

@@ -1,6 +1,6 @@
-"""Where a stage really stands that is not as its service believes: built otherwise, and with play in its drives.
+"""True pose of a stage that differs from its service's model, in its geometry and by backlash in its drives.
 
-For simulated cameras: it takes the records that a service publishes, and has from them what its encoders measured.
+For simulated cameras: it takes the encoders' measurements from the records that a service publishes.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from trirail.kinematics.robot import forward
 from trirail.wire.records import unpack
 
 HISTORY = 5000
-"""Cycles that are kept."""
+"""Number of cycles that are kept."""
 COMES_WITHIN = 2.0
-"""How long the records of a time may take until they are there [s]."""
+"""Time-out of the arrival of a time's records [s]."""
 
 
 def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, angles: float) -> Geometry:
-    """Return a robot whose legs differ from those given by up to so much in each coordinate [m] and angle [rad]."""
+    """Return a robot whose legs differ at random by up to `places` [m] per coordinate and `angles` [rad] per angle."""
 
     def near(place: tuple[float, float]) -> tuple[float, float]:
         x, y = (np.array(place) + rng.uniform(-places, places, 2)).tolist()
@@ -44,10 +44,11 @@ def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, an
 
 
 class StageAsBuilt:
-    """The sliders and the table of a robot, from its records: `robot.records(stage.add_records)`.
+    """Sliders and table of a robot, from its records: `robot.records(stage.add_records)`.
 
-    `built` is the geometry of the stage itself, with its own errors as a correction; `play` is how far each motor turns
-    before its slider goes along, where it turns back [m]. Motors begin in the middle of it.
+    `built` is the geometry of the stage itself, with its own errors as a correction; `play` is the backlash of each
+    slider [m]: the distance that its motor moves after a reversal before the slider follows. Motors begin in its
+    middle.
     """
 
     def __init__(self, built: Geometry, play: Triple = (0.0, 0.0, 0.0)) -> None:
@@ -70,9 +71,9 @@ class StageAsBuilt:
             self._changed.notify_all()
 
     def sliders_at(self, time: float) -> Triple:
-        """Return where the sliders were at a time of the monotonic clock [s], between two cycles in a straight line.
+        """Return the positions of the sliders [m] at a time of the monotonic clock [s], linear between two cycles.
 
-        In metres. It waits for records of then. Raises ServiceError where none come, or those are not kept any more.
+        It waits for records of that time. Raises ServiceError where none arrive, or they are no longer kept.
         """
         with self._changed:
             if not self._changed.wait_for(lambda: self._cycles and self._cycles[-1][0] >= time, COMES_WITHIN):
@@ -88,6 +89,6 @@ class StageAsBuilt:
         return a, b, c
 
     def pose_at(self, time: float) -> Triple:
-        """Return where the table was then: x, y [m], phi [rad]. Raises ServiceError, and KinematicsError for none."""
+        """Return the table's pose at a time: x, y [m], phi [rad]. Raises ServiceError, KinematicsError for no pose."""
         x, y, phi = forward(self._built, self.sliders_at(time)).tolist()
         return x, y, phi

@@ -1,7 +1,7 @@
-"""A stop asked for in two ways at once: at the service's door for stops, and over Zenoh. The first answer counts.
+"""A stop requested in two ways in parallel: at the service's door for stops, and over Zenoh. The first answer counts.
 
-Both copies have one id, by which the service carries them out once. The door is asked by a thread of its own, again
-and again where it lets the caller go unheard, as one under attack may.
+Both copies have one id, by which the service carries them out once. A separate thread asks at the door, repeatedly if
+the door closes the connection without reading, as one under attack may.
 """
 
 from __future__ import annotations
@@ -25,43 +25,43 @@ from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
 
 HEARD_WITHIN: Final = 2.0
-"""How long the door may take to let one in before it is tried anew [s]."""
+"""Time-out of the connection to the door before another attempt [s]."""
 AGAIN_AFTER: Final = 0.05
-"""Between two tries [s]."""
+"""Delay between two attempts [s]."""
 
 Outcome = CommandReply | TrirailError
 
 
 class NoDoorError(ServiceError):
-    """Nobody has answered at the door for stops."""
+    """Error that nobody has answered at the door for stops."""
 
 
 class StopOrder(NamedTuple):
-    """A stop, quick_stop or disable, of which each copy says the same."""
+    """A stop, quick_stop or disable, with the content of each copy."""
 
     robot: str
     user: str
     name: str
     content: bytes | None
     within: float
-    """How long it may take to be carried out [s]."""
+    """Time-out for carrying it out [s]."""
     id: str
-    """By which the service knows the copies for one."""
+    """Id that its copies share, so that the service carries it out once."""
 
     @classmethod
     def of(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> StopOrder:
-        """Return one with an id of its own."""
+        """Return a stop with a new id."""
         return cls(robot, user, name, content, within, uuid.uuid4().hex)
 
     @property
     def parts(self) -> tuple[str, str, str]:
-        """Of its key over Zenoh."""
+        """Parts of its key over Zenoh."""
         return "cmd", self.user, self.name
 
     def at_door(
         self, locator: str, credentials: Credentials | None, deliver: Callable[[Outcome], None]
     ) -> StopCall | None:
-        """Ask at the door beside a locator, and have the outcome taken; None where there is no door."""
+        """Request it at the door beside a locator, and deliver the outcome; return None where there is no door."""
         address = stop_address(locator)
         content = (self.content or b"").decode()
         line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
@@ -71,16 +71,16 @@ class StopOrder(NamedTuple):
 
 
 class Outcomes:
-    """What has come of so many copies of a stop, until that decides."""
+    """Outcomes of the copies of a stop, until they decide."""
 
     def __init__(self, copies: int) -> None:
         self._copies = copies
         self._errors: list[TrirailError] = []
 
     def decide(self, outcome: Outcome) -> CommandReply | None:
-        """Return the reply, None while another copy may have one. Raises RefusedError, ServiceError for what remains.
+        """Return the reply; None while another copy may have one. Raises RefusedError or ServiceError without a reply.
 
-        That one way is full is no answer of the robot's while the other may not be.
+        A refusal as busy is not the robot's answer while another copy may have one.
         """
         if isinstance(outcome, CommandReply):
             return outcome
@@ -113,11 +113,11 @@ class StopCall:
         self._thread.start()
 
     def join(self) -> None:
-        """Wait until its outcome has been taken."""
+        """Wait until its outcome has been delivered."""
         self._thread.join()
 
     def cancel(self) -> None:
-        """Try no more: nobody waits for it."""
+        """Stop trying: nobody waits for it."""
         self._cancelled.set()
 
     def _run(self) -> None:
@@ -125,11 +125,11 @@ class StopCall:
             self._deliver(self._query_until_answered())
         except TrirailError as error:
             self._deliver(error)
-        except Exception as error:  # noqa: BLE001 - whoever waits gets an outcome, whatever it is
+        except Exception as error:  # noqa: BLE001 - the caller gets an outcome in any case
             self._deliver(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
 
     def _query_until_answered(self) -> CommandReply:
-        """Ask until there is an answer. Raises RefusedError where that is a no, ServiceError where none comes."""
+        """Ask until there is an answer. Raises RefusedError for a refusal, ServiceError where none arrives."""
         secured = tls.client(self._credentials) if self._address.secured and self._credentials is not None else None
         why: OSError | None = None
         while (left := self._deadline - time.monotonic()) > 0.0 and not self._cancelled.is_set():
@@ -142,7 +142,7 @@ class StopCall:
                 ssl.SSLEOFError,
                 ssl.SSLZeroReturnError,
             ) as error:
-                why = error  # it has let us go before it heard us
+                why = error  # it closed the connection before reading the request
             except OSError as error:
                 raise NoDoorError(f"nobody takes stops at {self._address}: {error}") from error
             self._cancelled.wait(AGAIN_AFTER)
@@ -179,7 +179,7 @@ def _connect(address: StopAddress, within: float) -> socket.socket:
 
 
 def _read(line: bytes) -> CommandReply:
-    """Return the reply of an answer's line. Raises RefusedError for a refusal, NoDoorError for what is no answer."""
+    """Return the reply in an answer's line. Raises RefusedError for a refusal, NoDoorError for an invalid answer."""
     try:
         answer = decoded(line, StopAnswer)
     except (msgspec.MsgspecError, ValueError) as error:

@@ -13,7 +13,7 @@ from msgspec import structs
 from trirail_drivers import files
 
 from trirail.client.goal import Result
-from trirail.client.outgoing import number
+from trirail.client.outgoing import number, too_many
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.decoding import decoded, prepare
 from trirail.wire.goals import PoseGoal, TrajectoryPoint
@@ -24,26 +24,29 @@ COLUMNS = ("t", "x", "y", "phi")
 Points = str | os.PathLike[str] | Iterable[TrajectoryPoint | Iterable[float]]
 MEANT = "TrajectoryPoints, rows of t [s], x, y [m], phi [rad], as an array (N, 4), or the path of a CSV or JSON file"
 FEWEST = 2
-"""Points of a trajectory: the first is where the robot stands."""
+"""Least number of points of a trajectory: the first is the robot's pose."""
 prepare(list[TrajectoryPoint])
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
 
 
 def points_of(given: Points) -> tuple[TrajectoryPoint, ...]:
-    """Return the points that a program means: points, rows of t [s], x, y [m], phi [rad], or the path of a file.
+    """Return the points of a trajectory, given as points, rows of t [s], x, y [m], phi [rad], or the path of a file.
 
-    Raises TrirailError where none of it can be meant.
+    Raises TrirailError for anything else.
     """
     if isinstance(given, str | os.PathLike):
         return tuple(read(Path(given)))
     try:
-        return tuple(itertools.starmap(_point_of, enumerate(given)))
+        points = tuple(itertools.starmap(_point_of, enumerate(given)))
     except TypeError as error:
         raise RefusedError(RefusalCode.MALFORMED, f"points: {quoted(repr(given))} is none of these: {MEANT}") from error
+    if why := too_many(len(points)):
+        raise RefusedError(RefusalCode.MALFORMED, f"points: {why}")
+    return points
 
 
 def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint:
-    """Return a point, or that of a row. Raises TypeError for what is no row, RefusedError for one of other things."""
+    """Return a point, or that of a row. Raises TypeError if it is no row, RefusedError for a row of other values."""
     if isinstance(row, TrajectoryPoint):  # its goal computes with its time
         return row if isinstance(row.t, float) else structs.replace(row, t=number(row.t, f"points: t of point {n}"))
     values = [] if isinstance(row, str | bytes | Mapping) else list(row)
@@ -55,7 +58,7 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
 
 
 def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
-    """Return what makes the goal that leads to where a trajectory begins, by its id."""
+    """Return a function of an id that returns the goal to the first pose of a trajectory."""
     if not points:
         raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; wanted are {MEANT}")
     x, y, phi = points[0].x, points[0].y, points[0].phi
@@ -70,16 +73,18 @@ def check_arrived(result: Result) -> None:
 
 
 def read(path: Path) -> list[TrajectoryPoint]:
-    """Read the points of a trajectory. Raises TrirailError with file, line and what would be right."""
+    """Read the points of a trajectory. Raises TrirailError with file, line and the expected value."""
     return parse(path, files.text(path))
 
 
 def parse(name: Path | str, text: str) -> list[TrajectoryPoint]:
-    """Return the points that are in a file of a name, .json or any other for CSV. Raises as read."""
+    """Return the points in the text of a file named .json, or otherwise for CSV. Raises TrirailError as `read`."""
     path = Path(name)
     points = _points(path, text)
     if len(points) < FEWEST:
         raise TrirailError(f"{path}: {'one point' if points else 'no points'}: a trajectory has {FEWEST} at least")
+    if why := too_many(len(points)):
+        raise TrirailError(f"{path}: {why}")
     return points
 
 

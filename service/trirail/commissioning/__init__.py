@@ -1,1 +1,1 @@
-"""The first hour with real drives: one at a time, slowly, each step judged, and the configuration that comes of it."""
+"""Commissioning of real drives: one drive at a time, slowly, each step judged, and a corrected configuration."""

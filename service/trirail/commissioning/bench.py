@@ -1,4 +1,4 @@
-"""The three drives under a guide's hands: a cycle that never ends, power for one drive alone, and what stops it."""
+"""Drive cycle of a commissioning: power for one drive alone, slow motions, and the conditions that stop everything."""
 
 from __future__ import annotations
 
@@ -14,60 +14,61 @@ from trirail.commissioning.moves import SlowMove
 from trirail.config import Config
 from trirail.kinematics.arrays import Array
 
-FOLLOWING: Final = 0.0003
-"""How far a powered slider may be from its setpoint before everything is stopped [m]: at 5 mm/s a drive without
-velocity feed-forward and with a position loop of 20 /s lags 0.25 mm."""
-SETTLE: Final = 0.3
-"""How long a slider is given to come to rest after a motion [s]."""
+MAX_FOLLOWING_ERROR_M: Final = 0.0003
+"""Following error of a powered slider that stops all drives [m]: at 5 mm/s a drive without velocity feed-forward and
+with a position loop of 20 /s lags 0.25 mm."""
+SETTLE_TIME_S: Final = 0.3
+"""Time for a slider to settle after a motion [s]."""
 INTERRUPTED: Final = "stopped by Ctrl-C"
-LAST_WORDS: Final = 0.05
-"""How long drives that missed the same heartbeat may take to tell of it, one after the other [s]."""
-REST: Final = 0.05
-"""How long a slider is looked at before it gets power [s]."""
-RESET: Final = 1.0
-"""How long a fault is given to be gone after a reset [s]."""
-DELAY: Final = 2
-"""SYNCs from writing a setpoint until a position is sampled that answers it: one takes it up, the next samples."""
+FAULT_WINDOW_S: Final = 0.05
+"""Time within which drives that missed the same heartbeat all report it [s]."""
+REST_CHECK_S: Final = 0.05
+"""Time for which the sliders are observed before power is applied [s]."""
+RESET_TIMEOUT_S: Final = 1.0
+"""Time for a fault to clear after a reset [s]."""
+FEEDBACK_DELAY_CYCLES: Final = 2
+"""SYNCs from writing a setpoint to the position that answers it: one applies the setpoint, the next samples."""
 
-_POWERED: Final = (
+_HISTORY_CYCLES: Final = FEEDBACK_DELAY_CYCLES + 8
+_POWERED_STATES: Final = (
     PowerState.SWITCHED_ON,
     PowerState.OPERATION_ENABLED,
     PowerState.QUICK_STOP_ACTIVE,
     PowerState.FAULT_REACTION_ACTIVE,
 )
-_OF_ITS_OWN: Final = ("emcy", "fault", "state")
-"""Causes of faults that a drive has told of, rather than that it was not heard."""
-_STILL: Final = (0.0, 0.0, 0.0)
+_DRIVE_REPORTED_CAUSES: Final = ("emcy", "fault", "state")
+"""Fault causes that the drive itself reported; the others are missing messages."""
+_ZERO_VELOCITY: Final = (0.0, 0.0, 0.0)
 
 
-class Stopped(Exception):
-    """The drives were stopped, and are without power now; the text says why."""
+class DrivesStoppedError(Exception):
+    """All drives were stopped and have no power; the text gives the reason."""
 
 
-class Travelled(NamedTuple):
-    """What the drives said of a motion."""
+class MeasuredMotion(NamedTuple):
+    """Feedback of the drives during a motion."""
 
-    measured: Array
-    """Positions, a row for each cycle, (N, 3) [m]."""
+    position: Array
+    """Measured slider positions, one row per cycle, (N, 3) [m]."""
     following_error: tuple[float, float, float]
-    """The greatest of each slider [m]."""
+    """Maximum following error of each slider [m]."""
 
 
-class Silence(NamedTuple):
-    """What a powered drive did while it heard no SYNC."""
+class WatchdogReaction(NamedTuple):
+    """Reaction of a powered drive to missing SYNCs and heartbeats."""
 
     seconds: float | None
-    """When it let go by itself [s]; None where it did not."""
-    by: str
-    """The drive that spoke, "" where none did."""
-    said: str
-    """What it said of it, "" where it said nothing."""
+    """Time until the drive switched its power off [s]; None if it did not."""
+    drive: str
+    """Drive that reported the loss, "" if none did."""
+    message: str
+    """Message of that drive, "" if there was none."""
     code: int = 0
-    """The code that it said, as of an EMCY; 0 for none."""
+    """EMCY error code; 0 for none."""
 
 
 class Bench:
-    """Turns the drives' cycle. Whatever is wrong while a drive has power stops all of them in that same cycle."""
+    """Runs the drives' cycle. Any problem while a drive has power stops all drives in the same cycle."""
 
     def __init__(
         self,
@@ -76,34 +77,44 @@ class Bench:
         tick: Callable[[], int],
         interrupted: Callable[[], bool],
     ) -> None:
-        """`tick` waits for the next cycle and returns how many were missed; `interrupted` tells of Ctrl-C.
+        """Take over configured drives.
 
-        The drives have been configured.
+        Parameters
+        ----------
+        tick
+            Waits for the next cycle and returns the number of cycles missed.
+        interrupted
+            True once Ctrl-C was pressed.
         """
         self.config = config
         self.period = config.period
         self._labels = config.geometry.labels
-        self.missed = 0
+        self.missed_cycles = 0
         """Cycles missed while a drive had power."""
-        self.worst = [0.0, 0.0, 0.0]
-        """The greatest following errors since power was given [m]."""
+        self.max_errors = [0.0, 0.0, 0.0]
+        """Maximum following errors since power was applied [m]."""
         self._drives = drives
         self._tick = tick
         self._interrupted = interrupted
         self._powered: tuple[int, ...] = ()
         self._target = [0.0, 0.0, 0.0]
-        self._written: deque[tuple[float, ...]] = deque(maxlen=DELAY + 8)
+        self._setpoints: deque[tuple[float, ...]] = deque(maxlen=_HISTORY_CYCLES)
         self.feedback = drives.read()
 
     @property
     def position(self) -> Triple:
-        """Where the drives say that the sliders are [m]."""
+        """Measured slider positions [m]."""
         return self.feedback.position
 
-    def cycle(self, rates: Triple = _STILL) -> Feedback:
-        """Turn one cycle; powered drives are held at their targets, of velocities `rates` [m/s].
+    def cycle(self, rates: Triple = _ZERO_VELOCITY) -> Feedback:
+        """Run one cycle; hold powered drives at their targets, with target velocities `rates` [m/s].
 
-        Raises Stopped; KeyboardInterrupt, once nothing has power, where that was asked for.
+        Raises
+        ------
+        DrivesStoppedError
+            On any problem while a drive has power.
+        KeyboardInterrupt
+            On Ctrl-C, once no drive has power.
         """
         missed = self._tick()
         self._drives.sync()
@@ -111,39 +122,46 @@ class Bench:
         if not self._powered:
             if self._interrupted():
                 raise KeyboardInterrupt
-            self._drives.write(feedback.position, _STILL)
+            self._drives.write(feedback.position, _ZERO_VELOCITY)
             return feedback
-        self.missed += missed
-        if reason := self._wrong(feedback, missed):
-            self._halt(reason)
-        for index, place in enumerate(feedback.position):
+        self.missed_cycles += missed
+        if reason := self._check(feedback, missed):
+            self._stop_and_raise(reason)
+        for index, position in enumerate(feedback.position):
+            # The target of a drive that does not follow yet is its own position: enabling must not make it jump.
             if index not in self._powered or not feedback.follows[index]:
-                self._target[index] = place
+                self._target[index] = position
         a, b, c = self._target
         self._drives.write((a, b, c), rates)
-        self._written.append((a, b, c))
+        self._setpoints.append((a, b, c))
         return feedback
 
     def wait(self, seconds: float) -> Feedback:
-        """Turn cycles for so long [s]."""
+        """Run cycles for `seconds` [s]."""
         for _ in range(max(1, round(seconds / self.period))):
             self.cycle()
         return self.feedback
 
     @contextmanager
     def power(self, alone: str | None = None) -> Iterator[None]:
-        """Give all drives power, or one `alone`, and take it off at the end. Raises Stopped where they get none."""
-        self.clear()
+        """Enable all drives, or the one named `alone`, and disable them at the end.
+
+        Raises
+        ------
+        DrivesStoppedError
+            If a slider moves before, or a drive is not enabled within `watchdogs.enable_timeout`.
+        """
+        self.clear_fault()
         before = self.feedback.position
-        for name, was, now in zip(self._labels, before, self.wait(REST).position, strict=True):
-            if abs(now - was) > FOLLOWING / 3.0:
-                raise Stopped(
-                    f"slider {name} is not at rest: it went {(now - was) * 1e3:.3f} mm by itself, or by a hand"
+        for name, was, now in zip(self._labels, before, self.wait(REST_CHECK_S).position, strict=True):
+            if abs(now - was) > MAX_FOLLOWING_ERROR_M / 3.0:
+                raise DrivesStoppedError(
+                    f"slider {name}: moved {(now - was) * 1e3:.3f} mm without power; keep hands off and try again"
                 )
         self._powered = tuple(range(len(NAMES))) if alone is None else (NAMES.index(alone),)
         self._target = list(self.feedback.position)
-        self._written.extend([self.feedback.position] * (DELAY + 8))
-        self.worst = [0.0, 0.0, 0.0]
+        self._setpoints.extend([self.feedback.position] * _HISTORY_CYCLES)
+        self.max_errors = [0.0, 0.0, 0.0]
         self._drives.enable(alone)
         try:
             for _ in range(round(self.config.watchdogs.enable_timeout / self.period)):
@@ -152,7 +170,7 @@ class Bench:
             else:
                 states = ", ".join(f"{NAMES[index]} {self.feedback.state[index]}" for index in self._powered)
                 timeout = self.config.watchdogs.enable_timeout
-                self._halt(f"no power within watchdogs.enable_timeout = {timeout:g} s: {states}")
+                self._stop_and_raise(f"no power within watchdogs.enable_timeout = {timeout:g} s: {states}")
             yield
         except BaseException:
             if self._powered:
@@ -161,80 +179,79 @@ class Bench:
         if not self._powered:
             return
         self._drives.disable()
-        self._until_off()
+        self._wait_without_power()
         if (fault := self.feedback.fault) is not None:
-            raise Stopped(fault.message)
+            raise DrivesStoppedError(fault.message)
 
-    def play(self, way: SlowMove) -> Travelled:
-        """Move powered sliders along a way from where they are held, and let them settle."""
-        begin = tuple(self._target)
+    def play(self, move: SlowMove) -> MeasuredMotion:
+        """Move the powered sliders from their targets along `move`, and let them settle."""
+        start = tuple(self._target)
         measured = []
-        for offset, rate in zip(way.position.tolist(), way.velocity.tolist(), strict=True):
-            self._target = [place + by for place, by in zip(begin, offset, strict=True)]
+        for offset, rate in zip(move.position.tolist(), move.velocity.tolist(), strict=True):
+            self._target = [position + by for position, by in zip(start, offset, strict=True)]
             a, b, c = rate
             measured.append(self.cycle((a, b, c)).position)
-        measured += [self.cycle().position for _ in range(round(SETTLE / self.period))]
-        a, b, c = self.worst
-        return Travelled(np.array(measured), (a, b, c))
+        measured += [self.cycle().position for _ in range(round(SETTLE_TIME_S / self.period))]
+        a, b, c = self.max_errors
+        return MeasuredMotion(np.array(measured), (a, b, c))
 
     def home(self, timeout: float) -> None:
-        """Home the drive that has power alone. Raises Stopped."""
+        """Home the one powered drive within `timeout` [s]. Raises DrivesStoppedError."""
         self._drives.home()
         for _ in range(round(timeout / self.period)):
             self.cycle()
             if not self.feedback.homing and all(self.feedback.homed[index] for index in self._powered):
                 return
-        self._halt(f"not homed within {timeout:g} s")
+        self._stop_and_raise(f"not homed within {timeout:g} s")
 
-    def silence(self, seconds: float) -> Silence:
-        """Send no SYNC and no heartbeat to the powered drive, for so long [s] or until it lets go by itself."""
+    def provoke_watchdog(self, seconds: float) -> WatchdogReaction:
+        """Send neither SYNC nor heartbeat for `seconds` [s], or until the powered drive switches its power off."""
         (index,) = self._powered
         for number in range(1, round(seconds / self.period) + 1):
-            feedback = self._listen()
+            feedback = self._read_without_sync()
             state = feedback.state[index]
             if feedback.fault is not None or state is not PowerState.OPERATION_ENABLED:
-                return self._last_words(index, number * self.period)
+                return self._reaction(index, number * self.period)
             if self._interrupted():
-                self._halt(INTERRUPTED)
-        # A drive that tells its state in answer to SYNC alone has had nobody to tell it to.
+                self._stop_and_raise(INTERRUPTED)
+        # A drive that sends its status only in answer to SYNC could not report a state change until now.
         self._drives.sync()
-        state = self._listen().state[index]
+        state = self._read_without_sync().state[index]
         self._stop()
-        return Silence(None if state is PowerState.OPERATION_ENABLED else seconds, "", str(state))
+        return WatchdogReaction(None if state is PowerState.OPERATION_ENABLED else seconds, "", str(state))
 
-    def _listen(self) -> Feedback:
-        """Let a period pass in which the drives hear nothing."""
+    def _read_without_sync(self) -> Feedback:
         self._tick()
         self.feedback = self._drives.read()
         return self.feedback
 
-    def _last_words(self, index: int, after: float) -> Silence:
-        """Take in what the drives say that were not heard of; then stop what has not stopped by itself."""
+    def _reaction(self, index: int, after: float) -> WatchdogReaction:
+        """Collect the drives' fault messages, then stop all drives."""
         fault, state = self.feedback.fault, self.feedback.state[index]
         if fault is not None and fault.drive != NAMES[index]:
-            # Another drive, which missed the heartbeat too, was heard first, and the driver has stopped them all.
-            for _ in range(round(LAST_WORDS / self.period)):
-                self._listen()
+            # Another drive missed the same heartbeat and reported first; the driver has stopped all drives for it.
+            for _ in range(round(FAULT_WINDOW_S / self.period)):
+                self._read_without_sync()
         own = self._drives.reported_faults[index]
         self._stop()
         if fault is None:
-            return Silence(after, NAMES[index], str(state))
+            return WatchdogReaction(after, NAMES[index], str(state))
         own = own or fault
-        by_itself = own.drive == NAMES[index] and own.cause in _OF_ITS_OWN
-        return Silence(after if by_itself else None, own.drive, own.message, own.code)
+        is_own = own.drive == NAMES[index] and own.cause in _DRIVE_REPORTED_CAUSES
+        return WatchdogReaction(after if is_own else None, own.drive, own.message, own.code)
 
-    def clear(self) -> None:
-        """Reset a fault, if there is one. Raises Stopped where it does not go."""
+    def clear_fault(self) -> None:
+        """Reset a fault, if there is one. Raises DrivesStoppedError if it does not clear."""
         if self.feedback.fault is not None:
             self._drives.reset()
-            if (fault := self.wait(RESET).fault) is not None:
-                raise Stopped(f"a fault stays: {fault.message}")
+            if (fault := self.wait(RESET_TIMEOUT_S).fault) is not None:
+                raise DrivesStoppedError(f"fault does not clear: {fault.message}")
 
     def _has_power(self, feedback: Feedback) -> bool:
         return all(feedback.state[index] is PowerState.OPERATION_ENABLED for index in self._powered)
 
-    def _wrong(self, feedback: Feedback, missed: int) -> str:
-        """Say what must stop the drives now; "" where nothing."""
+    def _check(self, feedback: Feedback, missed: int) -> str:
+        """Return the reason to stop the drives now; "" for none."""
         if feedback.fault is not None:
             return feedback.fault.message
         if self._interrupted():
@@ -245,35 +262,39 @@ class Bench:
             state = feedback.state[index]
             if index not in self._powered:
                 if state is PowerState.OPERATION_ENABLED:
-                    return f"drive {name} has power, though it was left without"
+                    return f"drive {name}: enabled, although this step leaves it without power"
                 continue
             if state is PowerState.OPERATION_ENABLED and feedback.follows[index]:
-                error = self._written[-DELAY - min(feedback.age[index], 7)][index] - feedback.position[index]
-                self.worst[index] = max(self.worst[index], abs(error))
-                if not abs(error) <= FOLLOWING:
+                # An old position answers an older setpoint: compare it with the one of its own cycle.
+                sent = self._setpoints[-FEEDBACK_DELAY_CYCLES - min(feedback.age[index], 7)]
+                error = sent[index] - feedback.position[index]
+                self.max_errors[index] = max(self.max_errors[index], abs(error))
+                if not abs(error) <= MAX_FOLLOWING_ERROR_M:  # also true of nan
                     slider = f"slider {self._labels[index]}"
-                    return f"{slider}: following error {error * 1e3:.3f} mm, beyond {FOLLOWING * 1e3:g} mm"
+                    limit = MAX_FOLLOWING_ERROR_M * 1e3
+                    return f"{slider}: following error {error * 1e3:.3f} mm exceeds the limit of {limit:g} mm"
         return ""
 
-    def _halt(self, reason: str) -> None:
+    def _stop_and_raise(self, reason: str) -> None:
         self._stop()
-        if kept := [name for name, state in zip(NAMES, self.feedback.state, strict=True) if state in _POWERED]:
-            reason += f"; drive {', '.join(kept)} STILL HAS POWER: press the emergency stop"
+        states = zip(NAMES, self.feedback.state, strict=True)
+        if powered := [name for name, state in states if state in _POWERED_STATES]:
+            reason += f"; drive {', '.join(powered)} STILL HAS POWER: press the emergency stop"
         if self._interrupted():
             raise KeyboardInterrupt(reason)
-        raise Stopped(reason)
+        raise DrivesStoppedError(reason)
 
     def _stop(self) -> None:
-        """Stop all drives by their quick stop, and see their power go."""
         self._drives.quick_stop()
-        self._until_off()
+        self._wait_without_power()
 
-    def _until_off(self) -> None:
+    def _wait_without_power(self) -> None:
+        """Run cycles until no drive has power, for `drives.stop_timeout` and the settle time at most."""
         self._powered = ()
-        for _ in range(round((self.config.drives.stop_timeout + SETTLE) / self.period)):
+        for _ in range(round((self.config.drives.stop_timeout + SETTLE_TIME_S) / self.period)):
             self._tick()
             self._drives.sync()
             self.feedback = self._drives.read()
-            self._drives.write(self.feedback.position, _STILL)
-            if not any(state in _POWERED for state in self.feedback.state):
+            self._drives.write(self.feedback.position, _ZERO_VELOCITY)
+            if not any(state in _POWERED_STATES for state in self.feedback.state):
                 return

@@ -1,4 +1,4 @@
-"""Which slider goes with which drive, which way and how far: from what was seen to what should be configured; pure."""
+"""Coupling of drives to sliders: which drive moves which slider, its direction and its scale; pure functions."""
 
 from __future__ import annotations
 
@@ -8,235 +8,245 @@ from typing import Final, NamedTuple
 from trirail_drivers.config import Drive, Drives
 from trirail_drivers.interface import NAMES
 
-from trirail.commissioning.judgement import Changes, Judged, in_mm
+from trirail.commissioning.judgement import Changes, Judgement, format_mm
 from trirail.naming import Labels, label
 
-SCALE: Final = 0.02
-"""Share of a way by which drive and rule may differ where the rule could be read better than that."""
-COARSE: Final = 0.5
-"""Share of a way that a rule leaves open beyond which it tells nothing of the scale."""
-PLAY: Final = 0.1
-"""Share of 1 mm by which slider and drive may differ for play in screw or belt: less is no wrong scale there."""
-BACKLASH: Final = 0.0004
-"""So much less than counted [m] a slider may go both ways for play: over 1 mm that looks like a wrong scale."""
-FOLLOWS: Final = 0.2
-"""Share of a way that an encoder has to count for it to have moved at all."""
-NOTHING: Final = 0.02
-"""Share of a way by hand that an encoder has to count for it to be on that slider, however wrong its scale."""
-AGAINST: Final = 0.05
-"""Share of a way that an encoder has to count backwards for it to count against its motor."""
-LOOSE: Final = "fasten the encoder of drive {} on its shaft, and look at its cable; no power before that"
+SCALE_TOLERANCE: Final = 0.02
+"""Relative difference of drive and rule above which the scale is wrong, over a stroke by hand."""
+MAX_RULE_UNCERTAINTY: Final = 0.5
+"""Uncertainty of the rule, relative to the stroke, above which it shows no scale."""
+PLAY_TOLERANCE: Final = 0.1
+"""The same tolerance over 1 mm under power: play in screw or belt is a larger share of that."""
+MAX_BACKLASH_M: Final = 0.0004
+"""Loss in both directions that may be backlash [m]: over 1 mm it looks like a wrong scale."""
+MIN_COUNTED_SHARE: Final = 0.2
+"""Share of a stroke below which the encoder counts as not moving."""
+MIN_PUSHED_SHARE: Final = 0.02
+"""The same share for a stroke by hand, where the scale may be far off."""
+MIN_REVERSED_SHARE: Final = 0.05
+"""Share of a stroke counted backwards above which the encoder counts against its motor."""
+LOOSE_ENCODER_REMEDY: Final = "fasten the encoder of drive {} on its shaft, and check its cable; no power before that"
 
 
-class MoveSeen(NamedTuple):
-    """One drive alone was to move its slider there and back. Ways are signed [m]."""
+class MoveObservation(NamedTuple):
+    """Observation of one drive that moved its slider out and back, alone under power. Lengths are signed [m]."""
 
     drive: str
-    asked: float
+    commanded: float
     out: float
-    """By its encoder."""
+    """Distance by its encoder."""
     back: float
-    """By its encoder, on the way back."""
+    """Distance by its encoder on the way back."""
     following: float
-    """Its greatest following error [m]."""
+    """Its maximum following error."""
     stopped: str
-    """Why it was stopped on the way; "" where it was not."""
+    """Reason for a stop on the way, or ""."""
     slider: str | None
-    """Which slider was seen to move; None for none of them."""
+    """Slider that the person saw moving, if any."""
     rule_out: float
-    """By the rule beside that slider."""
+    """Distance by the rule beside that slider."""
     rule_back: float
-    """What of that was left when it had come back."""
-    read_to: float
-    """How finely the rule can be read [m]."""
-    step: float
-    """How fine the encoder's counts are [m]."""
+    """Rule reading after the way back, relative to the start."""
+    rule_resolution: float
+    encoder_resolution: float
     labels: Labels = NAMES
-    """What people call the sliders."""
+
+
+class PushObservation(NamedTuple):
+    """Observation of a slider pushed out and back by hand, without power. Lengths are signed [m]."""
+
+    slider: str
+    rule: float
+    counted: tuple[float, float, float]
+    """Distances by the encoders of drives A, B, C."""
+    rule_back: float
+    """Distance by the rule on the way back, to about the start."""
+    counted_back: tuple[float, float, float]
+    rule_resolution: float
+    encoder_resolution: float
+    labels: Labels = NAMES
 
 
 class _Stroke(NamedTuple):
-    """A way in one direction [m]."""
+    """Motion in one direction, by the encoder and by the rule [m]."""
 
     counted: float
     rule: float
 
     @property
     def ratio(self) -> float:
-        """How many times as far the encoder counts as the slider goes."""
+        """Ratio of counted to real distance."""
         return abs(self.counted / self.rule)
 
 
-class PushSeen(NamedTuple):
-    """A slider was pushed there and back by hand, nothing had power. Ways are signed [m]."""
-
-    slider: str
-    rule: float
-    ways: tuple[float, float, float]
-    """By the encoders of drives A, B, C."""
-    rule_back: float
-    """When it was pushed back, to about where it was."""
-    ways_back: tuple[float, float, float]
-    read_to: float
-    step: float
-    labels: Labels = NAMES
-
-
-def judge_move(seen: MoveSeen, drives: Drives) -> Judged:
-    """Judge which slider moved, which way, how far, and whether its encoder goes with it."""
+def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
+    """Judge which slider a drive moved, in which direction, how far, and whether its encoder follows."""
     name, slider = seen.drive, seen.slider
     by_encoder = (
-        f"drive {name} counted {in_mm(seen.out)} of {in_mm(seen.asked)}, following error {seen.following * 1e3:.3f} mm"
+        f"drive {name} counted {format_mm(seen.out)} of {format_mm(seen.commanded)}, "
+        f"following error {seen.following * 1e3:.3f} mm"
     )
     if slider is None:
         words = (by_encoder, "no slider moved")
-        if abs(seen.out) >= FOLLOWS * abs(seen.asked):
-            return Judged(
+        if abs(seen.out) >= MIN_COUNTED_SHARE * abs(seen.commanded):
+            return Judgement(
                 "wrong",
-                (*words, "the motor turns, but nothing goes with it: its coupling to the slider is loose or broken"),
+                (*words, "the motor turns without the slider: the coupling between them is loose or broken"),
                 f"fasten the coupling between motor {name} and its screw or belt, then repeat this step",
             )
-        return Judged(
+        return Judgement(
             "wrong" if seen.stopped else "failed",
-            (*words, seen.stopped or "the drive did nothing", "the motor does not turn, or cannot"),
-            f"look at drive {name}: motor phases, brake (is it released?), current limit, jammed slider",
+            (*words, seen.stopped or "the drive did nothing", "the motor does not turn, or is blocked"),
+            f"check drive {name}: motor phases, brake (is it released?), current limit, jammed slider",
         )
-    by_rule = f"slider {label(slider, seen.labels)} moved {in_mm(seen.rule_out)} by the rule"
-    if seen.out / seen.asked < -AGAINST:
-        return Judged(
+    by_rule = f"slider {label(slider, seen.labels)} moved {format_mm(seen.rule_out)} by the rule"
+    if seen.out / seen.commanded < -MIN_REVERSED_SHARE:
+        return Judgement(
             "wrong",
             (by_encoder, by_rule, f"the encoder of drive {name} counts against its motor: with power it runs away"),
             f"in drive {name} itself: exchange two motor phases, or set the encoder's polarity with its maker's tool, "
-            "and let it find its commutation again; `direction` in the configuration does not help here",
+            "and run its commutation search again; `direction` in the configuration does not help here",
         )
-    if abs(seen.out) < FOLLOWS * min(abs(seen.asked), abs(seen.rule_out)):
-        return Judged(
+    if abs(seen.out) < MIN_COUNTED_SHARE * min(abs(seen.commanded), abs(seen.rule_out)):
+        return Judgement(
             "wrong",
             (by_encoder, by_rule, f"loose encoder: the slider moves and the encoder of drive {name} does not count it"),
-            LOOSE.format(name),
+            LOOSE_ENCODER_REMEDY.format(name),
         )
     if seen.stopped:
-        return Judged(
+        return Judgement(
             "failed",
             (by_encoder, by_rule, seen.stopped),
             "if the slider moves freely, tune the drive's position loop with its maker's tool, then repeat this step",
         )
     out, back = _Stroke(seen.out, seen.rule_out), _Stroke(seen.back, seen.rule_back - seen.rule_out)
-    lost = [abs(stroke.counted) - abs(stroke.rule) for stroke in (out, back)]
-    readable = 2.0 * (seen.read_to + seen.step) <= COARSE * min(abs(out.rule), abs(back.rule))
-    if slider == name and readable and PLAY * abs(seen.out) < min(lost) and max(lost) <= BACKLASH:
-        return Judged(
+    losses = [abs(stroke.counted) - abs(stroke.rule) for stroke in (out, back)]
+    uncertainty = 2.0 * (seen.rule_resolution + seen.encoder_resolution)
+    readable = uncertainty <= MAX_RULE_UNCERTAINTY * min(abs(out.rule), abs(back.rule))
+    # A loss within the uncertainty of the rule may be the reading alone.
+    is_lossy = min(losses) > max(PLAY_TOLERANCE * abs(seen.out), uncertainty)
+    if slider == name and readable and is_lossy and max(losses) <= MAX_BACKLASH_M:
+        return Judgement(
             "wrong",
-            (by_encoder, by_rule, f"it went {in_mm(lost[0])} less than counted there and {in_mm(lost[1])} back: play"),
-            f"look for play in the coupling, screw or belt of slider {label(name, seen.labels)}; where there is none, "
+            (
+                by_encoder,
+                by_rule,
+                f"it moved {format_mm(losses[0])} less than counted out and {format_mm(losses[1])} back: play",
+            ),
+            f"check the coupling, screw or belt of slider {label(name, seen.labels)} for play; if there is none, "
             "it is a wrong scale, which the step by hand finds over 10 mm",
         )
-    return _coupled(name, slider, out, back, seen, drives, (by_encoder, by_rule), PLAY)
+    return _judge_coupling(name, slider, out, back, seen, drives, (by_encoder, by_rule), PLAY_TOLERANCE)
 
 
-def judge_push(seen: PushSeen, drives: Drives) -> Judged:
-    """Judge which drive's encoder is on the slider that was pushed, which way and how finely it counts."""
+def judge_push(seen: PushObservation, drives: Drives) -> Judgement:
+    """Judge which drive's encoder is on the pushed slider, its direction and its scale."""
     at = NAMES.index(seen.slider)
-    sizes = [max(abs(way), abs(back)) for way, back in zip(seen.ways, seen.ways_back, strict=True)]
-    most = sizes.index(max(sizes))
-    counted = ", ".join(f"{name} {in_mm(way)}" for name, way in zip(NAMES, seen.ways, strict=True))
+    sizes = [max(abs(out), abs(back)) for out, back in zip(seen.counted, seen.counted_back, strict=True)]
+    largest = sizes.index(max(sizes))
+    counted = ", ".join(f"{name} {format_mm(out)}" for name, out in zip(NAMES, seen.counted, strict=True))
     slider = label(seen.slider, seen.labels)
-    words = (f"slider {slider} was pushed {in_mm(seen.rule)} by the rule; the drives counted {counted}",)
-    if min(abs(seen.rule), abs(seen.rule_back)) < 5.0 * seen.read_to:
-        return Judged(
+    words = (f"slider {slider} was pushed {format_mm(seen.rule)} by the rule; the drives counted {counted}",)
+    if min(abs(seen.rule), abs(seen.rule_back)) < 5.0 * seen.rule_resolution:
+        return Judgement(
             "failed",
-            (*words, "there or back is too little to be judged"),
+            (*words, "one direction is too short to be judged"),
             "push it further: 10 mm, or as far as it goes, and back",
         )
-    if max(sizes) < NOTHING * abs(seen.rule):
-        return Judged(
+    if max(sizes) < MIN_PUSHED_SHARE * abs(seen.rule):
+        return Judgement(
             "wrong",
             (*words, "loose encoder: the slider moves and no encoder counts it"),
-            LOOSE.format(seen.slider),
+            LOOSE_ENCODER_REMEDY.format(seen.slider),
         )
-    drive = seen.slider if sizes[at] >= FOLLOWS * sizes[most] else NAMES[most]
+    drive = seen.slider if sizes[at] >= MIN_COUNTED_SHARE * sizes[largest] else NAMES[largest]
     index = NAMES.index(drive)
-    out, back = _Stroke(seen.ways[index], seen.rule), _Stroke(seen.ways_back[index], seen.rule_back)
-    return _coupled(drive, seen.slider, out, back, seen, drives, words, SCALE)
+    out, back = _Stroke(seen.counted[index], seen.rule), _Stroke(seen.counted_back[index], seen.rule_back)
+    return _judge_coupling(drive, seen.slider, out, back, seen, drives, words, SCALE_TOLERANCE)
 
 
-def _coupled(
+def _judge_coupling(
     name: str,
     slider: str,
     out: _Stroke,
     back: _Stroke,
-    seen: MoveSeen | PushSeen,
+    seen: MoveObservation | PushObservation,
     drives: Drives,
     words: tuple[str, ...],
     tolerance: float,
-) -> Judged:
-    """Judge a drive, whose encoder has counted two strokes, by the slider that went with it, and the rule beside that.
+) -> Judgement:
+    """Judge a drive by two strokes of the slider that it moves.
 
-    A wrong scale is the same factor both ways, a slip or play is not: strokes are to differ by less than `tolerance`,
-    or by what the rule leaves open.
+    A wrong scale is the same factor in both directions, slip and play are not: the ratios of the strokes must agree
+    within `tolerance`, or within the uncertainty of the rule.
     """
-    drive, configured, read_to, step = _of(drives, name), _of(drives, slider), seen.read_to, seen.step
+    drive, configured = _drive(drives, name), _drive(drives, slider)
+    rule_resolution, encoder_resolution = seen.rule_resolution, seen.encoder_resolution
     named = f"slider {label(slider, seen.labels)}"
-    found = [*words]
+    reasons = [*words]
     if slider != name:
-        found.append(f"swapped nodes: drive {name}, node {drive.node}, has {named}")
-    if min(abs(out.rule), abs(back.rule)) <= 2.0 * read_to:
-        found.append(f"the rule, read to {read_to * 1e3:g} mm, shows neither direction nor scale")
+        reasons.append(f"swapped nodes: drive {name}, node {drive.node}, has {named}")
+    if min(abs(out.rule), abs(back.rule)) <= 2.0 * rule_resolution:
+        reasons.append(f"the rule, read to {rule_resolution * 1e3:g} mm, shows neither direction nor scale")
         if slider == name:
-            return Judged("failed", tuple(found), "read it more finely, or push the slider further")
-        return _changed(slider, configured, {"node": drive.node}, found)
-    unread = [2.0 * (read_to + step) / abs(stroke.rule) for stroke in (out, back)]
+            return Judgement("failed", tuple(reasons), "read it more finely, or push the slider further")
+        return _propose_changes(slider, configured, {"node": drive.node}, reasons)
+    uncertainties = [2.0 * (rule_resolution + encoder_resolution) / abs(stroke.rule) for stroke in (out, back)]
     ratios = out.ratio, back.ratio
-    if abs(ratios[0] - ratios[1]) > max(ratios) * max(tolerance, sum(unread)):
-        found += [
-            f"of the slider's way drive {name} counts {ratios[0]:.1%} there and {ratios[1]:.1%} back",
+    if abs(ratios[0] - ratios[1]) > max(ratios) * max(tolerance, sum(uncertainties)):
+        reasons += [
+            f"drive {name} counts {ratios[0]:.1%} of the slider's travel out and {ratios[1]:.1%} back",
             "slipping encoder or coupling: counts are lost on the way, or there is as much play",
         ]
-        remedy = f"fasten encoder and coupling of drive {name} on their shafts, look for play, then repeat this step"
-        return Judged("wrong", tuple(found), remedy, _node(slider, configured, drive))
+        remedy = f"fasten encoder and coupling of drive {name} on their shafts, check for play, then repeat this step"
+        return Judgement("wrong", tuple(reasons), remedy, _node_change(slider, configured, drive))
     direction, counts = drive.direction, drive.counts_per_metre
     if out.counted * out.rule < 0.0:
         direction = -drive.direction
-        found.append(f"wrong direction: by the counts of drive {name} {named} goes the other way")
-    open_share = max(unread)
-    if open_share > COARSE:
-        found.append(
-            f"a rule read to {read_to * 1e3:g} mm does not tell the scale over so short a way; push it further"
+        reasons.append(f"wrong direction: drive {name} counts against the motion of {named}")
+    uncertainty = max(uncertainties)
+    if uncertainty > MAX_RULE_UNCERTAINTY:
+        reasons.append(
+            f"a rule read to {rule_resolution * 1e3:g} mm does not show the scale over so short a stroke; push further"
         )
-    elif all(abs(ratio - 1.0) > max(tolerance, left) for ratio, left in zip(ratios, unread, strict=True)):
+    elif all(abs(ratio - 1.0) > max(tolerance, each) for ratio, each in zip(ratios, uncertainties, strict=True)):
         ratio = (abs(out.counted) + abs(back.counted)) / (abs(out.rule) + abs(back.rule))
-        counts = _rounded(drive.counts_per_metre * ratio, open_share)
-        found.append(
-            f"wrong scale: drive {name} counts {ratio:.3g} times as far as the slider goes, there and back, "
-            f"read to {open_share:.1%}"
+        counts = _round_counts(drive.counts_per_metre * ratio, uncertainty)
+        reasons.append(
+            f"wrong scale: drive {name} counts {ratio:.3g} times the slider's travel, out and back, "
+            f"read to {uncertainty:.1%}"
         )
     elif slider == name and direction == drive.direction:
-        readable = max(tolerance, open_share)
-        found.append(f"direction is right, and counts per metre as far as can be told: to {readable:.1%}")
-    return _changed(slider, configured, {"node": drive.node, "direction": direction, "counts_per_metre": counts}, found)
+        accuracy = max(tolerance, uncertainty)
+        reasons.append(f"direction is right, and counts per metre within the accuracy of {accuracy:.1%}")
+    values = {"node": drive.node, "direction": direction, "counts_per_metre": counts}
+    return _propose_changes(slider, configured, values, reasons)
 
 
-def _node(slider: str, configured: Drive, drive: Drive) -> Changes:
+def _node_change(slider: str, configured: Drive, drive: Drive) -> Changes:
     return {} if drive.node == configured.node else {f"drives.{slider}.node": drive.node}
 
 
-def _changed(slider: str, configured: Drive, wanted: Mapping[str, int | float], found: Sequence[str]) -> Judged:
-    """Say what of a slider's drive should be configured otherwise."""
-    different = {key: value for key, value in wanted.items() if value != getattr(configured, key)}
+def _propose_changes(
+    slider: str, configured: Drive, values: Mapping[str, int | float], reasons: Sequence[str]
+) -> Judgement:
+    """Return a judgement that proposes the values that differ from the configured ones."""
+    different = {key: value for key, value in values.items() if value != getattr(configured, key)}
     if not different:
-        return Judged("ok", tuple(found))
-    told = (f"drives.{slider}.{key} = {value:g}, not {getattr(configured, key):g}" for key, value in different.items())
-    remedy = f"in the configuration {', '.join(told)}; then begin again with it"
-    return Judged("wrong", tuple(found), remedy, {f"drives.{slider}.{key}": value for key, value in different.items()})
+        return Judgement("ok", tuple(reasons))
+    lines = (f"drives.{slider}.{key} = {value:g}, not {getattr(configured, key):g}" for key, value in different.items())
+    remedy = f"in the configuration {', '.join(lines)}; then start again with it"
+    changes = {f"drives.{slider}.{key}": value for key, value in different.items()}
+    return Judgement("wrong", tuple(reasons), remedy, changes)
 
 
-def _of(drives: Drives, name: str) -> Drive:
+def _drive(drives: Drives, name: str) -> Drive:
     return drives.each[NAMES.index(name)]
 
 
-def _rounded(counts: float, open_share: float) -> float:
-    """Leave out digits that the rule does not tell, but one."""
+def _round_counts(counts: float, uncertainty: float) -> float:
+    """Round to the digits that a relative uncertainty supports, and one more."""
     digits = 2
-    while 10.0**-digits > open_share / 10.0 and digits < 8:
+    while 10.0**-digits > uncertainty / 10.0 and digits < 8:
         digits += 1
     return float(f"{counts:.{digits}g}")

@@ -1,24 +1,49 @@
-"""Leads a person through the steps in order: each can be refused and repeated, and needs those before it."""
+"""Guide through the steps in order: each can be skipped and repeated, and requires earlier ones."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from trirail_drivers.config import Drives
 from trirail_drivers.interface import NAMES
 
 from trirail import naming
-from trirail.commissioning import configuration
+from trirail.commissioning import config_edit
 from trirail.commissioning.bench import INTERRUPTED
-from trirail.commissioning.judgement import Judged
-from trirail.commissioning.node_swaps import merged
-from trirail.commissioning.person import Person, Question, choose
-from trirail.commissioning.report import Keeper
-from trirail.commissioning.session import Done
+from trirail.commissioning.judgement import Changes, Judgement
+from trirail.commissioning.person import Operator, Question, ask_choice
+from trirail.commissioning.report import ReportFile
+from trirail.commissioning.session import StepOutcome
 from trirail.commissioning.steps import Steps
 from trirail.config import Config
+
+
+def merge_changes(proposals: Sequence[Changes], drives: Drives) -> tuple[dict[str, int | float], str]:
+    """Return the changes of all steps together, and why node ids cannot be exchanged, "" if they can.
+
+    A node id that moves to another slider leaves its own slider without one: the two are exchanged unless another step
+    contradicts that.
+    """
+    changes = {key: value for each in proposals for key, value in each.items()}
+    nodes = {name: drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
+    moved = {name: int(changes[f"drives.{name}.node"]) for name in NAMES if f"drives.{name}.node" in changes}
+    after = {**nodes, **moved}
+    free = [node for node in nodes.values() if node not in after.values()]
+    for name in NAMES:
+        doubled = name not in moved and after[name] in moved.values()
+        if doubled and free:
+            after[name] = free.pop(0)
+    if len(set(after.values())) < len(NAMES):
+        others = {key: value for key, value in changes.items() if not key.endswith(".node")}
+        return others, "two drives moved one slider; check the cables, and repeat those steps"
+    for name, node in after.items():
+        changes.pop(f"drives.{name}.node", None)
+        if node != nodes[name]:
+            changes[f"drives.{name}.node"] = node
+    return dict(sorted(changes.items())), ""
 
 
 class GuideStep(NamedTuple):
@@ -27,50 +52,50 @@ class GuideStep(NamedTuple):
     name: str
     drive: str
     title: str
-    what: str
-    """What will happen, and what is wanted of the person: a line."""
-    run: Callable[[], Done]
+    description: str
+    """Line for the person about the motion or power, and their task."""
+    run: Callable[[], StepOutcome]
     needs: tuple[tuple[str, str], ...] = ()
-    """Steps that must be as they should be before."""
+    """Steps that must be ok before this one."""
     not_after: tuple[tuple[str, str], ...] = ()
-    """Steps that must not have found anything wrong before."""
+    """Steps that must not have found a defect before this one."""
 
 
-def plan(steps: Steps, config: Config) -> list[GuideStep]:
-    """Return the steps in their order."""
+def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
+    """Return the steps of the guide in their order."""
 
     def named(name: str) -> str:
         return naming.drive(name, config.geometry.labels)
 
-    made = [
+    plan = [
         GuideStep(
             "bus",
             "",
-            "Who is on the bus",
-            "Reads who each drive is. Writes nothing, no drive gets power.",
-            steps.session.bus,
+            "Drives on the bus",
+            "Reads the identity of each drive. Writes nothing; no drive gets power.",
+            steps.session.inspect_bus,
         ),
         GuideStep(
             "setup",
             "",
             "Set-up",
-            "Writes what differs into the drives' memory, reads it back, stores nothing. No drive gets power.",
+            "Writes different values into the drives' memory and reads them back; stores nothing. No drive gets power.",
             steps.session.set_up,
             (("bus", ""),),
         ),
     ]
-    made += [
+    plan += [
         GuideStep(
             "push",
             name,
-            f"Slider {steps.labelled(name)} by hand",
-            f"You push slider {steps.labelled(name)}, nothing has power. Refuse it (s) where it cannot be pushed.",
+            f"Slider {steps.slider_label(name)} by hand",
+            f"You push slider {steps.slider_label(name)}; no drive has power. Skip it (s) if it cannot be pushed.",
             partial(steps.push, name),
             (("setup", ""),),
         )
         for name in NAMES
     ]
-    made += [
+    plan += [
         GuideStep(
             "power",
             name,
@@ -82,37 +107,37 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         )
         for name in NAMES
     ]
-    made += [
+    plan += [
         GuideStep(
             "move",
             name,
             f"D{named(name)[1:]} moves 1 mm",
-            f"MOTION: drive {name} alone goes 1 mm and back, 5 mm/s at most. Free way on both sides; Ctrl-C stops.",
+            f"MOTION: drive {name} alone moves 1 mm and back, up to 5 mm/s. Keep both sides free; Ctrl-C stops.",
             partial(steps.move, name),
             (("power", name),),
             (("push", name),),
         )
         for name in NAMES
     ]
-    made += [
+    plan += [
         GuideStep(
             "switches",
             name,
-            f"Switches of slider {steps.labelled(name)}",
-            f"You press each limit switch and the home switch of slider {steps.labelled(name)} by hand; "
-            "nothing has power.",
+            f"Switches of slider {steps.slider_label(name)}",
+            f"You press each limit switch and the home switch of slider {steps.slider_label(name)} by hand; "
+            "no drive has power.",
             partial(steps.switches, name),
             (("setup", ""),),
         )
         for name in NAMES
-        if steps.session.tells_inputs
+        if steps.session.reports_inputs
     ]
-    made += [
+    plan += [
         GuideStep(
             "home",
             name,
-            f"Home of slider {steps.labelled(name)}",
-            f"MOTION: drive {name} alone searches its home switch, as [drives.{name}.homing] says. Ctrl-C stops.",
+            f"Home of slider {steps.slider_label(name)}",
+            f"MOTION: drive {name} alone searches for its home switch, as [drives.{name}.homing] says. Ctrl-C stops.",
             partial(steps.home, name),
             (("move", name),),
             (("switches", name),),
@@ -120,143 +145,146 @@ def plan(steps: Steps, config: Config) -> list[GuideStep]:
         for name in NAMES
         if config.drives.each[NAMES.index(name)].homing is not None
     ]
-    made += [
+    plan += [
         GuideStep(
             "watchdog",
             name,
             f"Watchdog of {named(name)}",
-            f"POWER on drive {name}, then SYNC and heartbeat end: it must let go of the slider by itself.",
+            f"POWER on drive {name}, then SYNC and heartbeat end: it must switch its power off by itself.",
             partial(steps.watchdog, name),
             (("power", name),),
             (("push", name), ("move", name)),
         )
         for name in NAMES
     ]
-    needed = [(step.name, step.drive) for step in made if step.name in ("move", "home")]
-    made.append(
+    moves = [(step.name, step.drive) for step in plan if step.name in ("move", "home")]
+    plan.append(
         GuideStep(
             "square",
             "",
             "All three: a square of 1 mm",
-            "MOTION of all three: the platform goes 1 mm along x, along y, and back, 5 mm/s at most. Ctrl-C stops.",
+            "MOTION of all three: the platform moves 1 mm along x, along y, and back, up to 5 mm/s. Ctrl-C stops.",
             steps.square,
-            tuple(needed),
+            tuple(moves),
             tuple(("watchdog", name) for name in NAMES),
         )
     )
-    made.append(
+    plan.append(
         GuideStep(
             "kind",
             "",
             "3-PRP or 3-PPR",
-            "MOTION of all three: the platform turns, goes along x or y, and back, 5 mm/s at most. You read a dial "
-            "gauge or microscope; refuse it (s) without one.",
+            "MOTION of all three: the platform turns, moves along x or y, and back, up to 5 mm/s. You read a dial "
+            "gauge or microscope; skip it (s) without one.",
             steps.kind,
             (("square", ""),),
         )
     )
-    return made
+    return plan
 
 
 class Guide:
-    """Goes through the plan with a person, and keeps what comes of it."""
+    """Runs the steps with a person, and records their judgements."""
 
-    def __init__(self, config: Config, path: Path, steps: Steps, person: Person, keeper: Keeper) -> None:
-        """`path` is that of the configuration."""
+    def __init__(self, config: Config, path: Path, steps: Steps, operator: Operator, report_file: ReportFile) -> None:
+        """`path` is the path of the configuration."""
         self._config = config
         self._path = path
         self._steps = steps
-        self._person = person
-        self._keeper = keeper
+        self._operator = operator
+        self._report_file = report_file
 
     def run(self) -> None:
-        """Go through all steps. Raises Quit where the person leaves."""
-        made = plan(self._steps, self._config)
-        self._keeper.report.plan = tuple((step.name, step.drive) for step in made)
-        if self._keeper.report.simulated:
-            self._person.show(
-                "Simulated drives: in brackets stands what a person beside them would answer; Enter takes it."
-            )
+        """Run all steps. Raises QuitRequest if the person quits."""
+        plan = plan_steps(self._steps, self._config)
+        self._report_file.report.plan = tuple((step.name, step.drive) for step in plan)
+        if self._report_file.report.simulated:
+            self._operator.show("Simulated drives: brackets show the answer of a person beside them; Enter accepts it.")
         at = 0
-        while at < len(made):
-            step = made[at]
-            self._person.show("")
-            self._person.show(f"{at + 1}/{len(made)}  {step.title}")
-            if lacks := self._lacks(step):
-                self._keep(step, Judged("skipped", (lacks,)))
+        while at < len(plan):
+            step = plan[at]
+            self._operator.show("")
+            self._operator.show(f"{at + 1}/{len(plan)}  {step.title}")
+            if reason := self._missing(step):
+                self._record(step, Judgement("skipped", (reason,)))
                 at += 1
                 continue
-            self._person.show(f"  {step.what}")
+            self._operator.show(f"  {step.description}")
             if step.name == "setup":
-                for line in self._steps.session.changes_of_set_up():
-                    self._person.show(f"  {line}")
-            at = self._done(step, at)
+                for line in self._steps.session.describe_setup():
+                    self._operator.show(f"  {line}")
+            at = self._run_step(step, at)
 
     def write(self, out: Path | None) -> Path | None:
-        """Write the configuration with what was found, to `out` or a free name beside it; None where nothing was."""
-        latest = self._keeper.report.latest.values()
-        changes, conflict = merged([entry.changes for entry in latest], self._config.drives)
-        self._person.show("")
+        """Write the corrected configuration to `out`, or to an unused path beside the original.
+
+        Return its path, None if nothing needs a correction.
+        """
+        latest = self._report_file.report.latest.values()
+        changes, conflict = merge_changes([entry.changes for entry in latest], self._config.drives)
+        self._operator.show("")
         if conflict:
-            self._person.show(f"Node ids: {conflict}.")
+            self._operator.show(f"Node ids: {conflict}.")
         written = None
         if changes:
-            written = out or configuration.free_name(self._path)
-            text = configuration.changed(self._path.read_text(encoding="utf-8"), changes)
-            if self._keeper.report.simulated and self._config.can.simulated.built is None:
-                text = configuration.with_built(text, self._config.drives)
+            written = out or config_edit.find_free_path(self._path)
+            text = config_edit.edit_text(self._path.read_text(encoding="utf-8"), changes)
+            if self._report_file.report.simulated and self._config.can.simulated.built is None:
+                text = config_edit.add_simulated_build(text, self._config.drives)
             if written.parent.resolve() != self._path.parent.resolve():
-                text = configuration.with_whole_paths(text, self._path.parent)
-            configuration.write(written, text)
-            self._person.show("The configuration with what was found:")
+                text = config_edit.resolve_eds_paths(text, self._path.parent)
+            config_edit.write_new_file(written, text)
+            self._operator.show("Corrected values:")
             for key, value in changes.items():
-                self._person.show(f"  {key} = {value:g}")
-            self._person.show(f"is {written}; yours is as it was. Begin again with it: trirail commission {written}")
+                self._operator.show(f"  {key} = {value:g}")
+            self._operator.show(
+                f"written to {written}; the original is unchanged. Start again with it: trirail commission {written}"
+            )
         else:
-            self._person.show("Nothing in the configuration is to be changed by what was found.")
-        self._keeper.conclude(changes, written)
+            self._operator.show("The configuration needs no correction.")
+        self._report_file.conclude(changes, written)
         return written
 
-    def _done(self, step: GuideStep, at: int) -> int:
-        """Do a step as the person wants it; return where to go on."""
-        choices = {"y": "do it", "s": "skip it", "b": "back to the step before"}
-        choice = self._choice("  Do it? Enter or y, s skip, b back, q quit:", "y", choices)
-        if choice == "s" and (step.name, step.drive) not in self._keeper.report.latest:
-            self._keep(step, Judged("skipped", ("left out",)))
+    def _run_step(self, step: GuideStep, at: int) -> int:
+        """Run, skip or leave a step, as the person chooses; return the index of the next one."""
+        choices = {"y": "run it", "s": "skip it", "b": "previous step"}
+        choice = self._ask("  Run it? Enter or y, s skip, b back, q quit:", "y", choices)
+        if choice == "s" and (step.name, step.drive) not in self._report_file.report.latest:
+            self._record(step, Judgement("skipped", ("left out",)))
         while choice == "y":
             try:
-                judged, measured = step.run()
-            except KeyboardInterrupt as stopped:
-                self._keep(step, Judged("failed", (str(stopped) or INTERRUPTED,)))
+                judgement, measured = step.run()
+            except KeyboardInterrupt as interrupt:
+                self._record(step, Judgement("failed", (str(interrupt) or INTERRUPTED,)))
                 raise
-            self._keep(step, judged, measured)
-            if judged.verdict == "ok":
+            self._record(step, judgement, measured)
+            if judgement.verdict == "ok":
                 return at + 1
-            choices = {"s": "go on", "y": "repeat it", "b": "back to the step before"}
-            choice = self._choice("  Go on with the next? Enter or s, y repeat, b back, q quit:", "s", choices)
+            choices = {"s": "continue", "y": "repeat it", "b": "previous step"}
+            choice = self._ask("  Continue with the next step? Enter or s, y repeat, b back, q quit:", "s", choices)
         return at + 1 if choice == "s" else max(0, at - 1)
 
-    def _choice(self, text: str, default: str, choices: dict[str, str]) -> str:
-        return choose(self._person, self._steps.session.idle, Question(text, default), choices)
+    def _ask(self, text: str, default: str, choices: dict[str, str]) -> str:
+        return ask_choice(self._operator, self._steps.session.idle, Question(text, default), choices)
 
-    def _keep(
-        self, step: GuideStep, judged: Judged, measured: dict[str, float | int | str | bool | None] | None = None
+    def _record(
+        self, step: GuideStep, judgement: Judgement, measured: dict[str, float | int | str | bool | None] | None = None
     ) -> None:
-        self._keeper.add(step.name, step.drive, judged, measured or {})
-        self._person.judged(judged)
+        self._report_file.add(step.name, step.drive, judgement, measured or {})
+        self._operator.show_judgement(judgement)
 
-    def _lacks(self, step: GuideStep) -> str:
-        latest = self._keeper.report.latest
+    def _missing(self, step: GuideStep) -> str:
+        latest = self._report_file.report.latest
         missing = [
             f"{name} {drive}".rstrip()
             for name, drive in step.needs
             if (name, drive) not in latest or latest[name, drive].verdict != "ok"
         ]
         if missing:
-            return f"not before {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} as it should be"
+            return f"requires {', '.join(missing)} to be ok"
         wrong = [
             f"{name} {drive}".rstrip()
             for name, drive in step.not_after
             if (name, drive) in latest and latest[name, drive].verdict == "wrong"
         ]
-        return f"not after what {', '.join(wrong)} has found" if wrong else ""
+        return f"not run after the defect that {', '.join(wrong)} found" if wrong else ""

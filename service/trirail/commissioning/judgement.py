@@ -1,4 +1,4 @@
-"""From what was measured of a step to a verdict in words and the remedy: pure functions."""
+"""Judgements of a step's measurements: a verdict in words and its remedy; pure functions."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from trirail_drivers.interface import NAMES
 from trirail.naming import Labels, label
 
 Verdict = Literal["ok", "wrong", "failed", "skipped"]
-"""As it should be; a defect was found; the step could not be carried out; it was left out."""
+"""Correct; a defect was found; the step could not be carried out; the step was left out."""
 Changes = Mapping[str, int | float]
-"""Keys of a configuration, by their whole path as `drives.A.node`, and what they should have."""
+"""New values of configuration keys, each by its whole path, as `drives.A.node`."""
 
 
 SWITCHES: Final = {1: "negative limit switch", 2: "positive limit switch", 4: "home switch"}
 """Bits of the digital inputs 60FDh (CiA 402-2)."""
-LIMITS: Final = (1, 2)
+LIMIT_BITS: Final = (1, 2)
 HEARTBEAT_MISSING: Final = 0x8130
-"""What the EMCY of a drive says that does not hear its master (CiA 301, emergency error codes)."""
+"""EMCY code of a lost heartbeat or life guarding (CiA 301, emergency error codes)."""
 
 
-class Judged(NamedTuple):
-    """What is to be thought of a step."""
+class Judgement(NamedTuple):
+    """Verdict on a step, with its reasons and the changes that it proposes."""
 
     verdict: Verdict
     words: tuple[str, ...]
@@ -32,94 +32,116 @@ class Judged(NamedTuple):
     changes: Changes = MappingProxyType({})
 
 
-def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judged:
-    """Judge a drive that had power alone, held its slider for so long [s], and drifted [m]."""
+def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judgement:
+    """Judge a drive that was enabled alone for `seconds` [s] and drifted by `drift` [m]."""
     if stopped:
-        return Judged(
+        return Judgement(
             "failed",
             (stopped,),
-            f"look at drive {drive}: supply, safe torque off, brake, tuning; then repeat this step",
+            f"check drive {drive}: supply, safe torque off, brake, tuning; then repeat this step",
         )
-    return Judged(
+    return Judgement(
         "ok", (f"drive {drive} held for {seconds:g} s, within {drift * 1e3:.4f} mm; the others had no power",)
     )
 
 
-def judge_switches(name: str, rest: int, changed: int, seen: bool, labels: Labels = NAMES) -> Judged:
-    """Judge a slider's switches: bits of 60FDh at rest and those that changed; whether these are all that there are."""
-    told = [f"{switch} {'changed' if changed & bit else 'never changed'}" for bit, switch in SWITCHES.items()]
-    words = (f"drive {name} told: {', '.join(told)}",)
-    pressed = [switch for bit, switch in SWITCHES.items() if rest & bit and bit in LIMITS]
+def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: Labels = NAMES) -> Judgement:
+    """Judge a slider's switches.
+
+    Parameters
+    ----------
+    rest
+        Bits of 60FDh while no switch is pressed.
+    changed
+        Bits that changed when the person pressed each switch.
+    confirmed
+        True if the person agrees that these are all the slider's switches.
+    """
+    states = [f"{switch} {'changed' if changed & bit else 'never changed'}" for bit, switch in SWITCHES.items()]
+    words = (f"drive {name} reported: {', '.join(states)}",)
+    pressed = [switch for bit, switch in SWITCHES.items() if rest & bit and bit in LIMIT_BITS]
     if pressed:
-        return Judged(
+        return Judgement(
             "wrong",
-            (*words, f"at rest it takes its {' and its '.join(pressed)} for pressed"),
-            f"if slider {label(name, labels)} does not stand on it: turn the input's polarity in the drive (a normally "
-            "closed contact?), or look for a broken wire",
+            (*words, f"at rest it reports its {' and its '.join(pressed)} as pressed"),
+            f"if slider {label(name, labels)} is not on the switch: invert the input's polarity in the drive (a "
+            "normally closed contact?), or look for a broken wire",
         )
-    if not seen:
-        return Judged(
+    if not confirmed:
+        return Judgement(
             "wrong",
             (*words, f"slider {label(name, labels)} has other switches than these"),
-            f"look at their wiring, and at which input drive {name} takes for which (its maker's tool)",
+            f"check their wiring, and the functions of the inputs of drive {name} (its maker's tool)",
         )
-    return Judged("ok", words)
+    return Judgement("ok", words)
 
 
-def judge_homing(drive: str, way: float, position: float, seen: bool, stopped: str, labels: Labels = NAMES) -> Judged:
-    """Judge a drive that has found home: how far it went [m], where it says that it is [m], whether that was seen."""
+def judge_homing(
+    drive: str, travel: float, position: float, confirmed: bool, stopped: str, labels: Labels = NAMES
+) -> Judgement:
+    """Judge a homing that ended at `position` [m] after `travel` [m]; the person confirms the home switch."""
     slider = f"slider {label(drive, labels)}"
     if stopped:
-        return Judged(
+        return Judgement(
             "failed",
             (stopped,),
-            f"look at {slider}'s home switch, its wiring, and drives.{drive}.homing: method, speeds, timeout",
+            f"check {slider}'s home switch, its wiring, and drives.{drive}.homing: method, speeds, timeout",
         )
-    words = (f"drive {drive} says that it is home; {slider} went {in_mm(way)} and is at {in_mm(position)} now",)
-    if seen:
-        return Judged("ok", words)
-    return Judged(
+    words = (f"drive {drive} reports home; {slider} moved {format_mm(travel)} and is at {format_mm(position)}",)
+    if confirmed:
+        return Judgement("ok", words)
+    return Judgement(
         "wrong",
-        (*words, "and it was seen not to be there"),
+        (*words, "but the slider is not at its home switch"),
         f"drives.{drive}.homing.method is for another switch or side: its directions are those of the drive's counts",
     )
 
 
-def judge_watchdog(drive: str, seconds: float | None, by: str, said: str, code: int) -> Judged:
-    """Judge what a powered drive did that heard neither SYNC nor heartbeat, `code` is that of its EMCY."""
+def judge_watchdog(drive: str, seconds: float | None, reporter: str, message: str, code: int) -> Judgement:
+    """Judge a powered drive's reaction to missing SYNCs and heartbeats, as in `WatchdogReaction`."""
     if seconds is not None:
-        words = (f"drive {drive} let go {seconds * 1e3:.0f} ms after the last SYNC: {said}",)
+        words = (f"drive {drive} switched its power off {seconds * 1e3:.0f} ms after the last SYNC: {message}",)
         if code == HEARTBEAT_MISSING:
-            return Judged("ok", (*words, "that was its watch on heartbeats: it has none on SYNC, or a slower one"))
-        return Judged("ok", words)
-    if by and by != drive:
-        return Judged("failed", (f"another drive spoke first: {said}",), "repeat this step")
-    return Judged(
+            return Judgement("ok", (*words, "by its watch on heartbeats: it has none on SYNC, or a slower one"))
+        return Judgement("ok", words)
+    if reporter and reporter != drive:
+        return Judgement("failed", (f"another drive reported first: {message}",), "repeat this step")
+    return Judgement(
         "wrong",
-        (f"drive {drive} kept its power without SYNC and heartbeat: {said or 'it said nothing'}",),
-        f"do not use drive {drive} like that: it would go on if this computer died. See which of 1006h, 1016h, "
-        "1029h and 6007h it has (trirail drives), or its own watchdog",
+        (f"drive {drive} kept its power without SYNC and heartbeat: {message or 'no message'}",),
+        f"do not use drive {drive} in this state: it would keep moving if this computer died. Check which of 1006h, "
+        "1016h, 1029h and 6007h it has (trirail drives), or enable its own watchdog",
     )
 
 
 def judge_square(
-    deviation: float, following: Sequence[float], seen: bool, stopped: str, labels: Labels = NAMES
-) -> Judged:
-    """Judge a square of the platform: how far the measured pose was from the commanded one [m], and what was seen."""
+    deviation: float, following: Sequence[float], confirmed: bool, stopped: str, labels: Labels = NAMES
+) -> Judgement:
+    """Judge a square of the platform.
+
+    Parameters
+    ----------
+    deviation
+        Maximum distance of the measured from the commanded pose [m].
+    following
+        Maximum following error of each slider [m].
+    confirmed
+        True if the person saw the platform move around the square.
+    """
     if stopped:
-        return Judged("failed", (stopped,), "repeat the step of the slider that is named")
+        return Judgement("failed", (stopped,), "repeat the steps of the slider that is named")
     errors = ", ".join(f"{name} {error * 1e3:.3f}" for name, error in zip(labels, following, strict=True))
     words = (f"the platform stayed within {deviation * 1e3:.3f} mm of its square; following errors {errors} mm",)
-    if seen:
-        return Judged("ok", words)
-    return Judged(
+    if confirmed:
+        return Judgement("ok", words)
+    return Judgement(
         "wrong",
-        (*words, "the sliders did as they were told, and the platform did not go along x, along y, and back"),
+        (*words, "the sliders followed their setpoints, but the platform did not move along x, along y, and back"),
         "compare [geometry] with the robot: "
         f"which rail is {', '.join(labels)}, which way its slider counts, l0 or the three legs",
     )
 
 
-def in_mm(way: float) -> str:
-    """Say a signed length [m] in millimetres."""
-    return f"{way * 1e3 + 0.0:+.3f} mm"
+def format_mm(length: float) -> str:
+    """Return a signed length [m] in millimetres."""
+    return f"{length * 1e3 + 0.0:+.3f} mm"

@@ -1,4 +1,4 @@
-"""The step that tells the two kinds of stages apart: all three move, somebody reads an instrument beside a mark."""
+"""Step that identifies the mechanism's kind: all three drives move, a person reads an instrument beside a mark."""
 
 from __future__ import annotations
 
@@ -7,79 +7,96 @@ import math
 import numpy as np
 
 from trirail.commissioning import moves
-from trirail.commissioning.bench import Stopped
-from trirail.commissioning.judgement import Judged
-from trirail.commissioning.kinds import AXES, DISTINCT, NEAR, KindPredicted, judge_kind, predicted, way_apart
+from trirail.commissioning.bench import DrivesStoppedError
+from trirail.commissioning.judgement import Judgement
+from trirail.commissioning.mechanism_kind import (
+    AXES,
+    MARK_RADIUS_M,
+    MIN_SEPARATION,
+    MarkPrediction,
+    find_test_move,
+    judge_kind,
+    predict_mark,
+)
 from trirail.commissioning.observer import Observer
 from trirail.commissioning.report import Number
-from trirail.commissioning.session import Done, Session
+from trirail.commissioning.session import Session, StepOutcome
 from trirail.config import geometry
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import other_kind
 from trirail.kinematics.robot import forward
 
-REMEDY = "move the sliders, by hand or by their homing, to where the platform is well within its limits"
+REMEDY = "move the sliders, by hand or by homing, until the platform is well within its limits"
 
 
 class KindStep:
-    """One turn and one straight way, of which the middle is measured from outside."""
+    """A turn and a straight motion, whose middle part is measured from outside."""
 
-    def __init__(self, session: Session, see: Observer) -> None:
+    def __init__(self, session: Session, observer: Observer) -> None:
         self._session = session
-        self._see = see
-        self._config = session.place.config
-        self._person = session.place.person
+        self._observer = observer
+        self._config = session.environment.config
+        self._operator = session.environment.operator
         self._robot = geometry(self._config.geometry)
 
-    def run(self) -> Done:
-        """Find the way, go it, and judge by how far the mark went."""
+    def run(self) -> StepOutcome:
+        """Plan the motion, carry it out, and judge the travel of the mark."""
         bench = self._session.bench()
-        read_to = self._see.instrument()
+        resolution = self._observer.ask_instrument_resolution()
         try:
             other = other_kind(self._robot)
-            found = way_apart(self._config, self._robot, other, np.array(bench.position), read_to)
+            plan = find_test_move(self._config, self._robot, other, np.array(bench.position), resolution)
         except KinematicsError as error:
-            return Judged("failed", (str(error),), REMEDY), {}
-        if found is None:
-            return Judged("failed", ("no way from here is within the limits of either kind",), REMEDY), {}
-        way, expected = found
+            return Judgement("failed", (str(error),), REMEDY), {}
+        if plan is None:
+            return Judgement("failed", ("no test motion from here stays within the limits of both kinds",), REMEDY), {}
+        move, expected = plan
         kinds = self._robot.kind, other.kind
-        if expected.apart < DISTINCT * read_to:
-            return judge_kind(kinds, way, expected, None, read_to), _measured(expected, None, read_to)
-        axis, line = AXES[way.axis], AXES[way.along]
-        self._person.show(
-            f"  It turns by {math.degrees(way.turn):+.2f}° and goes {way.distance * 1e3:+.2f} mm along {line}. Let the "
-            f"instrument read a mark, pin or ball on the platform, within {NEAR * 1e3:g} mm of its centre, along {axis}"
-            f", its numbers rising towards +{axis}. The edge of a turned table will not do."
+        if expected.separation < MIN_SEPARATION * resolution:
+            return judge_kind(kinds, move, expected, None, resolution), _measured(expected, None, resolution)
+        axis, line = AXES[move.axis], AXES[move.along]
+        self._operator.show(
+            f"  The platform turns by {math.degrees(move.turn):+.2f}° and moves {move.distance * 1e3:+.2f} mm along "
+            f"{line}. Place the instrument at a mark, pin or ball on the platform, within {MARK_RADIUS_M * 1e3:g} mm "
+            f"of its centre, to read along {axis}, rising towards +{axis}. The edge of a turned table is no such mark."
         )
-        rules, start = self._see.rules(), np.array(bench.position)
+        rules, start = self._observer.read_rules(), np.array(bench.position)
 
-        def mark() -> float:
-            now, shown = self._see.rules(), None
+        def read_mark() -> float:
+            now, simulated = self._observer.read_rules(), None
             if now is not None and rules is not None:
-                shown = float(forward(self._robot, start + np.subtract(now, rules))[way.axis])
-            return self._see.mark(axis, shown)
+                simulated = float(forward(self._robot, start + np.subtract(now, rules))[move.axis])
+            return self._observer.ask_mark(axis, simulated)
 
         try:
-            self._go(way.first)
-            first, before = np.array(bench.position), mark()
-            self._go(way.second)
-            second, after = np.array(bench.position), mark()
-            self._go(start)
-        except Stopped as why:
-            return Judged("failed", (str(why),), "repeat the step of the slider that is named"), {}
-        seen = predicted(self._robot, other, first, second, way.axis)
+            self._move_to(move.first)
+            first, before = np.array(bench.position), read_mark()
+            self._move_to(move.second)
+            second, after = np.array(bench.position), read_mark()
+            self._move_to(start)
+        except DrivesStoppedError as error:
+            return Judgement("failed", (str(error),), "repeat the steps of the slider that is named"), {}
+        try:
+            seen = predict_mark(self._robot, other, first, second, move.axis)
+        except KinematicsError as error:  # at the edge of the other kind's reach the sliders may miss it by a count
+            return Judgement("failed", (str(error),), REMEDY), {}
         moved = after - before
-        return judge_kind(kinds, way, seen, moved, read_to), _measured(seen, moved, read_to)
+        return judge_kind(kinds, move, seen, moved, resolution), _measured(seen, moved, resolution)
 
-    def _go(self, to: Array) -> None:
-        """Move all three sliders to a place [m], with power for that long. Raises Stopped."""
+    def _move_to(self, target: Array) -> None:
+        """Move all three sliders to `target`, (3,) [m], enabled for that time only. Raises DrivesStoppedError."""
         bench = self._session.bench()
-        ways = to - np.array(bench.position)
+        distances = target - np.array(bench.position)
         with bench.power():
-            bench.play(moves.together(ways, self._config.limits.slider, bench.period))
+            bench.play(moves.plan_joint_move(distances, self._config.limits.slider, bench.period))
 
 
-def _measured(expected: KindPredicted, moved: float | None, read_to: float) -> dict[str, Number]:
-    return expected._asdict() | {"moved": moved, "read_to": read_to}
+def _measured(expected: MarkPrediction, moved: float | None, resolution: float) -> dict[str, Number]:
+    return {
+        "configured": expected.configured,
+        "other": expected.other,
+        "unsure": expected.uncertainty,
+        "moved": moved,
+        "read_to": resolution,
+    }

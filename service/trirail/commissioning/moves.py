@@ -1,4 +1,4 @@
-"""Small, slow, jerk-limited ways: of one slider, and of the platform around a square."""
+"""Small, slow, jerk-limited motions of one slider, of all three, and of the platform around a square."""
 
 from __future__ import annotations
 
@@ -11,80 +11,86 @@ from ruckig import InputParameter, Ruckig, Trajectory
 from trirail.config import Config, SliderLimits, geometry
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import forward, inverse
-from trirail.motion.ruckig_call import solved
+from trirail.motion.ruckig_call import try_solve
 from trirail.quantities import beyond
 
-DISTANCE = 0.001
-"""How far a slider, or the platform along a side of the square, is moved [m]."""
-VELOCITY = 0.005
-"""Greatest velocity [m/s]."""
-ACCELERATION = 0.05
-"""Greatest acceleration [m/s²]."""
-JERK = 1.0
-"""Greatest jerk [m/s³]."""
+TEST_DISTANCE_M = 0.001
+"""Travel of a slider, and side of the platform's square [m]."""
+MAX_VELOCITY = 0.005
+"""Velocity limit [m/s]."""
+MAX_ACCELERATION = 0.05
+"""Acceleration limit [m/s²]."""
+MAX_JERK = 1.0
+"""Jerk limit [m/s³]."""
 
-STILL = 1e-9
-"""Who goes less far stays where they are [m]."""
+MIN_DISTANCE_M = 1e-9
+"""Shorter travels count as none [m]: Ruckig needs a distance to share out."""
 
 
 class SlowMove(NamedTuple):
-    """A motion of the three sliders from where they stand, a row for each cycle."""
+    """Motion of the three sliders relative to its start, one row per cycle."""
 
     position: Array
-    """How far each slider is from where it began, (N, 3) [m]."""
+    """Offsets from the start, (N, 3) [m]."""
     velocity: Array
-    """Their velocities, (N, 3) [m/s]."""
+    """Velocities, (N, 3) [m/s]."""
 
 
-def profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array, Array]:
+def plan_profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array, Array]:
     """Return positions [m] and velocities [m/s] from rest to rest, (N,) each, the last one at `distance` [m].
 
-    Never faster than the constants above, nor than the configured `limits`.
+    The constants above and the configured `limits` both apply.
     """
     request = InputParameter(1)
     request.target_position = [distance]
-    request.max_velocity = [min(VELOCITY, *limits.velocities)]
-    request.max_acceleration = [min(ACCELERATION, *limits.accelerations)]
-    request.max_jerk = [min(JERK, *limits.jerks)]
+    request.max_velocity = [min(MAX_VELOCITY, *limits.velocities)]
+    request.max_acceleration = [min(MAX_ACCELERATION, *limits.accelerations)]
+    request.max_jerk = [min(MAX_JERK, *limits.jerks)]
     trajectory = Trajectory(1)
-    if not solved(Ruckig(1), request, trajectory):
+    if not try_solve(Ruckig(1), request, trajectory):
         raise ValueError(f"Ruckig finds no motion over {distance} m")
     times = np.arange(1, math.ceil(trajectory.duration / period) + 1) * period
     rows = np.array([trajectory.at_time(min(time, trajectory.duration))[:2] for time in times])
     return rows[:, 0, 0], rows[:, 1, 0]
 
 
-def together(ways: Array, limits: SliderLimits, period: float) -> SlowMove:
-    """Return the way of all three over `ways` (3,) [m], on a straight line between them."""
-    longest = float(np.abs(ways).max())
-    along, rate = profile(max(longest, STILL), limits, period)
-    shares = ways / max(longest, STILL)
+def plan_joint_move(distances: Array, limits: SliderLimits, period: float) -> SlowMove:
+    """Return a motion of all three sliders over `distances` (3,) [m], on a straight line between both ends."""
+    longest = float(np.abs(distances).max())
+    along, rate = plan_profile(max(longest, MIN_DISTANCE_M), limits, period)
+    shares = distances / max(longest, MIN_DISTANCE_M)
     return SlowMove(along[:, None] * shares, rate[:, None] * shares)
 
 
-def of_slider(index: int, distance: float, limits: SliderLimits, period: float) -> SlowMove:
-    """Return the way of one slider over `distance` [m]; the others stand."""
-    along, rate = profile(distance, limits, period)
+def plan_slider_move(index: int, distance: float, limits: SliderLimits, period: float) -> SlowMove:
+    """Return a motion of one slider over `distance` [m]; the others hold."""
+    along, rate = plan_profile(distance, limits, period)
     position, velocity = np.zeros((len(along), 3)), np.zeros((len(along), 3))
     position[:, index], velocity[:, index] = along, rate
     return SlowMove(position, velocity)
 
 
-def square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMove, Array]:
-    """Return the sliders' way for a square of the platform from where it stands, and its poses, (N, 3).
+def plan_square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMove, Array]:
+    """Return the sliders' motion for a square of the platform from its current pose, and the poses, (N, 3).
 
-    Along x, along y, and back, `DISTANCE` each. Raises KinematicsError where the sliders belong to no pose, ValueError
-    where the way leaves a limit.
+    The platform moves along x, along y, and back, `TEST_DISTANCE_M` each.
+
+    Raises
+    ------
+    KinematicsError
+        If the slider positions belong to no pose.
+    ValueError
+        If the square leaves a limit.
     """
     robot = geometry(config.geometry)
     start = forward(robot, sliders)
-    along, rate = profile(DISTANCE, config.limits.slider, config.period)
+    along, rate = plan_profile(TEST_DISTANCE_M, config.limits.slider, config.period)
     sides = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)]
     poses, rates, corner = [], [], np.array(start)
     for side in np.array(sides):
         poses.append(corner + along[:, None] * side)
         rates.append(rate[:, None] * side)
-        corner = corner + DISTANCE * side
+        corner = corner + TEST_DISTANCE_M * side
     path = np.concatenate(poses)
     motion = inverse(robot, path, np.concatenate(rates))
     platform, slider = config.limits.platform, config.limits.slider
@@ -98,10 +104,10 @@ def square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMov
         ),
         ("a passive joint", "m", motion.passive_position, slider.passive),
     ):
-        for value, limit, outside in (
+        for value, limit, is_outside in (
             (values.min(), low, values.min() < low),
             (values.max(), high, values.max() > high),
         ):
-            if outside:
+            if is_outside:
                 raise ValueError(beyond(name, float(value), limit, unit))
     return SlowMove(motion.position - np.array(sliders), motion.velocity), path

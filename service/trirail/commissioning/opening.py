@@ -1,4 +1,4 @@
-"""Opens the bus for a commissioning, and leaves the drives without power whatever happens."""
+"""Opening of the bus for a commissioning; the drives are left without power in every case."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus
 
 from trirail.commissioning.bench import Bench
-from trirail.commissioning.person import Person
-from trirail.commissioning.session import Place, Session
+from trirail.commissioning.person import Operator
+from trirail.commissioning.session import Environment, Session
 from trirail.commissioning.steps import Steps
 from trirail.config import Config
 from trirail.kinematics.robot import warm_up
@@ -21,47 +21,47 @@ from trirail.processes import realtime
 from trirail.processes.clock import Ticker
 
 
-class SimulatedTime:
-    """The time of simulated drives: it goes on by a period a cycle, so a busy machine slows it and misses nothing."""
+class SimulatedClock:
+    """Clock of simulated drives: it advances by one period per cycle, so that a busy machine misses no cycle."""
 
     def __init__(self, period: float, sleep: Callable[[float], None]) -> None:
         self._period = period
         self._sleep = sleep
         self._now = self._due = time.monotonic()
-        self._freed: float | None = None
+        self._free_since: float | None = None
 
     def __call__(self) -> float:
-        """Tell the time [s]."""
-        return self._now if self._freed is None else self._now + time.monotonic() - self._freed
+        """Return the time [s]."""
+        return self._now if self._free_since is None else self._now + time.monotonic() - self._free_since
 
     def tick(self) -> int:
-        """Go on by a period, not before its time; return the number of cycles missed, none."""
+        """Wait for the next cycle and advance by a period; return 0, the number of cycles missed."""
         self._now += self._period
         self._due = max(self._due + self._period, time.monotonic() - self._period)
         self._sleep(max(0.0, self._due - time.monotonic()))
         return 0
 
-    def free(self) -> None:
-        """Go on by itself from now on, where nobody turns cycles any more."""
-        self._freed = time.monotonic()
+    def run_freely(self) -> None:
+        """Follow the machine's clock from now on: closing a driver waits, and no cycle advances this clock."""
+        self._free_since = time.monotonic()
 
 
 @contextmanager
 def open_steps(
     config: Config,
     faults: Sequence[str],
-    person: Person,
+    operator: Operator,
     interrupted: Callable[[], bool],
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Steps]:
-    """Yield the steps on the configured bus; `faults` on demand are of simulated drives.
+    """Yield the steps on the configured bus; `faults` are faults on demand of simulated drives.
 
-    Real drives have real-time rights, as the service has them: `loop.realtime`. Raises BusError, FaultSyntaxError,
-    ServiceError.
+    With real drives the process takes real-time rights, as the service does: `loop.realtime`. Raises BusError,
+    FaultSyntaxError, ServiceError.
     """
     warm_up()
     driver: DriveGroup | None = None
-    simulated = SimulatedTime(config.period, sleep)
+    simulated = SimulatedClock(config.period, sleep)
     clock: Clock = simulated if config.can.interface == "simulated" else time.monotonic
     with open_bus(config.can, config.drives, clock) as bus:
         rules = None
@@ -70,8 +70,8 @@ def open_steps(
                 bus.faults.add(line)
             rules = bus.faults.carriages
         else:
-            for lack in realtime.acquire(config.loop):
-                person.show(f"without {lack}")
+            for missing in realtime.acquire(config.loop):
+                operator.show(f"without {missing}")
 
         def make_bench() -> Bench:
             nonlocal driver
@@ -85,8 +85,8 @@ def open_steps(
         read = None if inputs is None else inputs(bus, config.drives, clock)
         press = bus.press if isinstance(bus, SimulatedBus) else None
         try:
-            yield Steps(Session(Place(config, bus, make_bench, rules, person, interrupted, read, press)))
+            yield Steps(Session(Environment(config, bus, make_bench, rules, operator, interrupted, read, press)))
         finally:
-            simulated.free()
+            simulated.run_freely()
             if driver is not None:
                 driver.close()

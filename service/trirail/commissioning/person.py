@@ -1,68 +1,71 @@
-"""The person beside the robot, as the guide needs one: hears lines, answers questions, may refuse or leave."""
+"""Interface to the person beside the robot: lines to show, questions to ask."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from trirail.commissioning.judgement import Judged
+from trirail.commissioning.judgement import Judgement
 from trirail.wire.units import LENGTH, quantity
 
 
-class Quit(Exception):
-    """The person wants to go no further."""
+class QuitRequest(Exception):
+    """The person ends the commissioning."""
 
 
 class Question(NamedTuple):
-    """What a person is asked."""
+    """Question to a person."""
 
     text: str
     default: str | None = None
-    """What an empty answer means; None where there is no such thing."""
+    """Meaning of an empty answer; None if an answer is required."""
 
 
-class Person(Protocol):
-    """Who answers. Raises Quit where there are no answers left."""
+class Operator(Protocol):
+    """Person who answers. Raises QuitRequest when there are no more answers."""
 
     def show(self, line: str) -> None:
         """Show a line."""
 
-    def judged(self, judged: Judged) -> None:
-        """Show what is thought of a step."""
+    def show_judgement(self, judgement: Judgement) -> None:
+        """Show the judgement of a step."""
 
     def ask(self, question: Question, idle: Callable[[], object]) -> str:
-        """Return the answer, stripped and never empty where there is a default; `idle` is called all the while.
+        """Return the answer, stripped; never empty if there is a default.
 
-        It keeps the drives alive: it must be called at least once a cycle, and itself waits for the next.
+        `idle` keeps the drives alive: it must be called at least once per cycle, and waits for the next one itself.
         """
 
 
-def choose(person: Person, idle: Callable[[], object], question: Question, choices: dict[str, str]) -> str:
-    """Return which of the choices, each with what it means, is taken; asks until it is one of them. Raises Quit."""
+def ask_choice(operator: Operator, idle: Callable[[], object], question: Question, choices: dict[str, str]) -> str:
+    """Return one of the choices, which map an answer to its meaning; ask until it is one. Raises QuitRequest."""
     while True:
-        answer = person.ask(question, idle).lower()
+        answer = operator.ask(question, idle).lower()
         if answer in ("q", "quit"):
-            raise Quit
-        found = [choice for choice in choices if choice.lower() == answer]
-        if found:
-            return found[0]
-        told = ", ".join(f"{choice} ({means})" for choice, means in choices.items())
-        person.show(f'  "{answer}" is no answer here; wanted: {told}, or q to leave')
+            raise QuitRequest
+        matches = [choice for choice in choices if choice.lower() == answer]
+        if matches:
+            return matches[0]
+        meanings = ", ".join(f"{choice} ({meaning})" for choice, meaning in choices.items())
+        operator.show(f'  "{answer}" is not an answer; expected: {meanings}, or q to quit')
 
 
-def length(
-    person: Person, idle: Callable[[], object], question: Question, low: float = -10.0, high: float = 10.0
+def ask_length(
+    operator: Operator, idle: Callable[[], object], question: Question, low: float = -10.0, high: float = 10.0
 ) -> float:
-    """Return the length that is answered [m], a bare number in mm; asks until one is within both [m]. Raises Quit."""
+    """Return a length [m] between both bounds, typed in mm unless it has a unit; ask until it is valid.
+
+    Raises QuitRequest.
+    """
     while True:
-        answer = person.ask(question, idle)
+        answer = operator.ask(question, idle)
         if answer.lower() in ("q", "quit"):
-            raise Quit
+            raise QuitRequest
         try:
             value = quantity(answer.replace(",", "."), LENGTH, "mm")
         except ValueError:
             value = float("nan")
         if low <= value <= high:
             return value
-        between = f"from {low * 1e3:g} to {high * 1e3:g} mm"
-        person.show(f'  "{answer}" is no length {between}; as in: 12.35, 350um, 0.01in (or q to leave)')
+        bounds = f"from {low * 1e3:g} to {high * 1e3:g} mm"
+        operator.show(f'  "{answer}" is no length {bounds}; examples: 12.35, 350um, 0.01in (or q to quit)')

@@ -1,4 +1,4 @@
-"""What a commissioning has come to: kept in a file after every step, for programs and for people."""
+"""Report of a commissioning: saved after every step, as JSON for programs and as text for people."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ import msgspec
 from msgspec import Struct
 from trirail_drivers.errors import FileError
 
-from trirail.commissioning.judgement import Changes, Judged, Verdict
+from trirail.commissioning.judgement import Changes, Judgement, Verdict
 
 Number = float | int | str | bool | None
 
 
 class StepReport(Struct, frozen=True):
-    """A step that was carried out, or left out."""
+    """Entry of a step, carried out or left out."""
 
     step: str
     drive: str
-    """A, B or C; "" where it is of all three."""
+    """A, B or C; "" for a step of all three."""
     verdict: Verdict
     words: tuple[str, ...]
     remedy: str
     measured: dict[str, Number]
     """Lengths in m, times in s, signed."""
     changes: dict[str, int | float]
-    """Keys of the configuration and what they should have."""
+    """Proposed values of configuration keys."""
     at: str
-    """When it ended, by the wall clock (ISO 8601)."""
+    """Wall-clock time of its end (ISO 8601)."""
 
 
 class CommissioningReport(Struct):
-    """All steps in the order in which they were done; of one that was repeated the last counts."""
+    """Report of all steps in the order of their execution; of a repeated step the last run counts."""
 
     robot: str
     config: str
@@ -41,31 +41,31 @@ class CommissioningReport(Struct):
     simulated: bool
     software: str
     plan: tuple[tuple[str, str], ...] = ()
-    """The steps that there are, each with its drive."""
+    """All steps of the guide, each with its drive."""
     steps: list[StepReport] = []
     changes: dict[str, int | float] = {}
-    """What the configuration should say otherwise, all steps together."""
+    """Proposed values of configuration keys, all steps together."""
     written: str | None = None
-    """The configuration that was written."""
+    """Path of the corrected configuration."""
 
     @property
     def latest(self) -> dict[tuple[str, str], StepReport]:
-        """Of each step the last time that it was done."""
+        """Last run of each step."""
         return {(entry.step, entry.drive): entry for entry in self.steps}
 
     @property
     def ok(self) -> bool:
-        """Whether nothing was found wrong and nothing failed, of what was done."""
+        """True if no step that was run found a defect or failed."""
         return all(entry.verdict in ("ok", "skipped") for entry in self.latest.values())
 
     @property
     def complete(self) -> bool:
-        """Whether every step was done and is as it should be."""
-        return bool(self.steps) and not self.left
+        """True if every step was run and is ok."""
+        return bool(self.steps) and not self.incomplete
 
     @property
-    def left(self) -> list[str]:
-        """The steps that were not done, or are not as they should be."""
+    def incomplete(self) -> list[str]:
+        """Steps that were not run, or are not ok."""
         latest = self.latest
         return [
             f"{step} {drive}".rstrip()
@@ -74,54 +74,54 @@ class CommissioningReport(Struct):
         ]
 
 
-class Keeper:
-    """Keeps a report in a file of its own, and the same in words beside it."""
+class ReportFile:
+    """A report's JSON file, and the text file for people beside it."""
 
     def __init__(self, report: CommissioningReport, path: Path) -> None:
-        """Raises FileError where there is such a file already, or none can be made."""
+        """Raises FileError if the file exists, or cannot be created."""
         self.report = report
         self.path = path
         try:
             path.touch(exist_ok=False)
         except FileExistsError:
-            raise FileError(f"{path} exists already: name another file with --report") from None
+            raise FileError(f"{path} exists already; name another file with --report") from None
         except OSError as error:
             raise FileError(f"{path}: {error.strerror}") from error
 
     @property
-    def text(self) -> Path:
-        """The file for people."""
+    def text_path(self) -> Path:
+        """Path of the text file."""
         return self.path.with_suffix(".txt")
 
-    def add(self, step: str, drive: str, judged: Judged, measured: dict[str, Number]) -> None:
-        """Note a step and write the file anew."""
+    def add(self, step: str, drive: str, judgement: Judgement, measured: dict[str, Number]) -> None:
+        """Add a step and save the report."""
         entry = StepReport(
-            step, drive, judged.verdict, judged.words, judged.remedy, measured, dict(judged.changes), now()
+            step, drive, judgement.verdict, judgement.words, judgement.remedy, measured, dict(judgement.changes), now()
         )
         self.report.steps.append(entry)
         self.save()
 
     def conclude(self, changes: Changes, written: Path | None) -> None:
-        """Note what it has come to."""
+        """Set the proposed changes and the path of the corrected configuration, and save the report."""
         self.report.changes, self.report.written = dict(changes), None if written is None else str(written)
         self.save()
 
     def save(self) -> None:
-        """Write both files; each is there whole, before and after."""
+        """Replace both files, each atomically."""
         _replace(self.path, msgspec.json.format(msgspec.json.encode(content(self.report)), indent=2).decode() + "\n")
-        _replace(self.text, "\n".join(words(self.report)) + "\n")
+        _replace(self.text_path, "\n".join(format_lines(self.report)) + "\n")
 
 
 def content(report: CommissioningReport) -> dict[str, object]:
-    """Return a report as plain values, with what it comes to."""
+    """Return a report as plain values, with its overall result."""
     return {"ok": report.ok, "complete": report.complete, **msgspec.to_builtins(report)}
 
 
-def words(report: CommissioningReport) -> list[str]:
+def format_lines(report: CommissioningReport) -> list[str]:
     """Return a report as lines for people."""
-    lines = [f"Commissioning of robot {report.robot}, {report.config}", f"begun {report.began}, {report.software}"]
+    lines = [f"Commissioning of robot {report.robot}, {report.config}", f"started {report.began}, {report.software}"]
     if report.simulated:
-        lines.append("on simulated drives")
+        lines.append("simulated drives")
     for entry in report.steps:
         lines += ["", f"{entry.step} {entry.drive}".rstrip() + f": {entry.verdict}"]
         lines += [f"  {word}" for word in entry.words]
@@ -131,7 +131,7 @@ def words(report: CommissioningReport) -> list[str]:
     lines += [f"{key} should be {value:g}" for key, value in report.changes.items()]
     if report.written:
         lines.append(f"written to {report.written}")
-    lines.append("everything is as it should be" if report.complete else f"not passed: {', '.join(report.left)}")
+    lines.append("all steps passed" if report.complete else f"not passed: {', '.join(report.incomplete)}")
     return lines
 
 
@@ -141,9 +141,9 @@ def now() -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    beside = path.with_name(f".{path.name}.new")
+    temporary = path.with_name(f".{path.name}.new")
     try:
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, path)
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
     except OSError as error:
         raise FileError(f"{path}: {error.strerror}") from error

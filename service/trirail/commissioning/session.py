@@ -1,4 +1,4 @@
-"""One commissioning on its bus: who is there, the drives' set-up, and the bench that comes of it."""
+"""State of a commissioning on its bus: the drives that answer, their set-up, and the bench."""
 
 from __future__ import annotations
 
@@ -11,120 +11,126 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import Carriages
 
-from trirail.commissioning import drives_told
-from trirail.commissioning.bench import Bench, Stopped
-from trirail.commissioning.judgement import Judged
-from trirail.commissioning.person import Person
+from trirail.commissioning import drive_report
+from trirail.commissioning.bench import Bench, DrivesStoppedError
+from trirail.commissioning.judgement import Judgement
+from trirail.commissioning.person import Operator
 from trirail.commissioning.report import Number
 from trirail.config import Config
 
-SETTLED = 0.5
-"""How long drives are looked at that have just been set up [s]."""
-IDLE = 0.01
-"""How often it is looked for an answer while no drive has been set up [s]."""
+SETUP_CHECK_S = 0.5
+"""Time for which drives are observed after their set-up [s]."""
+POLL_INTERVAL_S = 0.01
+"""Interval at which an answer is looked for before the drives' set-up [s]."""
 
-Done = tuple[Judged, dict[str, Number]]
-"""What is to be thought of a step, and what was measured in it."""
+StepOutcome = tuple[Judgement, dict[str, Number]]
+"""Judgement of a step, and its measurements by name."""
 
 
-class Place(NamedTuple):
-    """Where all this happens."""
+class Environment(NamedTuple):
+    """Everything that a commissioning works with."""
 
     config: Config
     bus: can.BusABC
     make_bench: Callable[[], Bench]
-    """Sets the drives up and begins their cycle."""
+    """Configures the drives and starts their cycle."""
     rules: Carriages | None
-    """Where the sliders really are, of simulated drives."""
-    person: Person
+    """Rules beside simulated sliders; None beside real ones."""
+    operator: Operator
     interrupted: Callable[[], bool]
-    """Tells of Ctrl-C."""
+    """True once Ctrl-C was pressed."""
     inputs: Callable[[str], int | None] | None = None
-    """Reads a drive's digital inputs, object 60FDh: None where it has none to tell; None for drives without."""
+    """Reads a drive's digital inputs, object 60FDh, None if it has none; None for protocols without."""
     press: Callable[[int, int], None] | None = None
-    """Presses switches of a simulated drive: its index, and bits of 60FDh."""
+    """Presses switches of a simulated drive, given its index and bits of 60FDh."""
 
 
 class Session:
-    """Holds what is kept from step to step."""
+    """State that the steps share."""
 
-    def __init__(self, place: Place) -> None:
-        self.place = place
-        self._config = place.config
+    def __init__(self, environment: Environment) -> None:
+        self.environment = environment
+        self._config = environment.config
         self._bench: Bench | None = None
-        self._told: list[dict[str, object]] = []
+        self._inspected: list[dict[str, object]] = []
 
     @property
-    def tells_inputs(self) -> bool:
-        """Whether drives of this protocol tell which of their switches are pressed."""
-        return self.place.inputs is not None
+    def reports_inputs(self) -> bool:
+        """True if drives of this protocol report their digital inputs."""
+        return self.environment.inputs is not None
 
-    def bus(self) -> Done:
-        """Ask every drive who it is."""
+    def inspect_bus(self) -> StepOutcome:
+        """Read the identity of every drive."""
         drives = self._config.drives
         inspect = PROTOCOLS[drives.protocol].inspect
         if inspect is None:
-            words = (f"drives of protocol {drives.protocol} have no objects to be shown; the next step finds them",)
-            return Judged("ok", words), {}
+            words = (f"drives of protocol {drives.protocol} have no objects to inspect; the next step finds them",)
+            return Judgement("ok", words), {}
         fastest = self._config.limits.slider.fastest
-        self._told = inspect(self.place.bus, drives, self._config.period, time.monotonic, fastest, apply=False)
-        lines = tuple(line for each in self._told for line in drives_told.identity(each, self._config.geometry.labels))
-        refused = tuple(f"drive {each['name']}: {each['refused']}" for each in self._told if each["refused"])
+        self._inspected = inspect(
+            self.environment.bus, drives, self._config.period, time.monotonic, fastest, apply=False
+        )
+        lines = tuple(
+            line
+            for each in self._inspected
+            for line in drive_report.format_identity(each, self._config.geometry.labels)
+        )
+        refused = tuple(f"drive {each['name']}: {each['refused']}" for each in self._inspected if each["refused"])
         measured: dict[str, Number] = {}
-        for each in self._told:
+        for each in self._inspected:
             for key in ("node", "device_type", "vendor", "product", "revision", "serial", "modes", "way"):
                 if (value := each.get(key)) is not None:
                     measured[f"{each['name']}.{key}"] = value if isinstance(value, int | str) else str(value)
         if refused:
             remedy = (
-                "no answer: supply, wiring, 60 Ω across the unpowered bus, the same bitrate everywhere, node ids; "
-                "else what the line says"
+                "if a drive does not answer, check supply, wiring, 60 Ω across the unpowered bus, bitrates, node ids; "
+                "else follow the line above"
             )
-            return Judged("wrong", (*lines, *refused), remedy), measured
-        return Judged("ok", lines), measured
+            return Judgement("wrong", (*lines, *refused), remedy), measured
+        return Judgement("ok", lines), measured
 
-    def set_up(self) -> Done:
-        """Set all drives up, without power, and begin their cycle."""
+    def set_up(self) -> StepOutcome:
+        """Configure all drives, without power, and start their cycle."""
         self._bench = None
         try:
-            self._bench = self.place.make_bench()
+            self._bench = self.environment.make_bench()
         except DriveError as error:
-            return Judged("failed", (str(error),), "what the line says; no drive has power"), {}
-        self._bench.wait(SETTLED)
+            return Judgement("failed", (str(error),), "follow the line above; no drive has power"), {}
+        self._bench.wait(SETUP_CHECK_S)
         if (fault := self._bench.feedback.fault) is not None:
             try:
-                self._bench.clear()
-            except Stopped as stopped:
-                return Judged("failed", (str(stopped),), "remove the cause, then repeat this step"), {}
-            return Judged("ok", (f"was in fault, and could be reset: {fault.message}",)), {}
-        written = sum(len(_differences(each)) for each in self._told)
+                self._bench.clear_fault()
+            except DrivesStoppedError as error:
+                return Judgement("failed", (str(error),), "remove the cause, then repeat this step"), {}
+            return Judgement("ok", (f"a fault was reset: {fault.message}",)), {}
+        written = sum(len(_changed_values(each)) for each in self._inspected)
         words = (f"set up, {written} values written, nothing stored; SYNC runs at {self._config.loop.rate_hz} Hz",)
-        return Judged("ok", words), {"written": written}
+        return Judgement("ok", words), {"written": written}
 
-    def changes_of_set_up(self) -> list[str]:
-        """Return what the set-up would change, as lines: what is so of several drives once."""
-        of: dict[str, list[str]] = {}
-        for each in self._told:
-            for line in drives_told.differences(each, applied=False):
-                of.setdefault(line.strip().removeprefix("would be written: "), []).append(str(each["name"]))
-        return [f"{', '.join(names)}: {line}" for line, names in of.items()]
+    def describe_setup(self) -> list[str]:
+        """Return the changes of the set-up as lines; a change that several drives share is one line."""
+        drives: dict[str, list[str]] = {}
+        for each in self._inspected:
+            for line in drive_report.format_differences(each, applied=False):
+                drives.setdefault(line.strip().removeprefix("would be written: "), []).append(str(each["name"]))
+        return [f"{', '.join(names)}: {line}" for line, names in drives.items()]
 
     def bench(self) -> Bench:
-        """Return the bench, once the drives have been set up."""
+        """Return the bench. Raises RuntimeError before the set-up."""
         if self._bench is None:
-            raise RuntimeError("the drives have not been set up")
+            raise RuntimeError("the drives are not set up")
         return self._bench
 
     def idle(self) -> None:
-        """Wait a little, and keep the drives alive."""
+        """Wait for a cycle, and keep the drives alive."""
         if self._bench is not None:
             self._bench.cycle()
-        elif self.place.interrupted():
+        elif self.environment.interrupted():
             raise KeyboardInterrupt
         else:
-            time.sleep(IDLE)
+            time.sleep(POLL_INTERVAL_S)
 
 
-def _differences(told: dict[str, object]) -> list[object]:
-    found = told.get("differences")
-    return found if isinstance(found, list) else []
+def _changed_values(drive: dict[str, object]) -> list[object]:
+    changed = drive.get("differences")
+    return changed if isinstance(changed, list) else []

@@ -1,4 +1,4 @@
-"""The steps of a commissioning: each asks, moves or looks, and returns what is to be thought of it."""
+"""Steps of a commissioning: each asks, moves or measures, and returns its judgement."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from trirail_drivers.interface import NAMES
 
 from trirail import naming
 from trirail.commissioning import moves
-from trirail.commissioning.bench import Stopped
-from trirail.commissioning.coupling import MoveSeen, PushSeen, judge_move, judge_push
+from trirail.commissioning.bench import DrivesStoppedError
+from trirail.commissioning.coupling import MoveObservation, PushObservation, judge_move, judge_push
 from trirail.commissioning.judgement import (
     SWITCHES,
-    Judged,
+    Judgement,
     judge_homing,
     judge_power,
     judge_square,
@@ -21,242 +21,262 @@ from trirail.commissioning.judgement import (
     judge_watchdog,
 )
 from trirail.commissioning.kind_step import REMEDY, KindStep
-from trirail.commissioning.observer import Observer, Reading, apart
-from trirail.commissioning.person import Question, choose
+from trirail.commissioning.observer import Observer, Reading, subtract
+from trirail.commissioning.person import Question, ask_choice
 from trirail.commissioning.report import Number
-from trirail.commissioning.session import Done, Session
+from trirail.commissioning.session import Session, StepOutcome
 from trirail.config import geometry
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward
 
-HOLD = 1.0
-"""How long a drive holds its slider when it gets power for the first time [s]."""
-PUSH = 0.010
-"""How far a slider is best pushed by hand [m]."""
-LOOK = 0.05
-"""How often digital inputs are read while switches are pressed [s]."""
+HOLD_TIME_S = 1.0
+"""Time for which a drive holds its slider when it is first enabled [s]."""
+PUSH_DISTANCE_M = 0.010
+"""Recommended travel of a slider by hand [m]."""
+INPUT_POLL_S = 0.05
+"""Interval at which digital inputs are read while switches are pressed [s]."""
 
 
 class Steps:
-    """What can be done with drives that have been set up, in whatever order."""
+    """Steps with drives that have been set up, callable in any order."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self._config = session.place.config
-        self._place = session.place
-        self._person = session.place.person
-        self._labels = session.place.config.geometry.labels
-        self._see = Observer(session.place.person, session.place.rules, session.idle, self._labels)
+        self._config = session.environment.config
+        self._environment = session.environment
+        self._operator = session.environment.operator
+        self._labels = session.environment.config.geometry.labels
+        self._observer = Observer(session.environment.operator, session.environment.rules, session.idle, self._labels)
 
-    def labelled(self, name: str) -> str:
-        """Return what people call the slider A, B or C."""
+    def slider_label(self, name: str) -> str:
+        """Return the display name of slider A, B or C."""
         return naming.label(name, self._labels)
 
     # Without power.
 
-    def push(self, name: str) -> Done:
-        """Have a slider pushed there and back by hand, without power."""
+    def push(self, name: str) -> StepOutcome:
+        """Have a slider pushed out and back by hand, without power."""
         bench, index = self.session.bench(), NAMES.index(name)
-        read_to = self._see.read_to()
-        label = self.labelled(name)
+        resolution = self._observer.ask_rule_resolution()
+        label = self.slider_label(name)
         angle = np.degrees(geometry(self._config.geometry).each[index].rail_angle)
-        self._person.show(
-            f"  Put the rule along rail {label}, its numbers rising towards {angle:.0f}° (0° is x, 90° is y)."
+        self._operator.show(f"  Put the rule along rail {label}, rising towards {angle:.0f}° (0° is x, 90° is y).")
+        start = self._observer.ask_rule(index), bench.position
+        end = self._observe_push(
+            index,
+            PUSH_DISTANCE_M,
+            f"Push slider {label} by {PUSH_DISTANCE_M * 1e3:g} mm or more in that direction, and release it.",
         )
-        before = self._see.reading(index), bench.position
-        there = self._pushed(index, PUSH, f"Push slider {label} by {PUSH * 1e3:g} mm or more, that way, and let it go.")
-        back = self._pushed(index, -PUSH, f"Push slider {label} back to about where it was, and let it go.")
-        (rule, ways), (rule_back, ways_back) = apart(before, there), apart(there, back)
-        seen = PushSeen(name, rule, ways, rule_back, ways_back, read_to, self._step(name), self._labels)
-        measured: dict[str, Number] = {"rule": rule, "rule_back": rule_back, "read_to": read_to}
-        measured |= dict(zip(NAMES, ways, strict=True))
-        measured |= {f"{each}_back": way for each, way in zip(NAMES, ways_back, strict=True)}
+        returned = self._observe_push(
+            index, -PUSH_DISTANCE_M, f"Push slider {label} back to about its start, and release it."
+        )
+        (rule, counted), (rule_back, counted_back) = subtract(end, start), subtract(returned, end)
+        seen = PushObservation(
+            name, rule, counted, rule_back, counted_back, resolution, self._encoder_resolution(name), self._labels
+        )
+        measured: dict[str, Number] = {"rule": rule, "rule_back": rule_back, "read_to": resolution}
+        measured |= dict(zip(NAMES, counted, strict=True))
+        measured |= {f"{each}_back": length for each, length in zip(NAMES, counted_back, strict=True)}
         return judge_push(seen, self._config.drives), measured
 
-    def _pushed(self, index: int, by: float, text: str) -> Reading:
-        """Have a slider pushed; where the rule and the drives then say that it is."""
+    def _observe_push(self, index: int, by: float, text: str) -> Reading:
+        """Have a slider pushed `by` a distance [m], and return its readings afterwards."""
         bench = self.session.bench()
-        if self._place.rules is None:
-            self._person.show(f"  {text}")
+        if self._environment.rules is None:
+            self._operator.show(f"  {text}")
         else:
-            self._place.rules.push(index, by)
-            bench.wait(HOLD / 10.0)
-            self._person.show(f"  A simulated hand has pushed slider {self._labels[index]} {by * 1e3:+g} mm that way.")
-        return self._see.reading(index), bench.position
+            self._environment.rules.push(index, by)
+            bench.wait(HOLD_TIME_S / 10.0)
+            self._operator.show(f"  Simulated push of slider {self._labels[index]}: {by * 1e3:+g} mm.")
+        return self._observer.ask_rule(index), bench.position
 
-    def switches(self, name: str) -> Done:
+    def switches(self, name: str) -> StepOutcome:
         """Have the switches of a slider pressed by hand, without power."""
-        bench, read = self.session.bench(), self._place.inputs
+        bench, read = self.session.bench(), self._environment.inputs
         rest = read(name) if read is not None else None
         if read is None or rest is None:
-            told = f"drive {name} does not tell its digital inputs (60FDh): look at them with its maker's tool"
-            return Judged("skipped", (told,)), {}
-        changed, turned, slider = 0, 0, f"slider {self.labelled(name)}"
+            reason = f"drive {name} does not report its digital inputs (60FDh): check them with its maker's tool"
+            return Judgement("skipped", (reason,)), {}
+        changed, cycles, slider = 0, 0, f"slider {self.slider_label(name)}"
 
         def read_switches() -> None:
-            nonlocal changed, turned
+            nonlocal changed, cycles
             self.session.idle()
-            turned += 1
-            if turned % max(1, round(LOOK / bench.period)) == 0:
+            cycles += 1
+            if cycles % max(1, round(INPUT_POLL_S / bench.period)) == 0:
                 changed |= (read(name) or 0) ^ rest
 
-        if (press := self._place.press) is None:
-            text = f"Press each limit switch and the home switch of {slider} for a second; Enter when that is done"
-            choose(self._person, read_switches, Question(text, "done"), {"done": "all were pressed"})
+        if (press := self._environment.press) is None:
+            text = f"Press each limit switch and the home switch of {slider} for a second, then press Enter"
+            ask_choice(self._operator, read_switches, Question(text, "done"), {"done": "all were pressed"})
         else:
-            self._person.show(f"  A simulated hand presses the switches of {slider}.")
+            self._operator.show(f"  Simulated presses of the switches of {slider}.")
             for bits in (*SWITCHES, 0):
                 press(NAMES.index(name), bits)
-                for _ in range(round(2.0 * LOOK / bench.period)):
+                for _ in range(round(2.0 * INPUT_POLL_S / bench.period)):
                     read_switches()
-        found = [switch for bit, switch in SWITCHES.items() if changed & bit]
-        seen = self._see.yes(f"Seen were: {', '.join(found) or 'none'}. Are those all that {slider} has?")
-        return judge_switches(name, rest, changed, seen, self._labels), {"at_rest": rest & 7, "changed": changed & 7}
+        changed_names = [switch for bit, switch in SWITCHES.items() if changed & bit]
+        confirmed = self._observer.ask_yes_no(
+            f"Switches that changed: {', '.join(changed_names) or 'none'}. Are those all that {slider} has?"
+        )
+        return judge_switches(name, rest, changed, confirmed, self._labels), {
+            "at_rest": rest & 7,
+            "changed": changed & 7,
+        }
 
     # With power, one drive alone.
 
-    def power(self, name: str) -> Done:
-        """Give one drive power, let it hold its slider, and take it off."""
+    def power(self, name: str) -> StepOutcome:
+        """Enable one drive, let it hold its slider, and disable it."""
         bench, stopped = self.session.bench(), ""
         try:
             with bench.power(name):
-                bench.wait(HOLD)
-        except Stopped as why:
-            stopped = str(why)
-        drift = bench.worst[NAMES.index(name)]
-        return judge_power(name, drift, HOLD, stopped), {"drift": drift}
+                bench.wait(HOLD_TIME_S)
+        except DrivesStoppedError as error:
+            stopped = str(error)
+        drift = bench.max_errors[NAMES.index(name)]
+        return judge_power(name, drift, HOLD_TIME_S, stopped), {"drift": drift}
 
-    def move(self, name: str) -> Done:
-        """Move one slider there and back, its drive alone with power; a person looks what has moved, and how far."""
+    def move(self, name: str) -> StepOutcome:
+        """Move one slider out and back, its drive enabled alone; a person reports which slider moved, and how far."""
         index, drives = NAMES.index(name), self._config.drives
-        read_to = self._see.read_to()
-        asked = self._way(index)
-        before = self._see.reading(index)
-        before_all = self._see.rules()
-        there = self._moved(index, asked)
-        rules = self._see.rules()
-        slider = self._see.which(before_all, rules)
-        measured: dict[str, Number] = {"asked": asked, "out": there.way, "slider": slider}
-        rule_out = rule_back = back_way = 0.0
+        resolution = self._observer.ask_rule_resolution()
+        commanded = self._choose_distance(index)
+        before = self._observer.ask_rule(index)
+        before_all = self._observer.read_rules()
+        out = self._move_slider(index, commanded)
+        rules = self._observer.read_rules()
+        slider = self._observer.ask_moved_slider(before_all, rules)
+        measured: dict[str, Number] = {"asked": commanded, "out": out.travel, "slider": slider}
+        rule_out = rule_back = travel_back = 0.0
         if slider is not None:
-            rule_out = self._see.gone(name, slider, before, before_all, rules, "go")
-        if slider is not None and not there.stopped:
-            back = self._moved(index, -asked)
-            back_way = back.way
-            there = there._replace(stopped=back.stopped, following=max(there.following, back.following))
-            now = self._see.rules()
+            rule_out = self._observer.ask_travel(name, slider, before, before_all, rules, "move")
+        if slider is not None and not out.stopped:
+            back = self._move_slider(index, -commanded)
+            travel_back = back.travel
+            out = out._replace(stopped=back.stopped, following=max(out.following, back.following))
+            now = self._observer.read_rules()
             if slider == name:
-                rule_back = self._see.gone(name, slider, before, before_all, now, "go")
+                rule_back = self._observer.ask_travel(name, slider, before, before_all, now, "move")
             else:
-                rule_back = rule_out + self._see.gone(name, slider, before, rules, now, "go back")
-        seen = MoveSeen(
+                rule_back = rule_out + self._observer.ask_travel(name, slider, before, rules, now, "move back")
+        seen = MoveObservation(
             name,
-            asked,
-            there.way,
-            back_way,
-            there.following,
-            there.stopped,
+            commanded,
+            out.travel,
+            travel_back,
+            out.following,
+            out.stopped,
             slider,
             rule_out,
             rule_back,
-            read_to,
-            self._step(name),
+            resolution,
+            self._encoder_resolution(name),
             self._labels,
         )
-        measured |= {"back": back_way, "following": there.following, "stopped": there.stopped}
-        measured |= {"rule_out": rule_out, "rule_back": rule_back, "read_to": read_to}
+        measured |= {"back": travel_back, "following": out.following, "stopped": out.stopped}
+        measured |= {"rule_out": rule_out, "rule_back": rule_back, "read_to": resolution}
         return judge_move(seen, drives), measured
 
-    def home(self, name: str) -> Done:
-        """Home one drive, which alone has power."""
+    def home(self, name: str) -> StepOutcome:
+        """Home one drive, enabled alone."""
         bench, index = self.session.bench(), NAMES.index(name)
         homing = self._config.drives.each[index].homing
         if homing is None:
-            return Judged("ok", ("its encoder is absolute: nothing to home",)), {}
-        began, stopped, rules = bench.position[index], "", self._see.rules()
+            return Judgement("ok", ("no homing: its encoder is absolute",)), {}
+        start, stopped, rules = bench.position[index], "", self._observer.read_rules()
         try:
             with bench.power(name):
                 bench.home(homing.timeout)
-                bench.wait(HOLD / 2.0)
-        except Stopped as why:
-            stopped = str(why)
+                bench.wait(HOLD_TIME_S / 2.0)
+        except DrivesStoppedError as error:
+            stopped = str(error)
         position = bench.position[index]
-        now = self._see.rules()
-        way = position - began if rules is None or now is None else now[index] - rules[index]
-        seen = stopped or self._see.yes(f"Did slider {self.labelled(name)} stop at its home switch?")
-        judged = judge_homing(name, way, position, bool(seen), stopped, self._labels)
-        return judged, {"way": way, "position": position, "stopped": stopped}
+        now = self._observer.read_rules()
+        travel = position - start if rules is None or now is None else now[index] - rules[index]
+        confirmed = stopped or self._observer.ask_yes_no(
+            f"Did slider {self.slider_label(name)} stop at its home switch?"
+        )
+        judgement = judge_homing(name, travel, position, bool(confirmed), stopped, self._labels)
+        return judgement, {"way": travel, "position": position, "stopped": stopped}
 
-    def watchdog(self, name: str) -> Done:
-        """Let one powered drive hear nothing any more, and see whether it lets go."""
+    def watchdog(self, name: str) -> StepOutcome:
+        """Stop SYNC and heartbeat while one drive is enabled: it must switch its power off."""
         bench, heartbeat = self.session.bench(), self._config.drives.heartbeat
         try:
             with bench.power(name):
-                bench.wait(HOLD / 2.0)
-                silence = bench.silence(3.0 * heartbeat + HOLD)
-        except Stopped as why:
-            return Judged("failed", (str(why),), "repeat this step"), {}
-        judged = judge_watchdog(name, silence.seconds, silence.by, silence.said, silence.code)
-        return judged, {"seconds": silence.seconds, "said": silence.said}
+                bench.wait(HOLD_TIME_S / 2.0)
+                # Drives react within three heartbeats, see drives.heartbeat.
+                reaction = bench.provoke_watchdog(3.0 * heartbeat + HOLD_TIME_S)
+        except DrivesStoppedError as error:
+            return Judgement("failed", (str(error),), "repeat this step"), {}
+        judgement = judge_watchdog(name, reaction.seconds, reaction.drive, reaction.message, reaction.code)
+        return judgement, {"seconds": reaction.seconds, "said": reaction.message}
 
     # All three.
 
-    def square(self) -> Done:
+    def square(self) -> StepOutcome:
         """Move the platform around a small square."""
         bench, stopped, deviation = self.session.bench(), "", 0.0
         robot = geometry(self._config.geometry)
         try:
-            way, path = moves.square(self._config, bench.position)
+            move, path = moves.plan_square(self._config, bench.position)
         except (KinematicsError, ValueError) as error:
-            return Judged("failed", (str(error),), REMEDY), {}
+            return Judgement("failed", (str(error),), REMEDY), {}
         half = len(path) // 2
-        rules = self._see.rules()
+        rules = self._observer.read_rules()
         corner = rules
         try:
             with bench.power():
-                first = bench.play(moves.SlowMove(way.position[:half], way.velocity[:half]))
-                corner = self._see.rules()
-                rest = moves.SlowMove(way.position[half:] - way.position[half - 1], way.velocity[half:])
+                first = bench.play(moves.SlowMove(move.position[:half], move.velocity[:half]))
+                corner = self._observer.read_rules()
+                rest = moves.SlowMove(move.position[half:] - move.position[half - 1], move.velocity[half:])
                 second = bench.play(rest)
-            poses = forward(robot, np.concatenate([first.measured, second.measured]))[:, :2]
-            apart = np.linalg.norm(poses[:, None, :] - path[None, ::4, :2], axis=2).min(axis=1)
-            deviation = float(apart.max())
-        except Stopped as why:
-            stopped = str(why)
-        seen = bool(stopped) or self._see.square(way.position[half - 1], rules, corner)
-        following = dict(zip(NAMES, bench.worst, strict=True))
-        judged = judge_square(deviation, bench.worst, seen, stopped, self._labels)
-        return judged, {"deviation": deviation, "missed_cycles": bench.missed, **following}
+            poses = forward(robot, np.concatenate([first.position, second.position]))[:, :2]
+            # Every fourth commanded pose is enough: at 5 mm/s and 1 kHz they are 20 µm apart.
+            distances = np.linalg.norm(poses[:, None, :] - path[None, ::4, :2], axis=2).min(axis=1)
+            deviation = float(distances.max())
+        except DrivesStoppedError as error:
+            stopped = str(error)
+        confirmed = bool(stopped) or self._observer.ask_square(move.position[half - 1], rules, corner)
+        following = dict(zip(NAMES, bench.max_errors, strict=True))
+        judgement = judge_square(deviation, bench.max_errors, confirmed, stopped, self._labels)
+        return judgement, {"deviation": deviation, "missed_cycles": bench.missed_cycles, **following}
 
-    def kind(self) -> Done:
-        """Tell whether the robot is of the configured kind, by a mark that is measured from outside."""
-        return KindStep(self.session, self._see).run()
+    def kind(self) -> StepOutcome:
+        """Check the mechanism's kind by a mark that is measured from outside."""
+        return KindStep(self.session, self._observer).run()
 
-    def _moved(self, index: int, way: float) -> _Moved:
-        """Move one slider, its drive alone with power; it has none afterwards."""
+    def _move_slider(self, index: int, distance: float) -> _SliderMotion:
+        """Move one slider over `distance` [m], its drive enabled alone and disabled afterwards."""
         bench, stopped = self.session.bench(), ""
         before = bench.position[index]
         try:
             with bench.power(NAMES[index]):
-                bench.play(moves.of_slider(index, way, self._config.limits.slider, self._config.period))
-        except Stopped as why:
-            stopped = str(why)
-        bench.wait(HOLD / 10.0)
-        return _Moved(bench.position[index] - before, bench.worst[index], stopped)
+                bench.play(moves.plan_slider_move(index, distance, self._config.limits.slider, self._config.period))
+        except DrivesStoppedError as error:
+            stopped = str(error)
+        bench.wait(HOLD_TIME_S / 10.0)
+        return _SliderMotion(bench.position[index] - before, bench.max_errors[index], stopped)
 
-    def _way(self, index: int) -> float:
-        """Return how far to move a slider [m]: away from the limit of its travel, where it is known where it is."""
+    def _choose_distance(self, index: int) -> float:
+        """Return the signed test distance of a slider [m], away from a limit that is near if its position is known."""
         bench = self.session.bench()
-        beyond = bench.position[index] + 2.0 * moves.DISTANCE > self._config.limits.slider.positions[index][1]
-        return -moves.DISTANCE if beyond and bench.feedback.homed[index] else moves.DISTANCE
+        is_near_end = (
+            bench.position[index] + 2.0 * moves.TEST_DISTANCE_M > self._config.limits.slider.positions[index][1]
+        )
+        return -moves.TEST_DISTANCE_M if is_near_end and bench.feedback.homed[index] else moves.TEST_DISTANCE_M
 
-    def _step(self, name: str) -> float:
+    def _encoder_resolution(self, name: str) -> float:
         return 1.0 / self._config.drives.each[NAMES.index(name)].counts_per_metre
 
 
-class _Moved(NamedTuple):
-    """What a drive said of a way."""
+class _SliderMotion(NamedTuple):
+    """Motion of one slider, as its drive reports it."""
 
-    way: float
+    travel: float
+    """Signed travel [m]."""
     following: float
+    """Maximum following error [m]."""
     stopped: str
+    """Reason for a stop, or ""."""

@@ -1,6 +1,6 @@
-"""A configuration: its keys (`tables`), how it is read (`loading`) and what is refused (`checks`, `explained`)."""
+"""Configuration files: keys (`tables`), loading (`loading`), and checks (`impossible`, `explained`)."""
 
-from trirail.config.explained import Mistake, explain, overlap
+from trirail.config.explained import Mistake, overlap, wrong_values
 from trirail.config.impossible import check_as_built
 from trirail.config.loading import SIM, Findings, everything, load, parse, toml_tables
 from trirail.config.network_checks import check_reach
@@ -51,7 +51,6 @@ __all__ = [
     "check_reach",
     "corrected_geometry",
     "everything",
-    "explain",
     "geometry",
     "load",
     "metrics_url",
@@ -59,4 +58,5 @@ __all__ = [
     "parse",
     "room",
     "toml_tables",
+    "wrong_values",
 ]

@@ -1,7 +1,7 @@
-"""What a robot differs from its [geometry] by: the correction that a file holds, and whether limits have room for it.
+"""Map of as-built errors, the differences of a robot from its [geometry]: its file, and its check against the limits.
 
-The file is TOML, made by `tools/calibrate.py --map`: when, beside which geometry and where the robot was measured, and
-the nodes of trirail.kinematics.correction.
+The file is TOML, made by `tools/calibrate.py --map`: date, geometry and range of the measurement, and the nodes of
+trirail.kinematics.correction.
 """
 
 from __future__ import annotations
@@ -30,18 +30,19 @@ from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import CorrectionTold
 
 RESERVE = (0.02, 0.02, 0.07)
-"""Share of the sliders' limits of velocity, acceleration and jerk that plans leave (motion.feasibility.PLANNED). Every
-path is looked at with the correction in it; what it adds between two looks must find room in this, wherever it is."""
+"""Share of the sliders' limits of velocity, acceleration and jerk that plans leave free (motion.feasibility.PLANNED).
+Paths are sampled with the correction; its effect between two samples must fit into this share everywhere."""
 QUANTITIES = (("velocity", "m/s"), ("acceleration", "m/s²"), ("jerk", "m/s³"))
 MAKE = "python tools/calibrate.py --map"
-PARTS = 4
-"""Of a cell along each axis, at whose ends it is looked at what the map adds."""
-BEYOND = 0.03
-"""Of the sliders' travel, up to where it is looked: from between two places one of them is nearer [m]."""
+SAMPLES_PER_CELL = 4
+"""Samples of the map's effect per cell, along each axis."""
+TRAVEL_MARGIN_M = 0.03
+"""Distance beyond the sliders' travel up to which the map is sampled [m]: no reachable pose between samples is
+missed."""
 COORDINATES = (("x", "m"), ("y", "m"), ("phi", "rad"))
 
 Error = Annotated[float, Meta(ge=-0.02, le=0.02)]
-"""A coefficient of the correction [m] or [rad]: whoever needs more has another geometry."""
+"""Coefficient of the correction [m] or [rad]; a larger one belongs in [geometry]."""
 Node = tuple[Error, Error, Error]
 Row = Annotated[tuple[Node, ...], Meta(min_length=4, max_length=11)]
 Face = Annotated[tuple[Row, ...], Meta(min_length=4, max_length=11)]
@@ -50,99 +51,109 @@ Words = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
 class AsBuilt(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [correction.as_built]: what the file of `map` holds. Recordings have it; nobody else need write it."""
+    """Section [correction.as_built]: contents of the file of `map`. Recordings have it; people name a file instead."""
 
     made: Words
-    """When the robot was measured: a date."""
+    """Date of the measurement."""
     geometry: Annotated[str, Meta(pattern=r"^[0-9a-f]{8}$")]
-    """The [geometry] beside which it was measured, as `geometry_of` tells it from others."""
+    """Checksum of the [geometry] of the measurement, from `geometry_of`."""
     low: tuple[Place, Place, Place]
-    """Least x, y [m] and phi [rad] of the places that it is for."""
+    """Lower bounds x, y [m] and phi [rad] of the map."""
     high: tuple[Place, Place, Place]
-    """Greatest x, y [m] and phi [rad]."""
+    """Upper bounds x, y [m] and phi [rad] of the map."""
     nodes: Annotated[tuple[Face, ...], Meta(min_length=4, max_length=11)]
-    """Coefficients of uniform cubic B-splines, by x, y, phi, of what is added to a pose in x, y [m] and phi [rad]."""
+    """Coefficients of uniform cubic B-splines over x, y, phi: corrections of a pose's x, y [m] and phi [rad]."""
 
 
 prepare(AsBuilt)
 
 
 def geometry_of(robot: Geometry) -> str:
-    """Return eight digits that tell a geometry from others, to a nanometre and a nanoradian."""
+    """Return a checksum of a geometry, of eight digits, to a nanometre and a nanoradian."""
     numbers = np.round([np.hstack([*leg.keys().values()]) for leg in robot.each], 9) + 0.0
-    kind = b"" if robot.kind == "3-PRP" else robot.kind.encode()  # maps are older than the second kind
+    kind = b"" if robot.kind == "3-PRP" else robot.kind.encode()  # the first maps were made before 3-PPR existed
     return f"{zlib.crc32(numbers.tobytes() + kind):08x}"
 
 
-def correction(found: AsBuilt) -> Correction:
-    """Return the map itself. Raises ConfigError where it is none."""
+def correction(as_built: AsBuilt) -> Correction:
+    """Return the map as a correction of poses. Raises ConfigError if its nodes are invalid."""
     try:
-        return Correction(found.low, found.high, np.array(found.nodes))
+        return Correction(as_built.low, as_built.high, np.array(as_built.nodes))
     except ValueError as error:  # rows of different length; KinematicsError
         raise ConfigError(f"correction.as_built.nodes: {error}") from error
 
 
 def read(path: Path) -> AsBuilt:
-    """Read a map's file. Raises ConfigError, with the file and what is wrong in one line."""
+    """Read a map's file. Raises ConfigError with the file and the problem in one line."""
     try:
         return parse(files.text(path))
     except FileError as error:
         raise ConfigError(f"{error}; {MAKE} makes one") from error
     except ConfigError as error:
-        raise ConfigError(f"{path}: no map of as-built errors: {error}; {MAKE} makes one") from error
+        raise ConfigError(f"{path}: invalid map of as-built errors: {error}; {MAKE} makes one") from error
 
 
 def parse(text: str) -> AsBuilt:
-    """Read a map. Raises ConfigError."""
+    """Parse a map. Raises ConfigError."""
     try:
         return converted(tomllib.loads(text), AsBuilt)
     except RecursionError as error:
         raise ConfigError("its arrays are nested too deeply") from error
     except msgspec.ValidationError as error:
-        said = " ".join(str(error).replace("`", "").replace(" - at $.", " at ").split())
-        raise ConfigError(f"{said[0].lower()}{said[1:]}") from error
-    except ValueError as error:  # TOMLDecodeError, and Python's own about an integer of thousands of digits
+        message = " ".join(str(error).replace("`", "").replace(" - at $.", " at ").split())
+        raise ConfigError(f"{message[0].lower()}{message[1:]}") from error
+    except ValueError as error:  # TOMLDecodeError, or int() on thousands of digits
         raise ConfigError(f"not TOML: {error}") from error
 
 
-def written(found: AsBuilt) -> str:
-    """Return a map's file, exact to the last digit; parse(written(found)) == found."""
-    rows = [" [\n" + "".join(f"  {[list(node) for node in row]},\n" for row in face) + " ],\n" for face in found.nodes]
+def format_map(as_built: AsBuilt) -> str:
+    """Return the text of a map's file, exact to the last digit: `parse` returns an equal map."""
+    rows = [
+        " [\n" + "".join(f"  {[list(node) for node in row]},\n" for row in face) + " ],\n" for face in as_built.nodes
+    ]
     return (
-        f"# As-built errors of a robot: what a pose is told besides, for [correction] map. Made by {MAKE}.\n"
-        f'made = "{found.made}"\n'
-        f'geometry = "{found.geometry}"\n'
-        f"low = {list(found.low)}\n"
-        f"high = {list(found.high)}\n"
+        f"# As-built errors of a robot, added to poses by [correction] map. Made by {MAKE}.\n"
+        f'made = "{as_built.made}"\n'
+        f'geometry = "{as_built.geometry}"\n'
+        f"low = {list(as_built.low)}\n"
+        f"high = {list(as_built.high)}\n"
         f"nodes = [\n{''.join(rows)}]\n"
     )
 
 
-def summary(file: str | None, found: AsBuilt | None, backlash: Triple) -> CorrectionTold | None:
-    """Return what people are told of a correction; None where nothing is corrected."""
-    if found is None:
+def summary(file: str | None, as_built: AsBuilt | None, backlash: Triple) -> CorrectionTold | None:
+    """Return the summary of a correction for people; None without a correction."""
+    if as_built is None:
         return CorrectionTold("", "", (0.0, 0.0, 0.0), backlash) if any(backlash) else None
-    x, y, phi = correction(found).greatest.tolist()
-    return CorrectionTold(file or "as_built", found.made, (x, y, phi), backlash)
+    x, y, phi = correction(as_built).greatest.tolist()
+    return CorrectionTold(file or "as_built", as_built.made, (x, y, phi), backlash)
 
 
-def check(found: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, sliders: Sequence[Triple]) -> None:
-    """Refuse a map that is another robot's, that does not reach all places, or that could break a limit anywhere.
+def check(as_built: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, sliders: Sequence[Triple]) -> None:
+    """Refuse a map of another robot, one that does not cover the limits, or one that could break a limit anywhere.
 
-    `robot` is without it; `platform` (3, 3) are the limits of velocity, acceleration and jerk of x, y, phi, `sliders`
-    those of the sliders, each for A, B, C [m, rad, s]. Raises ConfigError.
+    Raises ConfigError.
+
+    Parameters
+    ----------
+    robot
+        Geometry without the correction.
+    platform
+        Limits of velocity, acceleration and jerk of x, y, phi, (3, 3) [m, rad, s].
+    sliders
+        The same limits of the sliders A, B, C.
     """
-    errors = correction(found)
-    if found.geometry != geometry_of(robot):
+    errors = correction(as_built)
+    if as_built.geometry != geometry_of(robot):
         raise ConfigError(
-            f"it was measured beside another [geometry] ({found.geometry}, here {geometry_of(robot)}): "
+            f"it was measured with another [geometry] ({as_built.geometry}, here {geometry_of(robot)}): "
             f"measure again, and {MAKE} with this configuration"
         )
     for k, (name, unit) in enumerate(COORDINATES):
-        if found.low[k] > room.low[k] or found.high[k] < room.high[k]:
+        if as_built.low[k] > room.low[k] or as_built.high[k] < room.high[k]:
             raise ConfigError(
-                f"it is for {name} from {found.low[k]:g} to {found.high[k]:g} {unit}, limits.platform.{name} is "
-                f"[{room.low[k]:g}, {room.high[k]:g}]: measure as far, or keep the limit within"
+                f"it covers {name} from {as_built.low[k]:g} to {as_built.high[k]:g} {unit}, limits.platform.{name} is "
+                f"[{room.low[k]:g}, {room.high[k]:g}]: measure that range, or reduce the limit"
             )
     rates = np.array(platform, dtype=np.float64)
     slopes, cells = errors.adds(rates[0]), np.array(errors.low) + errors.size / 2.0
@@ -150,35 +161,35 @@ def check(found: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, slid
         share = slopes[..., k] / rates[0, k]
         if share.max() > STEEPEST:
             place = cells + np.array(np.unravel_index(int(share.argmax()), share.shape)) * errors.size
-            what = f"adds up to {share.max():.1%} to the rate of {name}"
-            raise ConfigError(_steep(place, what, f"{STEEPEST:.0%}"))
-    places, adds = _adds(errors, robot, room, rates)
-    for order, ((quantity, unit), limit, kept) in enumerate(zip(QUANTITIES, sliders, RESERVE, strict=True)):
+            effect = f"adds up to {share.max():.1%} to the rate of {name}"
+            raise ConfigError(_steep(place, effect, f"{STEEPEST:.0%}"))
+    places, adds = _added_rates(errors, robot, room, rates)
+    for order, ((quantity, unit), limit, reserve) in enumerate(zip(QUANTITIES, sliders, RESERVE, strict=True)):
         for i, leg in enumerate(robot.labels):
             more = adds[order, :, i]
-            if not more.max() <= kept * limit[i]:
-                what = f"adds up to {more.max():.3g} {unit} to slider {leg}'s {quantity}"
-                raise ConfigError(_steep(places[more.argmax()], what, f"{kept * limit[i]:.3g} {unit}"))
+            if not more.max() <= reserve * limit[i]:
+                effect = f"adds up to {more.max():.3g} {unit} to slider {leg}'s {quantity}"
+                raise ConfigError(_steep(places[more.argmax()], effect, f"{reserve * limit[i]:.3g} {unit}"))
 
 
-def _adds(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tuple[Array, Array]:
-    """Return the places where it is looked, (N, 3), and what is added there to the sliders' rates at most, (3, N, 3).
+def _added_rates(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tuple[Array, Array]:
+    """Return sample poses, (N, 3), and upper bounds of the slider rates that the correction adds there, (3, N, 3).
 
-    That is of s, their places with the correction less those without, as a function of the pose, with derivatives by
-    differences: ds/dt is at most the sum of |s_i| v_i, and so on. Infinite where that is not known.
+    With s(pose), the slider positions with the correction less those without, and its partial derivatives s_i by
+    differences, |ds/dt| <= sum |s_i| v_i, and so on for higher orders. Infinite where a derivative is undefined.
     """
     axes = [
-        np.linspace(low, high, PARTS * n + 1)
+        np.linspace(low, high, SAMPLES_PER_CELL * n + 1)
         for low, high, n in zip(errors.low, errors.high, errors.cells, strict=True)
     ]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    told = travels(dataclasses.replace(robot, correction=errors), places)
+    corrected = travels(dataclasses.replace(robot, correction=errors), places)
 
-    def slopes(of: Array) -> Array:
-        each: Array = np.array(np.gradient(of, *axes, axis=(-4, -3, -2)))
+    def slopes(values: Array) -> Array:
+        each: Array = np.array(np.gradient(values, *axes, axis=(-4, -3, -2)))
         return each
 
-    first = slopes(told[0] - travels(robot, places)[0])
+    first = slopes(corrected[0] - travels(robot, places)[0])
     second = slopes(first)
     once, twice, thrice = np.abs(first), np.abs(second), np.abs(slopes(second))
     v, a, j = rates
@@ -186,14 +197,14 @@ def _adds(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tupl
     acceleration = np.tensordot(a, once, 1) + np.tensordot(np.outer(v, v), twice, 2)
     jerk = np.tensordot(j, once, 1) + np.tensordot(3.0 * np.outer(a, v), twice, 2)
     jerk += np.tensordot(np.multiply.outer(np.outer(v, v), v), thrice, 3)
-    reached = room.holds(told, BEYOND)
+    reached = room.holds(corrected, TRAVEL_MARGIN_M)
     adds = np.stack([velocity, acceleration, jerk])[:, reached]
     return places[reached], np.nan_to_num(adds, nan=np.inf)
 
 
-def _steep(place: Array, what: str, right: str) -> str:
+def _steep(place: Array, effect: str, limit: str) -> str:
     x, y, phi = (worded(value, unit) for value, unit in zip(place.tolist(), ("m", "m", "rad"), strict=True))
     return (
-        f"too steep near x {x}, y {y}, phi {phi}: it {what}, and the limits have room for {right}; "
-        "measure there again, take fewer cells, or let calibrate.py find [geometry] before"
+        f"too steep near x {x}, y {y}, phi {phi}: it {effect}, the limits allow {limit}; "
+        "measure there again, use fewer cells, or calibrate [geometry] before"
     )

@@ -7,14 +7,15 @@ import difflib
 import math
 import re
 from collections.abc import Iterable, Iterator
-from types import UnionType
-from typing import Annotated, Any, Final, Literal, NamedTuple, get_args, get_origin
+from typing import Any, Final, NamedTuple
 
 import msgspec
+from msgspec import inspect as mi
+from trirail_drivers.config import Coordinate
 
-from trirail.config.tables import Config
+from trirail.config.tables import Angle, Config, ShapeError
+from trirail.quantities import meant
 from trirail.wire.decoding import converted
-from trirail.wire.vocabulary import Role
 
 Place = tuple[str | int, ...]
 """Where in nested tables and arrays: names and indices."""
@@ -30,14 +31,6 @@ def leaves(value: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
             yield from leaves(inner, (*place, index))
     else:
         yield place, value
-
-
-_AT = re.compile(r"^(?P<what>.*?)(?: - at (?P<key>`key` in )?`\$(?P<path>[^`]*)`)?$", re.DOTALL)
-NAMED = "[...]"
-"""What msgspec says in the place of a key of a table whose keys are names."""
-_FIELD = re.compile(r"^Object (?P<how>contains unknown|missing required) field `(?P<name>[^`]*)`")
-_SHAPE = re.compile(r"^Field `(?P<name>[^`]*)`")
-"""What a table itself says of a field of it."""
 
 
 class Mistake(NamedTuple):
@@ -59,98 +52,225 @@ def _holds(table: str, key: str) -> bool:
     return key.startswith((f"{table}.", f"{table}["))
 
 
+class _WrongValue(NamedTuple):
+    """A value that its type does not take."""
+
+    place: Place
+    text: str
+    kind: mi.Type | None
+    """The type of what belongs there; None where nothing does."""
+
+
+def wrong_values(raw: dict[str, Any], kind: type[msgspec.Struct]) -> list[Mistake]:
+    """Return every value of nested tables that the types of a kind of file do not take."""
+    return [Mistake(_key(wrong.place), wrong.text) for wrong in _wrong_values(raw, mi.type_info(kind), ())]
+
+
 def repaired(raw: dict[str, Any]) -> tuple[Config, list[Mistake]]:
     """Return what tables hold, with all that is no value of its key; in the place of each stands one that is."""
-    tables = copy.deepcopy(raw)
-    found = []
-    for place, value in leaves(raw):
-        if isinstance(value, float) and not math.isfinite(value):
-            key = _key(place)
-            found.append(Mistake(key, f"{key} = {value}: it must be a finite number"))
-            _repair(place, tables)
-    seen: set[Place] = set()
-    while True:
+    tables, found = copy.deepcopy(raw), list[Mistake]()
+    while wrong := list(_wrong_values(tables, mi.type_info(Config), ())):
+        for place, text, kind in wrong:
+            table, key = _at(place[:-1], tables), _key(place)
+            if kind is None:
+                del table[place[-1]]
+            else:
+                table[place[-1]] = _stand_in(kind)
+            if not overlap((key,), (each.key for each in found)):  # else the stand-ins do not go together
+                found.append(Mistake(key, text))
+    return converted(tables, Config), found
+
+
+def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_WrongValue]:
+    """Yield what a type does not take of a value, and of all that is in it."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield _WrongValue(place, f"{_key(place)} = {value}: it must be a finite number", kind)
+        return
+    match kind, value:
+        case mi.Metadata(type=inner), _:
+            for wrong in _wrong_values(value, inner, place):
+                yield _unexpected(value, kind, place) if wrong.place == place else wrong
+        case mi.UnionType(types=types), _:
+            of_each = [list(_wrong_values(value, part, place)) for part in types]
+            if all(of_each):
+                # The type whose shape the value has says where in it; else none is nearer than another.
+                inside = (found for found in of_each if all(wrong.place != place for wrong in found))
+                yield from next(inside, [_unexpected(value, kind, place)])
+        case mi.StructType(), dict():
+            yield from _wrong_fields(value, kind, place)
+        case mi.DictType(), dict():
+            yield from _wrong_names(value, kind, place)
+        case ((mi.TupleType() | mi.VarTupleType()), list()) if _has_length(kind, len(value)):
+            types = kind.item_types if isinstance(kind, mi.TupleType) else (kind.item_type,) * len(value)
+            for index, (each, inner) in enumerate(zip(value, types, strict=True)):
+                yield from _wrong_values(each, inner, (*place, index))
+        case _ if not _takes(kind, value):
+            yield _unexpected(value, kind, place)
+
+
+def _wrong_fields(table: dict[str, Any], kind: mi.StructType, place: Place) -> Iterator[_WrongValue]:
+    """Yield what is wrong in a table: keys, their values and, where these are right, what does not go together."""
+    word = "key" if place else "section"
+    fields = {field.encode_name: field for field in kind.fields}
+    found: list[_WrongValue] = []
+    for name, value in table.items():
+        at = (*place, name)
+        if name in fields:
+            found += _wrong_values(value, fields[name].type, at)
+        else:
+            close = difflib.get_close_matches(name, fields, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(fields)}"
+            found.append(_WrongValue(at, f"{_key(at)}: unknown {word}; {hint}", None))
+    for name, field in fields.items():
+        if field.required and name not in table:
+            found.append(_WrongValue((*place, name), f"{_key((*place, name))}: missing {word}", field.type))
+    yield from found
+    if not found and hasattr(kind.cls, "__post_init__"):
         try:
-            return converted(tables, Config), found
+            msgspec.convert(table, kind.cls)
         except msgspec.ValidationError as error:
-            place, text = _explained(str(error), tables, Config)
-        key = _key(place)
-        if not overlap((key,), (each.key for each in found)):
-            found.append(Mistake(key, text))
-        while place in seen:  # no value for it was found: the table that it is in goes
-            place = place[:-1]
-        seen.add(place)
-        _repair(place, tables)
+            cause = error.__cause__
+            if isinstance(cause, ShapeError):
+                yield _unexpected(table[cause.field], fields[cause.field].type, (*place, cause.field))
+            else:
+                yield _WrongValue(place, f"{_key(place)} = {table}: {cause}", kind)
 
 
-def explain(error: str, raw: dict[str, Any], kind: type[msgspec.Struct] = Config) -> str:
-    """Turn msgspec's words of a file of a kind into a key, the value found there, and what is allowed."""
-    return _explained(error, raw, kind)[1]
+def _wrong_names(table: dict[str, Any], kind: mi.DictType, place: Place) -> Iterator[_WrongValue]:
+    """Yield what is wrong in a table whose keys are names."""
+    for name, value in table.items():
+        if _takes(kind.key_type, name):
+            yield from _wrong_values(value, kind.value_type, (*place, name))
+        else:
+            text = f"{_key(place)}: {name!r} is no name here: expected {expected(kind.key_type)}"
+            yield _WrongValue((*place, name), text, None)
 
 
-def _explained(error: str, raw: dict[str, Any], kind: Any) -> tuple[Place, str]:
-    """Return where a file of a kind is wrong, and the words for people."""
-    found = _AT.match(error)
-    what, path = (found["what"], (found["path"] or "").lstrip(".")) if found else (error, "")
-    if field := _FIELD.match(what):
-        place = (*_place(path), field["name"])
-        if field["how"] == "missing required":
-            return place, f"{_key(place)}: missing {'key' if path else 'section'}"
-        allowed = _type_at(_place(path), kind).__struct_fields__
-        close = difflib.get_close_matches(field["name"], allowed, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(allowed)}"
-        return place, f"{_key(place)}: unknown {'key' if path else 'section'}; {hint}"
-    keys = bool(found and found["key"])
-    place = _place(path)
-    if keys or NAMED in path:
-        table, _, rest = path.partition(NAMED)
-        names = _place(table)
-        name = _culprit(_at(names, raw), get_args(_type_at(names, kind))[0 if keys else 1], of_keys=keys)
-        if keys:
-            return (*names, name), f"{table}: {name!r} is no name here: {what[0].lower()}{what[1:].replace('`', '')}"
-        place = (*names, name, *_place(rest))
-    if field := _SHAPE.match(what):
-        place = (*place, field["name"])
-    said = f"{_key(place)} = {_at(place, raw)!r}"
-    if field or what.startswith(("Expected `float | array`", "Expected `array`")):
-        wanted = _described(place, kind)
-        return place, f"{said}: {f'wanted {wanted}' if wanted else what[0].lower() + what[1:].replace('`', '')}"
-    if what.startswith("Invalid enum value"):
-        enum = _type_at(place, kind)
-        values = [str(each) for each in enum] if enum is Role else get_args(enum)
-        return place, f"{said}: allowed are {', '.join(map(repr, values))}"
-    return place, f"{said}: {what[0].lower()}{what[1:].replace('`', '').replace(' | null', '')}"  # TOML has no null
+def _takes(kind: mi.Type, value: object) -> bool:
+    """Whether a type takes a value that is no table or array of the right length."""
+    match kind:
+        case mi.NoneType():
+            return value is None
+        case mi.BoolType():
+            return isinstance(value, bool)
+        case mi.LiteralType(values=values):
+            return any(type(value) is type(each) and value == each for each in values)
+        case mi.EnumType(cls=cls):
+            return isinstance(value, str) and value in [each.value for each in cls]
+        case mi.StrType(pattern=pattern):
+            return (
+                isinstance(value, str)
+                and _fits(len(value), kind)
+                and (pattern is None or re.search(pattern, value) is not None)
+            )
+        case mi.IntType():
+            return isinstance(value, int) and not isinstance(value, bool) and _is_within(value, kind)
+        case mi.FloatType():
+            return isinstance(value, int | float) and not isinstance(value, bool) and _is_within(value, kind)
+    return False
 
 
-def _repair(place: Place, tables: Any) -> None:
-    """Put a value that is possible where an impossible one is; take out what there is no key for."""
-    *path, last = place
-    table = _at(tuple(path), tables)
-    try:
-        table[last] = _stand_in(_type_at(place, Config))
-    except (StopIteration, msgspec.ValidationError):
-        del table[last]
+def _is_within(value: float, kind: mi.IntType | mi.FloatType) -> bool:
+    return (
+        (kind.ge is None or value >= kind.ge)
+        and (kind.gt is None or value > kind.gt)
+        and (kind.le is None or value <= kind.le)
+        and (kind.lt is None or value < kind.lt)
+    )
 
 
-_POSSIBLE: Final[tuple[object, ...]] = (1, 0.5, 0, 10, 1000, 50_000, True, "x", "605A", "counts/s", [], {})
-"""Of these some value is possible for every key that is no table with keys that it must have."""
+def _has_length(kind: mi.TupleType | mi.VarTupleType, length: int) -> bool:
+    return length == len(kind.item_types) if isinstance(kind, mi.TupleType) else _fits(length, kind)
 
 
-def _stand_in(kind: Any) -> object:
-    """Return a value of a type. Raises ValidationError where there is none."""
-    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
-        return {field.name: _stand_in(field.type) for field in msgspec.structs.fields(kind) if field.required}
-    if get_origin(kind) is tuple:
-        kinds = get_args(kind)
-        return [_stand_in(each) for each in (kinds[:1] * 2 if Ellipsis in kinds else kinds)]
-    allowed = get_args(kind) if get_origin(kind) is Literal else tuple(kind) if kind is Role else _POSSIBLE
-    for value in allowed:
-        try:
-            msgspec.convert(value, kind)
-        except msgspec.ValidationError:
-            continue
-        return value
-    raise msgspec.ValidationError(f"nothing is possible for {kind}")
+def _fits(length: int, kind: mi.StrType | mi.VarTupleType) -> bool:
+    return (kind.min_length or 0) <= length and (kind.max_length is None or length <= kind.max_length)
+
+
+def _unexpected(value: object, kind: mi.Type, place: Place) -> _WrongValue:
+    """Say what stands at a place, and what its type takes."""
+    text = f"{_key(place)} = {value!r}: expected {expected(kind)}{_other_unit(value, kind)}"
+    return _WrongValue(place, text, kind)
+
+
+def expected(kind: mi.Type) -> str:
+    """Return in words which values a type takes."""
+    match kind:
+        case mi.Metadata(extra_json_schema={"description": words}):
+            return str(words)
+        case mi.UnionType(types=types):
+            return " or ".join(expected(part) for part in types if not isinstance(part, mi.NoneType))
+        case mi.LiteralType(values=values):
+            return f"one of {', '.join(map(repr, values))}"
+        case mi.EnumType(cls=cls):
+            return f"one of {', '.join(repr(each.value) for each in cls)}"
+        case mi.IntType():
+            return f"integer{bounds(kind)}"
+        case mi.FloatType():
+            return f"number{bounds(kind)}"
+        case mi.BoolType():
+            return "true or false"
+        case mi.StrType(pattern=pattern):
+            return (
+                "text"
+                + (f" of {kind.max_length} characters at most" if kind.max_length else "")
+                + (f" matching {pattern}" if pattern else "")
+            )
+        case mi.TupleType(item_types=types):
+            return f"array of length {len(types)}"
+        case mi.VarTupleType():
+            return "array" + (f" of length {kind.min_length or 0} to {kind.max_length}" if kind.max_length else "")
+    return "table"
+
+
+def bounds(kind: mi.IntType | mi.FloatType) -> str:
+    """Return the bounds of a number in words, as they follow what it is."""
+    digits = 10 if isinstance(kind, mi.IntType) else 6
+    if kind.ge is not None and kind.le is not None:
+        return f", {kind.ge:.{digits}g} to {kind.le:.{digits}g}"
+    signs = {">": kind.gt, "≥": kind.ge, "<": kind.lt, "≤": kind.le}
+    return " and".join(f" {sign} {bound:.{digits}g}" for sign, bound in signs.items() if bound is not None)
+
+
+_UNITS: Final = (
+    (mi.type_info(Angle), 2.0 * math.pi, "rad", "Angles are in radians"),
+    (mi.type_info(Coordinate), 100.0, "m", "Lengths are in metres"),
+)
+
+
+def _other_unit(value: object, kind: mi.Type) -> str:
+    """Ask whether a number that is out of its bounds was meant in degrees, or in millimetres."""
+    for number, limit, unit, words in _UNITS:
+        if number in (kind, *getattr(kind, "types", ())) and isinstance(value, int | float):
+            likely = meant(value, limit, unit)
+            return f"; did you mean {likely:.4g}? {words}" if likely is not None else ""
+    return ""
+
+
+_POSSIBLE: Final[tuple[object, ...]] = (1, 0.5, 0, 10, 1000, 50_000, True, "x", "605A", "counts/s")
+"""Of these some value is possible for every key that is no table or array."""
+
+
+def _stand_in(kind: mi.Type) -> object:
+    """Return a value of a type."""
+    match kind:
+        case mi.Metadata(type=inner):
+            return _stand_in(inner)
+        case mi.UnionType(types=types):
+            return _stand_in(types[0])
+        case mi.StructType(fields=fields):
+            return {field.encode_name: _stand_in(field.type) for field in fields if field.required}
+        case mi.DictType():
+            return {}
+        case mi.TupleType(item_types=types):
+            return [_stand_in(each) for each in types]
+        case mi.VarTupleType(item_type=inner):
+            return [_stand_in(inner)] * max(2, kind.min_length or 0)  # two are a range, of limits.slider.position
+        case mi.LiteralType(values=values):
+            return values[0]
+        case mi.EnumType(cls=cls):
+            return next(iter(cls)).value
+    return next(value for value in _POSSIBLE if _takes(kind, value))
 
 
 def _at(place: Place, raw: Any) -> Any:
@@ -163,40 +283,3 @@ def _at(place: Place, raw: Any) -> Any:
 def _key(place: Place) -> str:
     """A place as people write it: limits.platform.x[0]."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
-
-
-def _place(path: str) -> Place:
-    return tuple(int(part) if part.isdigit() else part for part in re.findall(r"[^.\[\]]+", path))
-
-
-def _culprit(table: Any, kind: Any, *, of_keys: bool) -> str:
-    """The first name in a table of names whose key, or value, is not of a type: msgspec does not say which."""
-    for name, value in table.items():
-        try:
-            msgspec.convert(name if of_keys else value, kind)
-        except msgspec.ValidationError:
-            return str(name)
-    return NAMED
-
-
-def _described(place: Place, kind: Any) -> str | None:
-    """What a key takes, where its type has words of its own for that."""
-    *path, name = place
-    table = _type_at(tuple(path), kind)
-    fields = msgspec.structs.fields(table) if isinstance(table, type) and issubclass(table, msgspec.Struct) else ()
-    metas = [meta for field in fields if field.name == name for meta in getattr(field.type, "__metadata__", ())]
-    return next((meta.description for meta in metas if isinstance(meta, msgspec.Meta)), None)
-
-
-def _type_at(place: Place, kind: Any) -> Any:
-    """The type that the key or table at a place of a kind of file must have."""
-    for part in place:
-        if isinstance(part, int):
-            kind = get_args(kind)[0]
-        elif get_origin(kind) is dict:
-            kind = get_args(kind)[1]
-        else:
-            kind = next(field.type for field in msgspec.structs.fields(kind) if field.name == part)
-        if isinstance(kind, UnionType) or (get_origin(kind) is Annotated and get_origin(get_args(kind)[0]) is not None):
-            kind = get_args(kind)[0]
-    return kind

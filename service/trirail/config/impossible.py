@@ -1,4 +1,4 @@
-"""What is well-formed in a configuration, but impossible."""
+"""Checks of a configuration's values that are well-formed but impossible."""
 
 from __future__ import annotations
 
@@ -18,25 +18,29 @@ from trirail.config.network_checks import network_rules
 from trirail.config.tables import BASE, PLATFORM, Config, Limits, corrected_geometry, geometry, room
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, gains, singular_angles, travels
+from trirail.quantities import FAMILIAR_UNITS, meant
 from trirail.wire.text import QUANTITY_RULE, is_quantity
 
 
-def check_as_built(found: AsBuilt, robot: Geometry, limits: Limits) -> None:
-    """Refuse a map that is not this robot's, or that could break a limit anywhere. Raises ConfigError."""
+def check_as_built(errors: AsBuilt, robot: Geometry, limits: Limits) -> None:
+    """Refuse a map of another robot, or one that could break a limit anywhere. Raises ConfigError."""
     platform, slider = limits.platform, limits.slider
     rates = platform.velocity, platform.acceleration, platform.jerk
-    as_built.check(found, robot, room(limits), rates, (slider.velocities, slider.accelerations, slider.jerks))
+    as_built.check(errors, robot, room(limits), rates, (slider.velocities, slider.accelerations, slider.jerks))
 
 
+MAX_RANGE_SIZES = 10.0
+"""Plausible maximum of a range, in multiples of the robot's size."""
+MM = FAMILIAR_UNITS["m"][0]
 _WINDOWS = (
     *((f"sliders[{i}]", "m") for i in range(3)),
     *((f"pose[{i}]", unit) for i, unit in enumerate(("m", "m", "rad"))),
 )
-"""The windows of [limits.in_position], each with its unit."""
+"""Windows of [limits.in_position], each with its unit."""
 
 
 def check(config: Config) -> None:
-    """Refuse what is well-formed but impossible, at the first that is. Raises ConfigError."""
+    """Raise ConfigError for the first impossible value."""
     for rule in rules(config):
         try:
             rule.check()
@@ -45,30 +49,30 @@ def check(config: Config) -> None:
 
 
 def mistakes(config: Config, impossible: Sequence[str] = ()) -> tuple[list[Mistake], list[str]]:
-    """Return all that is well-formed but impossible, and what was not looked at: what reads an `impossible` key.
+    """Return all mistakes, and the keys that were not checked because their checks read an `impossible` key.
 
-    Files that are named are read.
+    The files that the configuration names are read.
     """
     from trirail_drivers.connection import settings_checks
 
-    found: dict[str, Mistake] = {}
-    left: dict[str, None] = {}
+    by_text: dict[str, Mistake] = {}
+    unchecked: dict[str, None] = {}
     wrong = list(impossible)
     for rule in itertools.chain(rules(config), settings_checks.files(config.drives)):
         if overlap((rule.key, *rule.reads), wrong):
-            left[rule.key] = None
+            unchecked[rule.key] = None
             continue
         try:
             rule.check()
         except TrirailError as error:
-            found.setdefault(str(error), Mistake(rule.key, str(error)))
-            if not rule.reads:  # wrong by itself, whatever else there is
+            by_text.setdefault(str(error), Mistake(rule.key, str(error)))
+            if not rule.reads:  # wrong by itself, whatever the other keys are
                 wrong.append(rule.key)
-    return list(found.values()), list(left)
+    return list(by_text.values()), list(unchecked)
 
 
 def rules(config: Config) -> Iterator[Rule]:
-    """Yield every check of what is well-formed; a later one takes for granted what the earlier ones refuse."""
+    """Yield all checks; each relies on those before it."""
     from trirail_drivers.connection import settings_checks
 
     platform, slider = config.limits.platform, config.limits.slider
@@ -82,6 +86,9 @@ def rules(config: Config) -> Iterator[Rule]:
     for key, both in ranges.items():
         yield Rule(key, (), partial(_check_range, key, *both))
     yield Rule("geometry", (), partial(geometry, config.geometry))
+    for key, both in ranges.items():
+        if key != "limits.platform.phi":
+            yield Rule(key, ("geometry",), partial(_check_metres, config, key, *both))
     yield Rule("correction.map", ("geometry", "limits"), partial(_check_correction, config))
     reads = "limits.platform.x", "limits.platform.y", "limits.singularity_margin", "geometry", "correction"
     yield Rule("limits.platform.phi", reads, partial(_check_singular_angles, config))
@@ -102,11 +109,30 @@ def _check_range(key: str, low: float, high: float) -> None:
         raise ConfigError(f"{key} = [{low:g}, {high:g}]: the lower limit must be below the upper one")
 
 
+def _check_metres(config: Config, key: str, low: float, high: float) -> None:
+    """Refuse a range that is far larger than the robot, but plausible in millimetres."""
+    size = _size(config)
+    widest = max(low, high, key=abs)
+    if abs(widest) > MAX_RANGE_SIZES * size and meant(widest, MAX_RANGE_SIZES * size, "m") is not None:
+        raise ConfigError(
+            f"{key} = [{low:g}, {high:g}]: {abs(widest):g} m on a robot of {size:g} m; "
+            f"did you mean [{low * MM:g}, {high * MM:g}]? Lengths are in metres"
+        )
+
+
+def _size(config: Config) -> float:
+    """Return the maximum distance of a part of the robot from the origin of its frame [m]."""
+    legs = config.geometry.leg or ()
+    points = [point for leg in legs for point in (leg.anchor, leg.edge_point, leg.pivot) if point is not None]
+    homes = [leg.home for leg in legs]
+    return max([config.geometry.l0 or 0.0, *map(abs, itertools.chain(*points, homes))])
+
+
 def _check_singular_angles(config: Config) -> None:
     platform = config.limits.platform
     corrected = corrected_geometry(config)
-    off = corrected.correction
-    x, y, phi = np.zeros(3) if off is None else off.bound  # the legs are told places that far beyond
+    errors = corrected.correction
+    x, y, phi = np.zeros(3) if errors is None else errors.bound  # the legs receive poses that far beyond
     (low, high), margin = (platform.phi[0] - phi, platform.phi[1] + phi), config.limits.singularity_margin
     # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
     beside = [(low - more, high + more) for (low, high), more in ((platform.x, x), (platform.y, y))]
@@ -115,13 +141,13 @@ def _check_singular_angles(config: Config) -> None:
     singular = {angle for centre in centres for angle in singular_angles(robot, centre)}
     for angle in singular:
         if low - margin < angle < high + margin:
-            least = max(angle for angle in (-math.pi, *singular) if angle <= 0.0) + margin + phi
-            most = min(angle for angle in (math.pi, *singular) if angle > 0.0) - margin - phi
-            # Both ends, over all corners, and rounded inwards: what is said is accepted.
+            lowest = max(angle for angle in (-math.pi, *singular) if angle <= 0.0) + margin + phi
+            highest = min(angle for angle in (math.pi, *singular) if angle > 0.0) - margin - phi
+            # Both ends, over all corners, and rounded inwards: the range in the message is itself accepted.
             raise ConfigError(
-                f"limits.platform.phi = [{platform.phi[0]:g}, {platform.phi[1]:g}] comes nearer than "
-                f"limits.singularity_margin = {margin:g} to the singular angle {angle:.4f}: keep it within "
-                f"[{math.ceil(least * 1e4 + 1e-6) * 1e-4:.4f}, {math.floor(most * 1e4 - 1e-6) * 1e-4:.4f}]"
+                f"limits.platform.phi = [{platform.phi[0]:g}, {platform.phi[1]:g}] is closer than "
+                f"limits.singularity_margin = {margin:g} to the singular angle {angle:.4f}; keep it within "
+                f"[{math.ceil(lowest * 1e4 + 1e-6) * 1e-4:.4f}, {math.floor(highest * 1e4 - 1e-6) * 1e-4:.4f}]"
             )
 
 
@@ -135,7 +161,7 @@ def _check_settling(config: Config) -> None:
 
 def _check_frame(name: str) -> None:
     if name in (BASE, PLATFORM):
-        raise ConfigError(f"frames.work.{name}: every robot has a frame of that name; give this one another")
+        raise ConfigError(f"frames.work.{name}: the name is reserved for the robot's own frame; use another")
 
 
 def _check_rate(config: Config) -> None:
@@ -143,12 +169,12 @@ def _check_rate(config: Config) -> None:
     if 1_000_000 % config.loop.rate_hz:
         raise ConfigError(
             f"loop.rate_hz = {config.loop.rate_hz}: a cycle must be a whole number of microseconds, "
-            "as with 100, 200, 250, 400, 500, 800, 1000"
+            "for example 100, 200, 250, 400, 500, 800 or 1000"
         )
 
 
 def _required(config: Config) -> Requirements:
-    """Return what the robot asks of its drives; without the windows of a robot that is singular, or none."""
+    """Return the robot's requirements for its drives, without in-position windows if its geometry is singular."""
     slider = config.limits.slider
     simulated, starts = config.can.interface == "simulated", config.can.simulated.start
     places = [(*ends, at) if simulated else ends for ends, at in zip(slider.positions, starts, strict=True)]
@@ -165,27 +191,29 @@ def _windows(config: Config) -> Iterator[Window]:
     platform, settling = config.limits.platform, config.limits.in_position
     corners = itertools.product(platform.x, platform.y, platform.phi)
     robot = geometry(config.geometry)
-    most = np.abs([gains(robot, corner) for corner in corners]).max(axis=0).tolist()
-    widths = zip((*np.eye(3).tolist(), *most), (*settling.sliders, *settling.pose), strict=True)
+    largest = np.abs([gains(robot, corner) for corner in corners]).max(axis=0).tolist()
+    widths = zip((*np.eye(3).tolist(), *largest), (*settling.sliders, *settling.pose), strict=True)
     for (key, unit), ((a, b, c), width) in zip(_WINDOWS, widths, strict=True):
         yield Window(f"limits.in_position.{key}", width, unit, (a, b, c))
 
 
 def _check_correction(config: Config) -> None:
-    """Refuse a map that is not this robot's, or that the limits have no room for."""
-    told = config.correction
-    if told.as_built is None:
-        if told.map is not None:
-            raise ConfigError(f"correction.map = {told.map!r}: a file, which only a configuration in a file can name")
+    """Refuse a map of another robot, or one that could break a limit."""
+    table = config.correction
+    if table.as_built is None:
+        if table.map is not None:
+            raise ConfigError(
+                f"correction.map = {table.map!r}: only a configuration that is read from a file can name one"
+            )
         return
     try:
-        check_as_built(told.as_built, geometry(config.geometry), config.limits)
+        check_as_built(table.as_built, geometry(config.geometry), config.limits)
     except ConfigError as error:
-        raise ConfigError(f"correction.map: {told.map or 'as_built'}: {error}") from error
+        raise ConfigError(f"correction.map: {table.map or 'as_built'}: {error}") from error
 
 
 def _check_pose(config: Config, name: str) -> None:
-    """Refuse a named pose at which the robot cannot be."""
+    """Refuse a named pose outside the limits."""
     platform, slider, pose = config.limits.platform, config.limits.slider, config.poses[name]
     if is_quantity(name):
         raise ConfigError(f"poses.{name}: {name} {QUANTITY_RULE}")
@@ -203,9 +231,9 @@ def _check_pose(config: Config, name: str) -> None:
         (f"cross slide {label}", at, "limits.slider.passive", slider.passive)
         for label, at in zip(robot.labels, passive, strict=True)
     ]
-    for what, at, key, (low, high) in places:
+    for coordinate, at, key, (low, high) in places:
         if not low <= at <= high:
             numbers = ", ".join(f"{value:g}" for value in pose)
             raise ConfigError(
-                f"poses.{name} = [{numbers}]: {what} would be {at:.6g}, outside of {key} = [{low:g}, {high:g}]"
+                f"poses.{name} = [{numbers}]: {coordinate} would be {at:.6g}, outside {key} = [{low:g}, {high:g}]"
             )

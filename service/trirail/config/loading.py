@@ -1,4 +1,4 @@
-"""Reads configurations."""
+"""Loading of configuration files."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from trirail.wire.decoding import prepare
 
 _PACKAGED = Path(__file__).parents[1] / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[3] / "configs") / "sim.toml"
-"""The configuration that needs nothing: no hardware, no rights, no other program."""
+"""Default configuration: simulated drives, no hardware, no rights, no other program."""
 prepare(Config, Limits, FramesTable)
 
 
 def load(path: Path) -> Config:
-    """Read a configuration file. Raises ConfigError with the file, the key, the value and what is allowed."""
+    """Read a configuration file. Raises ConfigError with file, key, value and allowed values."""
     try:
         config, wrong = _read(path)
         _refuse(wrong)
@@ -36,7 +36,7 @@ def load(path: Path) -> Config:
 
 
 def parse(text: str) -> Config:
-    """Read a configuration from TOML. Raises ConfigError."""
+    """Parse a configuration in TOML. Raises ConfigError."""
     config, wrong = repaired(toml_tables(text))
     _refuse(wrong)
     check(config)
@@ -44,26 +44,26 @@ def parse(text: str) -> Config:
 
 
 class Findings(NamedTuple):
-    """What a file holds, and everything in it that is refused."""
+    """Contents of a file, and all its mistakes."""
 
     config: Config
-    """With something possible in the place of what is not."""
+    """Configuration with possible values in place of the mistakes."""
     mistakes: list[Mistake]
-    left: list[str]
-    """Keys that were not looked at, for want of those that are impossible."""
+    unchecked: list[str]
+    """Keys whose checks depend on a mistake, and were not run."""
 
 
 def everything(path: Path) -> Findings:
-    """Read a configuration file and find all its mistakes, where `load` ends at the first.
+    """Read a configuration file and find all its mistakes; `load` ends at the first.
 
-    Raises ConfigError for what is no TOML.
+    Raises ConfigError if the file is not TOML.
     """
     try:
         config, wrong = _read(path)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
-    more, left = mistakes(config, [each.key for each in wrong])
-    return Findings(config, [*wrong, *more], left)
+    more, unchecked = mistakes(config, [each.key for each in wrong])
+    return Findings(config, [*wrong, *more], unchecked)
 
 
 def _refuse(wrong: list[Mistake]) -> None:
@@ -72,36 +72,36 @@ def _refuse(wrong: list[Mistake]) -> None:
 
 
 def _read(path: Path) -> tuple[Config, list[Mistake]]:
-    """Read a file whose values may each be impossible. Raises ConfigError."""
+    """Read a file, and return its mistakes beside a configuration without them. Raises ConfigError."""
     try:
         text = files.text(path)
     except FileError as error:
         without_path = str(error).removeprefix(f"{path}: ")
-        raise ConfigError(f"{without_path}; `trirail config copy sim` gives one to start from") from error
+        raise ConfigError(f"{without_path}; `trirail config copy sim` makes one to start from") from error
     config, wrong = repaired(toml_tables(text))
-    return _beside(path, config, wrong), wrong
+    return _resolve_paths(path, config, wrong), wrong
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """Read TOML. Raises ConfigError."""
+    """Parse TOML. Raises ConfigError."""
     try:
         raw = tomllib.loads(text)
         for _ in leaves(raw):
             pass
     except RecursionError as error:
         raise ConfigError("not a configuration: its tables or arrays are nested too deeply") from error
-    except ValueError as error:  # TOMLDecodeError, and Python's own about an integer of thousands of digits
+    except ValueError as error:  # TOMLDecodeError, or int() on thousands of digits
         raise ConfigError(f"not TOML: {error}") from error
     return raw
 
 
-def _beside(path: Path, config: Config, wrong: list[Mistake]) -> Config:
-    """The configuration with what lies relative to its file: files of drives, certificates, what is in the map's."""
+def _resolve_paths(path: Path, config: Config, wrong: list[Mistake]) -> Config:
+    """Return the configuration with paths relative to its file resolved, and with its map of as-built errors loaded."""
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
         named = {key: getattr(drive, key) for key in ("eds", "endpoints")}
-        found = {key: str(path.parent / file) for key, file in named.items() if file is not None}
-        drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(drive, **found)})
+        resolved = {key: str(path.parent / file) for key, file in named.items() if file is not None}
+        drives = msgspec.structs.replace(drives, **{name: msgspec.structs.replace(drive, **resolved)})
     correction = config.correction
     if correction.map is not None and correction.as_built is None:
         file = path.parent / correction.map
@@ -109,4 +109,8 @@ def _beside(path: Path, config: Config, wrong: list[Mistake]) -> Config:
             correction = msgspec.structs.replace(correction, map=str(file), as_built=as_built.read(file))
         except ConfigError as error:
             wrong.append(Mistake("correction.map", f"correction.map: {error}"))
-    return msgspec.structs.replace(config, drives=drives, zenoh=config.zenoh.beside(path.parent), correction=correction)
+    telemetry = config.telemetry
+    if not path.resolve().is_relative_to(SIM.parent):  # recordings never go beside the shipped files
+        telemetry = msgspec.structs.replace(telemetry, directory=str(path.parent / telemetry.directory))
+    zenoh = config.zenoh.beside(path.parent)
+    return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction, telemetry=telemetry)

@@ -1,11 +1,11 @@
-"""Backlash, taken up where a slider turns back; compiled, from cycle to cycle.
+"""Compensation of backlash where a slider reverses; compiled, one cycle at a time.
 
-A slider with play stands half its width beside its motor, behind it as the motor last went. So the setpoints are the
-sliders' places plus an offset of half a width to the side to which the slider last went, and what the drives measure,
-less the offset, is where the slider is. From one side to the other the offset goes by trirail.motion.backlash_reserve,
-one way at a time: a slider that turns back again meanwhile waits for the end of it, and where it has turned twice goes
-to the other side first, since it may have been left anywhere in its play. Where nobody knows to which side a slider
-last went, as after power-on, the offset is zero.
+A slider with backlash lags its motor by half the width. The setpoints are therefore the sliders' positions plus an
+offset of half a width in the direction in which the slider last moved, and a slider's position is the drive's
+measurement less the offset. The offset changes sides by trirail.motion.backlash_reserve, one change at a time: a slider
+that reverses again during a change waits for its end, and after two reversals it goes to the other side first, since it
+may have been left anywhere in its backlash. While the last direction of a slider is unknown, as after power-on, its
+offset is zero.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from trirail.motion.backlash_reserve import TakeUp
 __all__ = ["BACKLASH", "KEPT", "TURNS", "add_offset", "backlash", "due_offset", "keep_offset", "let_go", "taking_up"]
 
 TURNS = 5e-7
-"""A slider turns back where it goes back by more [m]: less makes no difference to anybody, and wears the drive."""
+"""Least distance of a reversal [m]: compensating less has no benefit, and wears the drive."""
 KEPT = 5
-"""Offsets of the newest setpoints that are kept, as of trirail.control.feedback."""
+"""Number of newest setpoints whose offsets are kept, for trirail.control.feedback."""
 
 BACKLASH = np.dtype(
     [
         ("half", "<f8", 3),  # of the backlash [m]
-        ("step", "<f8"),  # which part of taking it up is done in a cycle; zero where there is no backlash
+        ("step", "<f8"),  # share of the take-up that is done in a cycle; zero without backlash
         ("period", "<f8"),  # of a cycle [s]
         ("offset", "<f8", 3),  # in the newest setpoints [m]
-        ("begin", "<f8", 3),  # where the offset comes from, and where it goes [m]
+        ("begin", "<f8", 3),  # offset at the begin and at the end of the change [m]
         ("end", "<f8", 3),
-        ("done", "<f8", 3),  # which part of that is done; one where all is
-        ("turns", "<i8", 3),  # how often a slider has turned back since it began
-        ("heading", "<f8", 3),  # to which side a slider last went: 1 or -1; 0 where nobody knows
-        ("farthest", "<f8", 3),  # how far, as a place of the slider [m]; not a number before it is commanded anywhere
+        ("done", "<f8", 3),  # share of the change that is done; one when complete
+        ("turns", "<i8", 3),  # reversals of a slider since the change began
+        ("heading", "<f8", 3),  # direction in which a slider last moved: 1 or -1; 0 while unknown
+        ("farthest", "<f8", 3),  # farthest position in that direction [m]; NaN before the first command
         ("offsets", "<f8", (KEPT, 3)),  # in the setpoints of the cycles before, the newest last
     ],
     align=True,
 )
-"""What is kept from cycle to cycle, as compiled code takes it."""
+"""State of the compensation between cycles, for compiled code."""
 
 
 def backlash(taken: TakeUp, period: float) -> NDArray[np.void]:
-    """Return what is kept, (2,): as it is, and as it is tried."""
+    """Return the state, (2,): the current one, and the tried one."""
     kept = np.zeros(2, BACKLASH)
     kept["half"] = np.array(taken.widths) / 2.0
     kept["step"] = 1.0 / math.ceil(taken.duration / period) if taken.duration > 0.0 else 0.0
@@ -59,7 +59,7 @@ def backlash(taken: TakeUp, period: float) -> NDArray[np.void]:
 def add_offset(kept: NDArray[np.void], sliders: Array) -> None:
     """Add to solved sliders (6, 3), rows lambda_10, v_10, gamma_10, the offset of the next cycle; write it to kept[1].
 
-    Another call without `kept[0] = kept[1]` in between begins from the same.
+    Another call without `kept[0] = kept[1]` in between begins from the same state.
     """
     if kept[0].step == 0.0:
         return
@@ -95,21 +95,21 @@ def taking_up(kept: NDArray[np.void]) -> bool:
 
 @compiled()
 def keep_offset(kept: NDArray[np.void]) -> None:
-    """Keep the offset of the setpoints that were written in the cycle before."""
+    """Keep the offset of the setpoints that were written in the previous cycle."""
     kept[0].offsets[:-1] = kept[0].offsets[1:]
     kept[0].offsets[-1] = kept[0].offset
 
 
 @compiled()
 def due_offset(kept: NDArray[np.void], age: int, i: int) -> float:
-    """Return the offset in the setpoint at which slider i was due when it was measured, so many SYNCs ago [m]."""
+    """Return the offset [m] in the setpoint that slider i was due at when measured, `age` SYNCs ago."""
     due: float = kept[0].offsets[KEPT - 2 - age, i]
     return due
 
 
 @compiled()
 def let_go(kept: NDArray[np.void]) -> None:
-    """Leave the offsets as they are: the sliders go wherever they do, and nothing moves when they are held again."""
+    """Freeze the offsets while the sliders move freely, so that nothing moves when they are held again."""
     for i in range(3):
         if kept[0].done[i] < 1.0:
             kept[0].end[i], kept[0].done[i], kept[0].heading[i] = kept[0].offset[i], 1.0, 0.0

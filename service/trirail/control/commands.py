@@ -1,14 +1,14 @@
-"""What clients command: whether it may be now, what it does, and what has become of it."""
+"""Commands of clients: the check before each, its effect, and the rule of its completion."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import NamedTuple
 
+from trirail_drivers.interface import NAMES, PowerState
+
 from trirail.config import Config
-from trirail.control import completion
-from trirail.control.completion import CommandProgress, Rule, still_powered
-from trirail.control.feedback import Measured
+from trirail.control.feedback import CAN_MOVE, Measured
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter, LeaseChange
 from trirail.control.ledger import Ledger
@@ -17,16 +17,89 @@ from trirail.control.plan_requests import PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.control.transitions import Transitions
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Notice
 from trirail.wire.packets import CommandRequest
 from trirail.wire.vocabulary import Command, FaultCause, Mode
 
+_FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
+
+
+class CommandProgress(NamedTuple):
+    """State by which a rule judges a command."""
+
+    mode: Mode
+    latched: str | None
+    """Reason of the fault, if there is one."""
+    measured: Measured
+    settled: bool
+    """Whether the time that the drives may take to leave their fault state has elapsed."""
+
+
+Rule = Callable[[CommandProgress], str | None]
+"""Returns "" when a command is carried out, None while it is not, else the reason why it never will be."""
+
+
+def at_once(_: CommandProgress) -> str:
+    """Return "": complete on arrival."""
+    return ""
+
+
+def standing(now: CommandProgress) -> str | None:
+    """Return "" once the robot is at rest."""
+    return None if now.mode is Mode.STOPPING else ""
+
+
+def powered_up(now: CommandProgress) -> str | None:
+    """Return "" once the drives have power and the robot holds."""
+    if now.mode is Mode.ENABLING:
+        return None
+    return "" if now.mode not in (Mode.FAULT, Mode.DISABLED) else now.latched or "disabled while powering up"
+
+
+def powered_down(now: CommandProgress) -> str | None:
+    """Return "" once the robot is at rest and no drive has power."""
+    return _timed_out(now) or (None if now.mode is Mode.STOPPING or now.measured.powered else "")
+
+
+def unpowered(now: CommandProgress) -> str | None:
+    """Return "" once no drive has power."""
+    return _timed_out(now) or (None if now.measured.powered else "")
+
+
+def homed(now: CommandProgress) -> str | None:
+    """Return "" once every slider is homed."""
+    if now.mode in (Mode.HOMING, Mode.STOPPING):
+        return None
+    return "" if now.measured.homed else now.latched or "stopped before every drive was homed"
+
+
+def cleared(now: CommandProgress) -> str | None:
+    """Return "" once neither the robot nor a drive is in fault."""
+    if now.mode is Mode.FAULT:
+        return f"the cause is still there: {now.latched}"
+    return "" if now.settled and not any(state in _FAULTY for state in now.measured.feedback.state) else None
+
+
+def _timed_out(now: CommandProgress) -> str:
+    """Return the message of a drive that has not obeyed in time; else ""."""
+    fault = now.measured.feedback.fault
+    return fault.message if fault is not None and fault.cause == "timeout" else ""
+
+
+def still_powered(measured: Measured, latched: str | None) -> str:
+    """Name the drives that can still move, by their last states."""
+    states = zip(NAMES, measured.feedback.state, strict=True)
+    said = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
+    return f"{said} by what it said last: send reset again when the drives stand (fault: {latched})"
+
+
 SETTLE = 0.1
-"""How long the drives may take to leave their fault state after a reset [s]."""
+"""Time that the drives may take to leave their fault state after a reset [s]."""
 
 
 class Commands:
-    """Takes each command in the cycle in which it comes, and answers it when it is carried out."""
+    """Execution of commands: each begins in the cycle of its arrival, and is answered when carried out."""
 
     def __init__(
         self,
@@ -50,14 +123,14 @@ class Commands:
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
     def carry_out(self, request: CommandRequest) -> None:
-        """Begin to carry out a command. Raises RefusedError where that may not be."""
+        """Begin to carry out a command. Raises RefusedError where that is not allowed."""
         if not request.name.everybodys:
             self._lease.check(request.user)
         EFFECTS[request.name].begin(self, request)
         self._ledger.undertake(request, self._modes.cycle)
 
     def settle(self) -> None:
-        """Answer the commands that are carried out, or cannot be any more."""
+        """Answer the commands that are carried out or have failed."""
         self._ledger.settle(self._verdict, self._modes.state.mode, self._modes.cycle + 1)
 
     def end_silent_lease(self) -> None:
@@ -66,7 +139,7 @@ class Commands:
             self._change_lease(over)
 
     def _change_mode(self, request: CommandRequest) -> None:
-        """Let the mode's event of the same name happen."""
+        """Apply the mode event of the command's name."""
         event, reason = ModeEvent[request.name.name], _reason(request)
         action = self._modes.check(event).action
         goal = self._ledger.goal
@@ -74,10 +147,12 @@ class Commands:
             event = ModeEvent.STOP  # nobody would be at the key, nor where the target was, when it is resumed
         if action is Action.POWER_UP:
             self._setpoints.check_rest()
-            if self._measured.homed:
-                self._setpoints.check_start()
+            if self._measured.homed and (outside := self._setpoints.check_start()) is not None:
+                self._ledger.notices.append(Notice("service", "warning", outside.text, **outside.fields))
         if action is Action.CLEAR and self._measured.powered:
             raise RefusedError(RefusalCode.STOPPING, still_powered(self._measured, self._modes.fault))
+        if action is Action.CLEAR and (unready := self._measured.unready):
+            raise RefusedError(RefusalCode.FAULT, f"the cause is still there: {'; '.join(unready)}")
         if event is ModeEvent.QUICK_STOP:
             self._modes.trip(reason, FaultCause.QUICK_STOP)
         else:
@@ -85,7 +160,7 @@ class Commands:
             self._modes.withdraw(event, reason)
 
     def _stop(self, request: CommandRequest) -> None:
-        """Stop the robot, or one goal, where that has not begun, alone."""
+        """Stop the robot, or a single goal that has not begun."""
         goal = request.content.goal
         if goal is None or not self._goal_queue.stop_alone(goal, _reason(request)):
             self._change_mode(request)
@@ -96,16 +171,15 @@ class Commands:
         self._change_mode(request)
 
     def _override(self, request: CommandRequest) -> None:
-        """Let this motion and those to come run at another rate."""
+        """Set the rate of this motion and of later ones."""
         rate = self._planner.override = request.content.percent / 100.0
-        if self._modes.state.mode is Mode.MOVING:
-            self._planner.run_at(rate)
-        self._ledger.notices.append(
-            Notice("service", "info", f"override {rate:.0%} by {request.user}", user=request.user)
-        )
+        self._planner.update_rate()
+        words = f"override {rate:.0%} by {request.user}"
+        text = coded(words, EventCode.OVERRIDE, percent=request.content.percent, user=request.user)
+        self._ledger.notices.append(Notice("service", "info", text.text, user=request.user, **text.fields))
 
     def _acquire(self, request: CommandRequest) -> None:
-        """Let a user have the lease, or keep it."""
+        """Give a user the lease, or renew it."""
         change = self._lease.acquire(request.user, request.content, self._modes.cycle)
         if change is not None:
             self._change_lease(change)
@@ -114,41 +188,43 @@ class Commands:
         self._change_lease(self._lease.release(request.user, request.content))
 
     def _change_lease(self, change: LeaseChange) -> None:
-        """Tell who holds the lease from now on; what others have under way stops, and does not begin any more."""
+        """Report the new holder of the lease; stop other users' motion, and withdraw their waiting goals."""
         user = self._lease.user
-        self._ledger.notices.append(Notice("lease", change.level, change.message, user=user))
+        text = change.message
+        self._ledger.notices.append(Notice("lease", change.level, text.text, user=user, **text.fields))
         if user is None or not self._ledger.is_all_of(user):
-            self._modes.go(ModeEvent.STOP, change.message)
-            self._modes.withdraw(ModeEvent.STOP, change.message)
+            self._modes.go(ModeEvent.STOP, text)
+            self._modes.withdraw(ModeEvent.STOP, text)
 
     def _verdict(self, name: Command, since: int) -> str | None:
-        """Say what has become of a command that came in a cycle, as a Rule does."""
+        """Return the verdict of the Rule on a command that came in cycle `since`."""
         settled = self._modes.cycle - since >= self._settle_cycles
         return EFFECTS[name].rule(CommandProgress(self._modes.state.mode, self._modes.fault, self._measured, settled))
 
 
 class Effect(NamedTuple):
-    """What a command does, and by which rule it is carried out."""
+    """Effect of a command, and the rule of its completion."""
 
     rule: Rule
     begin: Callable[[Commands, CommandRequest], None] = Commands._change_mode
 
 
 EFFECTS: dict[Command, Effect] = {
-    Command.ENABLE: Effect(completion.powered_up),
-    Command.DISABLE: Effect(completion.powered_down),
-    Command.STOP: Effect(completion.standing, Commands._stop),
-    Command.QUICK_STOP: Effect(completion.unpowered),
-    Command.RESET: Effect(completion.cleared),
-    Command.HOME: Effect(completion.homed, Commands._home),
-    Command.PAUSE: Effect(completion.standing),
-    Command.RESUME: Effect(completion.at_once),
-    Command.OVERRIDE: Effect(completion.at_once, Commands._override),
-    Command.ACQUIRE: Effect(completion.at_once, Commands._acquire),
-    Command.RELEASE: Effect(completion.standing, Commands._release),
+    Command.ENABLE: Effect(powered_up),
+    Command.DISABLE: Effect(powered_down),
+    Command.STOP: Effect(standing, Commands._stop),
+    Command.QUICK_STOP: Effect(unpowered),
+    Command.RESET: Effect(cleared),
+    Command.HOME: Effect(homed, Commands._home),
+    Command.PAUSE: Effect(standing),
+    Command.RESUME: Effect(at_once),
+    Command.OVERRIDE: Effect(at_once, Commands._override),
+    Command.ACQUIRE: Effect(at_once, Commands._acquire),
+    Command.RELEASE: Effect(standing, Commands._release),
 }
-"""Every command's."""
+"""Effect of each command."""
 
 
-def _reason(request: CommandRequest) -> str:
-    return f"{request.name} by {request.user}"
+def _reason(request: CommandRequest) -> EventText:
+    words = f"{request.name} by {request.user}"
+    return coded(words, EventCode.COMMAND, command=request.name, user=request.user)

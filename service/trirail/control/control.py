@@ -1,8 +1,8 @@
 """The robot's control, one cycle at a time, without a clock, a socket or a file.
 
-A cycle only executes: `observe` what the drives said, `solve` the sliders, `write` the setpoints behind the last gate.
-Between two cycles it `conclude`s what the one before has come to, and `decide`s what the next one executes, by what is
-asked for. What is to be said of it waits at the `ledger`.
+A cycle only executes: `observe` the drives' feedback, `solve` the sliders, `write` the setpoints behind the last gate.
+Between two cycles, `conclude` evaluates the previous one, and `decide` chooses by the requests what the next one
+executes. Answers and notices wait in the `ledger`.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger
 from trirail.control.modes import ModeEvent, ModeState
 from trirail.control.plan_requests import PlannerPort, PlanRequests
+from trirail.control.returning_drives import ReturningDrives
 from trirail.control.setpoints import Setpoints
 from trirail.control.transitions import Transitions
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.backlash_reserve import reserve_for_backlash
-from trirail.motion.limits import EDGE, Bounds
-from trirail.motion.runs import STILL, MotionState, Run, rest
+from trirail.motion.backlash_reserve import planned_limits, reserve_for_backlash
+from trirail.motion.limits import SETPOINT_TOLERANCE, Bounds, standing_tolerance
+from trirail.motion.runs import ZERO_RATES, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.messages import FaultDetail, Notice, Outcome
 from trirail.wire.packets import (
+    Announcement,
     CommandRequest,
     Disturbance,
     GoalRequest,
-    Looked,
     PlannerLost,
-    PoseChanged,
-    RefusedRequest,
-    Remark,
     Request,
 )
 from trirail.wire.plan_packets import PlanAnswer
@@ -47,26 +46,26 @@ from trirail.wire.records import Part
 from trirail.wire.vocabulary import FaultCause, Mode
 
 Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
-"""What the control is given in a cycle, and when, by the monotonic clock [ns]."""
+"""Input of the control in a cycle, and its time by the monotonic clock [ns]."""
 
 
 class Calm(NamedTuple):
-    """What cycles come to in which nothing happens."""
+    """State of the control for cycles in which nothing happens."""
 
     run: Run | None
-    """The motion under way, if setpoints come from one."""
+    """Motion under way, if setpoints come from one."""
     follows: bool
-    """Whether setpoints follow what is measured; else, without a run, they stay."""
+    """Whether setpoints follow the measurement; else, without a run, they stay."""
     held: bool
-    """As of trirail.control.cycle.follow."""
+    """Argument of trirail.control.cycle.follow."""
     stands: bool
-    """As of trirail.control.cycle.observe."""
+    """Argument of trirail.control.cycle.observe."""
     found: int
-    """What trirail.control.cycle.command has found in the newest cycle."""
+    """Result of trirail.control.cycle.command in the newest cycle."""
     until: float
-    """The last cycle before something is due."""
+    """Last cycle before something is due."""
     settles_by: int | None
-    """The cycle in which a goal ends that waits for the robot to be in position; None where none does."""
+    """Cycle in which a goal that waits for the robot to be in position ends; None where none does."""
 
 
 class Control:
@@ -77,7 +76,7 @@ class Control:
         self._labels = robot.labels
         self._drives = drives
         self._period = self.period = config.period
-        self.schedule = Schedule(rest(STILL), config.period)
+        self.schedule = Schedule(rest(ZERO_RATES), config.period)
         self._planner = PlanRequests(config, planner, self.schedule)
         self.ledger = Ledger()
         frames, queue = NamedFrames(config.frames), config.motion.queue
@@ -89,8 +88,10 @@ class Control:
         self.measured = Measured(
             legs, config.period, step_length, self._following_error_limit, config.limits.in_position, taken
         )
-        bounds = Bounds(config.limits, config.period, EDGE, robot.labels)
-        self.setpoints = Setpoints(legs, bounds, self.measured, step_length)
+        bounds = Bounds(config.limits, config.period, SETPOINT_TOLERANCE, robot.labels)
+        planned = planned_limits(config.limits, config.correction.backlash)
+        tolerance = standing_tolerance(planned, robot.arm)
+        self.setpoints = Setpoints(legs, bounds, tolerance, self.measured, step_length)
         self.modes = Transitions(
             drives, self.schedule, self._planner, self.ledger, self.goal_queue, self.measured, self.setpoints
         )
@@ -98,26 +99,27 @@ class Control:
             *(config, self.modes, self.lease, self.ledger),
             *(self.goal_queue, self._planner, self.measured, self.setpoints),
         )
+        self._returning = ReturningDrives(robot.labels, config.limits.in_position.sliders)
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._found = 0
 
     @property
     def cycles(self) -> int:
-        """How many cycles have been run."""
+        """Number of completed cycles."""
         return self.modes.cycle - 1
 
     @property
     def state(self) -> ModeState:
-        """The mode, and what is to come once the robot stands."""
+        """Mode, and what follows once the robot is at rest."""
         return self.modes.state
 
     @property
     def fault(self) -> str | None:
-        """The first reason of the fault; None where there is none."""
+        """First reason of the fault; None where there is none."""
         return self.modes.fault
 
     def calm(self) -> Calm | None:
-        """Return what the next cycles come to if nothing happens in them; None where something is to be done."""
+        """Return the state for cycles in which nothing happens; None while something needs to be done."""
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
@@ -136,7 +138,7 @@ class Control:
         return Calm(run, follows, held, self._stands, found, until, settling.ends)
 
     def _waits(self, run: Run | None) -> bool:
-        """Whether nothing more comes of a motion that has ended."""
+        """Whether a motion has ended and its goal waits."""
         if run is None or not run.arrived:
             return False
         goal = self.ledger.goal
@@ -144,9 +146,9 @@ class Control:
         return self.state.mode is Mode.MOVING and (self.measured.settling.under_way or target)
 
     def go_on(self, newest: int, time: float, found: int | None) -> None:
-        """Take over after calm cycles: the number of the newest one, and the time of the run's law in it [s].
+        """Continue after calm cycles from the number of the newest one, and the time of the run's law in it [s].
 
-        `found` is what the compiled call has found in that, if something comes of it.
+        `found` is the result of the compiled call in that cycle, if it needs handling.
         """
         self.schedule.cycle += newest - self.cycles
         self.modes.cycle = newest + 1
@@ -157,20 +159,32 @@ class Control:
             self.conclude()
 
     def cycle(self, read: Callable[[], Feedback], given: Iterable[Given] = ()) -> None:
-        """Decide by what is given before a cycle, and run it on what is then `read` of the drives."""
+        """Decide by the input before a cycle, and run it on the feedback that is then `read`."""
         self.decide(given)
         self.execute(read())
         self.conclude()
 
-    def execute(self, feedback: Feedback, mark: Callable[[Part], None] = lambda _: None) -> None:
-        """Run one cycle on what the drives said at its SYNC; `mark` is called at the end of each part.
+    def execute(
+        self,
+        feedback: Feedback,
+        mark: Callable[[Part], None] = lambda _: None,
+        *,
+        behind: int | None = None,
+        code: int | None = None,
+    ) -> None:
+        """Run one cycle on the drives' feedback at its SYNC; `mark` is called at the end of each part.
 
-        Nothing that goes wrong in it leaves the robot moving.
+        No error in it leaves the robot moving. Where the compiled cycle has ended early, `behind` is the result of
+        its `observe`, and `code` that of its `command` or `hold` if it has reached them.
         """
         try:
-            self.observe(feedback)
-            mark(Part.MOTION)
-            self.solve()
+            if code is None:
+                self.observe(feedback, behind)
+                mark(Part.MOTION)
+                self.solve()
+            else:
+                self.schedule.cycle += 1
+                self._check_solved(code)
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
             self._trip_for(error)
         mark(Part.KINEMATICS)
@@ -178,7 +192,8 @@ class Control:
         mark(Part.WRITE)
 
     def _trip_for(self, error: Exception) -> None:
-        self.modes.trip(f"internal error, please report it: {error!r}", FaultCause.INTERNAL)
+        words = f"internal error, please report it: {error!r}"
+        self.modes.trip(coded(words, EventCode.INTERNAL_ERROR, error=repr(error)), FaultCause.INTERNAL)
 
     # ------------------------------------------------------------------ the cycle, in its order
 
@@ -190,39 +205,46 @@ class Control:
         self._planner.warm_up()
         self._tell_warnings(feedback)
 
-    def observe(self, feedback: Feedback) -> None:
-        """Take in what the drives said at this SYNC, and stop all three if they must not go on."""
+    def observe(self, feedback: Feedback, behind: int | None = None) -> None:
+        """Read the drives' feedback at this SYNC, and stop all three if they must not continue.
+
+        `behind` is the result of the compiled `observe`, if that has been called.
+        """
         before = self.measured.feedback
-        behind = self.measured.update(feedback, self._stands)
+        if behind is None:
+            behind = self.measured.update(feedback, self._stands)
         self._tell_warnings(feedback)
         mode = self.state.mode
         if feedback.fault is not None:
             drive, cause, code, message = feedback.fault
+            text = coded(message, EventCode.DRIVE_FAULT, cause=cause, drive=drive, code=code)
             if mode is Mode.FAULT and feedback.fault != before.fault:
-                # The first one stays, but this came of it.
-                self.ledger.notices.append(Notice("fault", "error", message, fault=FaultDetail(cause, drive, code)))
-            self.modes.trip(message, cause, drive, code)
+                # The first fault stays latched; this one followed from it.
+                detail = FaultDetail(cause, drive, code)
+                self.ledger.notices.append(Notice("fault", "error", message, fault=detail, **text.fields))
+            self.modes.trip(text, cause, drive, code)
         elif mode is Mode.ENABLING:
             self._power_up()
         elif mode in (Mode.HOMING, Mode.HOLDING, Mode.MOVING, Mode.STOPPING):
             if behind:
-                error = self.measured.following_error[behind - 1]
-                self.modes.trip(
-                    f"slider {self._labels[behind - 1]}: following error {error * 1e3:.3f} mm is beyond its limit "
-                    f"{self._following_error_limit * 1e3:g} mm",
-                    FaultCause.FOLLOWING_ERROR,
-                    NAMES[behind - 1],
-                )
+                error, limit = self.measured.following_error[behind - 1], self._following_error_limit
+                slider = self._labels[behind - 1]
+                words = f"slider {slider}: following error {error * 1e3:.3f} mm is beyond its limit {limit * 1e3:g} mm"
+                text = coded(words, EventCode.FOLLOWING_ERROR, slider=slider, value=error, limit=limit)
+                self.modes.trip(text, FaultCause.FOLLOWING_ERROR, NAMES[behind - 1])
             elif not feedback.homing:
                 self._homing_over()
 
     def _tell_warnings(self, feedback: Feedback) -> None:
-        """Tell what people should know of the drives: they say it in one feedback only, some in the first."""
+        """Report the drives' warnings: each is in one feedback only, some in the first."""
         for warning in feedback.warnings:
-            self.ledger.notices.append(Notice("service", "warning", warning))
+            text = coded(warning, EventCode.DRIVE_WARNING, warning=warning)
+            self.ledger.notices.append(Notice("service", "warning", warning, **text.fields))
+        for level, text in self._returning.update(feedback):
+            self.ledger.notices.append(Notice("service", level, text.text, **text.fields))
 
     def solve(self) -> None:
-        """Move the commanded motion on by one period, solve the sliders by the paper's recursion, pass the last gate.
+        """Advance the commanded motion by one period, solve the sliders by the paper's recursion, pass the last gate.
 
         All of that is one compiled call.
         """
@@ -231,11 +253,15 @@ class Control:
             self._found = 0
             self._follow_measured()
             return
-        self._found = self.setpoints.solve(self.schedule, run)
+        self._check_solved(self.setpoints.solve(self.schedule, run))
         if len(self.schedule.runs) > 1:
             self.setpoints.tell_progress(*self.schedule.progress)
+
+    def _check_solved(self, code: int) -> None:
+        """Stop where the last gate has refused the setpoints."""
+        self._found = code
         if refused := self.setpoints.refusal(self._found):
-            self.modes.trip(refused, FaultCause.LIMIT)
+            self.modes.trip(coded(refused, EventCode.BAD_SETPOINT), FaultCause.LIMIT)
 
     def write(self) -> None:
         """Send the setpoints."""
@@ -244,7 +270,7 @@ class Control:
     # ------------------------------------------------------------------ between two cycles
 
     def conclude(self) -> None:
-        """End goals, or the motion, by what the compiled call has found in this cycle and what was measured in it.
+        """End goals, or the motion, by the compiled call's result and the measurement of this cycle.
 
         Commands that are carried out are answered.
         """
@@ -256,7 +282,7 @@ class Control:
             self.goal_queue.expire(self.modes.cycle)
             self._judge_arrival()
             moves = self.state.mode in (Mode.MOVING, Mode.STOPPING)
-            if found and moves and schedule.runs and schedule.runs[0].stands:
+            if found and moves and schedule.runs and schedule.runs[0].at_rest:
                 self._stand(schedule.runs[0])
             self._commands.settle()
         except Exception as error:  # noqa: BLE001
@@ -266,7 +292,7 @@ class Control:
     def decide(self, given: Iterable[Given]) -> None:
         """Decide what the next cycle executes.
 
-        `handle` what is given, end a lease or a jog that nobody renews, and begin what is planned and due.
+        `handle` the input, end a lease or a jog that is not renewed, and begin a planned motion that is due.
         """
         try:
             for what, now_ns in given:
@@ -274,21 +300,27 @@ class Control:
             self._commands.end_silent_lease()
             released = self.ledger.release(self.modes.cycle) if self.state.mode is Mode.MOVING else None
             if released is not None:
-                self.modes.go(ModeEvent.NOT_RENEWED, f"goal {released.id} of {released.user} is not renewed")
+                words = f"goal {released.id} of {released.user} is not renewed"
+                late = coded(words, EventCode.NOT_RENEWED, goal=released.id, user=released.user)
+                self.modes.go(ModeEvent.NOT_RENEWED, late)
             beginning = self.goal_queue.think(self.modes.cycle, self._admit, self._place)
             if beginning is not None:
-                self.modes.go(ModeEvent.GOAL, f"goal {beginning.id} of {beginning.user}", beginning)
+                words = f"goal {beginning.id} of {beginning.user}"
+                begun = coded(words, EventCode.GOAL_STARTED, goal=beginning.id, user=beginning.user)
+                self.modes.go(ModeEvent.GOAL, begun, beginning)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
     def handle(self, what: Request | Disturbance | PlanAnswer | PlannerLost, now_ns: int) -> None:
-        """Take in what is asked for, has happened or is planned, at a time of the monotonic clock."""
+        """Handle a request, a disturbance or a plan, received at a time of the monotonic clock."""
         try:
             match what:
                 case Disturbance():
-                    self.modes.happen(ModeEvent[what.event], what.reason)
-                case GoalRequest() | CommandRequest() | RefusedRequest() | PoseChanged() | Looked() | Remark():
+                    self.modes.happen(ModeEvent[what.event], what.text)
+                case GoalRequest() | CommandRequest():
                     self._answer(what, now_ns)
+                case Announcement(notice):
+                    self.ledger.notices.append(notice)
                 case PlannerLost():
                     self._planner.lose(what.reason)
                 case answer:
@@ -296,22 +328,13 @@ class Control:
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
-    def _answer(self, request: Request, now_ns: int) -> None:
-        """Take a request: a command at once, a goal behind those before it."""
+    def _answer(self, request: GoalRequest | CommandRequest, now_ns: int) -> None:
+        """Carry out a command immediately; enqueue a goal behind earlier ones."""
         try:
             if isinstance(request, GoalRequest):
                 self.goal_queue.enqueue(request, now_ns, self.modes.cycle)
-            elif isinstance(request, CommandRequest):
-                self._commands.carry_out(request)
-            elif isinstance(request, PoseChanged):
-                self.ledger.notices.append(Notice("pose", "info", request.message, user=request.user))
-            elif isinstance(request, Looked):
-                look, words = request.look, request.message
-                self.ledger.notices.append(Notice("alignment", request.level, words, user=request.user, alignment=look))
-            elif isinstance(request, Remark):
-                self.ledger.notices.append(Notice("service", request.level, request.message))
             else:
-                self.ledger.notices.append(Notice("refused", "warning", request.message, user=request.user))
+                self._commands.carry_out(request)
         except RefusedError as refusal:
             self.ledger.refuse(request, refusal)
 
@@ -319,17 +342,17 @@ class Control:
 
     @property
     def commanded(self) -> MotionState:
-        """The platform's motion commanded in this cycle."""
+        """Motion of the platform commanded in this cycle."""
         return self.schedule.commanded
 
     @property
     def override(self) -> float:
-        """The rate at which motions are to run."""
+        """Rate at which motions shall run."""
         return self._planner.override
 
     @property
     def target(self) -> Triple | None:
-        """The pose that the running goal leads to, or that its target was last told to have; None for a jog."""
+        """Pose that the running goal leads to, or last reported pose of its target; None for a jog."""
         last, goal = self.schedule.last, self.ledger.goal
         if goal is None or last is None:
             return None
@@ -341,16 +364,16 @@ class Control:
     # ------------------------------------------------------------------ requests
 
     def _admit(self) -> bool:
-        """Whether the robot is moving to a goal; RefusedError where it takes none."""
+        """Whether the robot is moving to a goal. Raises RefusedError where it accepts none."""
         self.modes.check(ModeEvent.GOAL)
         if not self.measured.homed:
             raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
         return self.state.mode is Mode.MOVING
 
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
-        """Return the pose from which a move begins: where the goals before it lead, or where the robot is.
+        """Return the pose from which a move begins: the end of the goals before it, or the measured pose.
 
-        RefusedError while a goal waits half-way, paused or at override 0: who looks at the robot means from there.
+        Raises RefusedError while a goal waits half-way, paused or at override 0: a person means a move from there.
         """
         if origin == "measured":
             return self.measured.pose
@@ -369,43 +392,42 @@ class Control:
 
     @property
     def _stands(self) -> bool:
-        """Whether the robot has been commanded to stand where it does."""
+        """Whether the robot is commanded to be at rest."""
         return (self.state.mode is Mode.HOLDING and self.measured.homed) or self.measured.settling.under_way
 
     def _stand(self, run: Run) -> None:
-        """The motion has ended where it should, or its law has brought it to a standstill on the way.
+        """Handle the end of the motion: at its target, or at a standstill of its law on the way.
 
-        A goal whose path has ended is under way until the robot is in position.
+        A goal whose path has ended stays under way until the robot is in position.
         """
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
-            self.modes.go(ModeEvent.STANDSTILL, "standstill")
+            self.modes.go(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
         elif self.state.mode is Mode.MOVING and goal is not None and goal.kind.waits_at_end:
             return  # it waits for what renews it
         elif goal is None or not goal.settles:
-            self.modes.go(ModeEvent.ARRIVED, "standstill")
+            self.modes.go(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
         elif not settling.under_way:
             settling.begin(self.modes.cycle)
 
     def _judge_arrival(self) -> None:
-        """End the goal whose path has ended once the robot is in position, or where that has taken too long."""
+        """End the goal whose path has ended once the robot is in position, or the time-out has elapsed."""
         settling = self.measured.settling
         settled = settling.over(self.modes.cycle)
         if settled is None:
             return
         outcome: Outcome = "done" if settled.settle is not None else "unsettled"
-        self.ledger.end(outcome, settling.said(settled, self._labels), settled=settled)
-        self.modes.go(ModeEvent.ARRIVED, "standstill")
+        self.ledger.end(outcome, settling.describe(settled, self._labels), settled=settled)
+        self.modes.go(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
 
     def _power_up(self) -> None:
-        """Hold with every drive that is enabled already; go on when all are, give up when it takes too long."""
+        """Hold with each drive that is enabled already; continue when all are, trip after the time-out."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
             if not self.measured.homed:
-                self.modes.go(
-                    ModeEvent.POWERED, "all drives are enabled; where the sliders are is not known: send home"
-                )
+                words = "all drives are enabled; where the sliders are is not known: send home"
+                self.modes.go(ModeEvent.POWERED, coded(words, EventCode.POWERED_NOT_HOMED))
             elif self._rest_at_setpoints():
-                self.modes.go(ModeEvent.POWERED, "all drives are enabled")
+                self.modes.go(ModeEvent.POWERED, coded("all drives are enabled", EventCode.POWERED))
         elif self.modes.cycle - self.modes.entered > self._enable_cycles:
             waiting = [
                 f"{naming.drive(name, self._labels)} is {state}"
@@ -413,39 +435,49 @@ class Control:
                 if state is not PowerState.OPERATION_ENABLED
             ]
             seconds = self._enable_cycles * self._period
-            self.modes.trip(
-                f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected", FaultCause.ENABLE
-            )
+            words = f"{', '.join(waiting)} {seconds:g} s after enable; operation enabled was expected"
+            names = [
+                name
+                for name, state in zip(self._labels, self.measured.feedback.state, strict=True)
+                if state is not PowerState.OPERATION_ENABLED
+            ]
+            text = coded(words, EventCode.ENABLE_TIMEOUT, drives=", ".join(names), timeout=seconds)
+            self.modes.trip(text, FaultCause.ENABLE)
 
     def _homing_over(self) -> None:
-        """Hold where homing has ended, or was stopped."""
+        """Hold where homing has ended or was stopped."""
         if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self.schedule.runs:
             return  # no homing has been under way
         if self.measured.homed:
             try:
-                self.setpoints.check_start()
+                outside = self.setpoints.check_start()
             except RefusedError as refusal:
-                self.modes.trip(f"all drives are homed, but {refusal}", FaultCause.PLACE)
+                words = f"all drives are homed, but {refusal}"
+                self.modes.trip(coded(words, EventCode.BAD_POSITION), FaultCause.PLACE)
                 return
+            if outside is not None:
+                self.ledger.notices.append(Notice("service", "warning", outside.text, **outside.fields))
             if not self._rest_at_setpoints():
                 return
         if self.state.mode is Mode.STOPPING:
-            self.modes.go(ModeEvent.STANDSTILL, "standstill")
+            self.modes.go(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
         else:
-            self.modes.go(ModeEvent.HOMED, "all drives are homed")
+            self.modes.go(ModeEvent.HOMED, coded("all drives are homed", EventCode.HOMED))
 
     def _rest_at_setpoints(self) -> bool:
-        """Command the pose that belongs to the setpoints, at rest; trip where there is none."""
+        """Command the pose of the setpoints, at rest; trip where there is none."""
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
-            self.modes.trip("the measured sliders belong to no pose", FaultCause.PLACE)
+            words = "the measured sliders belong to no pose"
+            self.modes.trip(coded(words, EventCode.BAD_POSITION), FaultCause.PLACE)
             return False
         self.schedule.commanded = rest(pose)
+        self.setpoints.stand_at(pose)
         return True
 
     def _follow_measured(self) -> None:
-        """Command the pose that is measured, and the sliders to where they are."""
+        """Command the measured pose, and the measured positions of the sliders."""
         held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
         stopped_now = self.state.mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         self.setpoints.follow(self.schedule, held=held, stopped_now=stopped_now)

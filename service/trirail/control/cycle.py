@@ -1,16 +1,16 @@
-"""The arithmetic of one cycle, compiled: where the robot is, and what its sliders are to do next.
+"""Arithmetic of one cycle, compiled: the robot's measured state, and its sliders' next setpoints.
 
-`observe` puts together what the drives said at a SYNC. `command` moves the platform one period on along its path and
-solves the sliders for it, behind the last gate; `hold` does that for one that stands, and `follow` leads the sliders to
-where they are. Each is one call over arrays that are made once, allocates nothing, and writes the cycle's record as it
-goes. Between the two calls of a cycle the control decides what changes modes.
+`observe` evaluates the drives' feedback at a SYNC. `command` moves the platform along its path by one period and solves
+the sliders for it, behind the last gate; `hold` does the same for a platform at rest, and `follow` leads the setpoints
+to the measured sliders. Each is one call over arrays that are made once, allocates nothing, and writes the cycle's
+record. Between the two calls of a cycle the control decides on changes of mode.
 
 Arrays: `legs` is Geometry.packed(), `bounds` Bounds.packed, `feedback` (2,) of FEEDBACK, the newest and the one before,
 `written` (5, 3) the setpoints of the cycles before, the newest last [m], `motion` (2, 3, 3) the platform's rows pose,
-velocity, acceleration as they are commanded, in this cycle and in the one before, `sliders` (2, 6, 3) the rows
-position, velocity, acceleration, and those of the cross slides, as they are set, and as they are tried, `kept` (2,) of
-BACKLASH, likewise, `found` (2,) what the gate has found, and `record` (1,) of trirail.wire.records.DTYPE. Places of
-sliders that are set or measured have the offset in them by which backlash is taken up.
+velocity, acceleration as commanded in this cycle and in the one before, `sliders` (2, 6, 3) the rows position,
+velocity, acceleration, and those of the cross slides, as set and as tried, `kept` (2,) of BACKLASH, as set and as
+tried, `found` (2,) the values that the gate has refused, and `record` (1,) of trirail.wire.records.DTYPE. Positions of
+sliders, set or measured, include the offset that compensates backlash.
 """
 
 from __future__ import annotations
@@ -30,16 +30,18 @@ from trirail.kinematics.closed_forward import forward_into
 from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.geometry import Geometry
-from trirail.motion.limits import BOUNDS, gate
-from trirail.motion.paths import FALL, law_at, platform_at
+from trirail.motion.limits import BOUNDS, AllowedMotion, gate
+from trirail.motion.paths import MAX_TIME_FALL_S, law_at, platform_at
 from trirail.wire.records import DTYPE
 
 __all__ = [
     "BACKWARDS",
+    "DRIFTS",
     "FAR",
     "FEEDBACK",
     "OLDEST",
     "PASSED",
+    "RUNS_ON",
     "SAID",
     "STANDS",
     "command",
@@ -50,15 +52,24 @@ __all__ = [
 ]
 
 OLDEST = 3
-"""The greatest age of a position that is compared with its setpoint [SYNCs]: at the next one a real drive is silent."""
+"""Greatest age of a position that is compared with its setpoint [SYNCs]: at the next one a real drive is silent."""
 PASSED, STANDS = 1, 2
-"""What command finds beside what is refused: the goal under way has ended on the path, the motion stands."""
+"""Bits in the result of command: the goal under way has ended on the path, the motion is at rest."""
 FAR = 1000
-"""Steps of a slider that its setpoint may be away from it where no wrong position has been followed."""
+"""Greatest distance of a setpoint from its slider, in steps, unless it has followed a wrong position."""
 BACKWARDS = -1
-"""What command refuses where the time along the path would fall."""
+"""Refusal of command where the time along the path would fall."""
+DRIFTS = -2
+"""Refusal of command and hold where the platform would move in a mode of standstill."""
+RUNS_ON = -3
+"""Refusal of command where a braking motion would continue."""
+DRIFT = 1e-12
+"""Greatest change of a pose per cycle that is rounding [m, rad]: at 1 kHz a drift of 1 nm/s is refused."""
+DRIFT_VELOCITY = 1e-9
+"""Greatest velocity of a platform at rest that is rounding [m/s, rad/s]."""
+_ANY, _BRAKING, _BRAKED, _NONE = (int(allowed) for allowed in AllowedMotion)
 OLDEST_RECORDED = 255
-"""No feedback is recorded as older [SYNCs]."""
+"""Greatest recorded age of feedback [SYNCs]; a greater one is recorded as this."""
 
 FEEDBACK = np.dtype(
     [
@@ -71,9 +82,9 @@ FEEDBACK = np.dtype(
     ],
     align=True,
 )
-"""What the numbers of trirail_drivers.interface.Feedback are here."""
+"""Numeric fields of trirail_drivers.interface.Feedback."""
 SAID = struct.Struct("<3d3q10B")
-"""To pack them."""
+"""Packing of FEEDBACK."""
 
 LEGS = typeof(Geometry.symmetric().packed())  # type: ignore[no-untyped-call]
 BOUND, FEEDBACKS, RECORD = from_dtype(BOUNDS)[::1], from_dtype(FEEDBACK)[::1], from_dtype(DTYPE)[::1]
@@ -98,12 +109,12 @@ def observe(
     monitored: NDArray[np.void],
     record: NDArray[np.void],
 ) -> int:
-    """Work out pose, velocities and following errors from feedback[0], and keep it as feedback[1].
+    """Compute pose, velocities and following errors from feedback[0], and keep it as feedback[1].
 
-    `fastest` [m/s] is the velocity above which a slider `jumps`: then the pose stays what it was, as it does where
-    the sliders belong to none; `room` (2, 3) is to seek it in. While the commanded motion `stands`, and no backlash is
-    being taken up, it is `monitored` whether the robot is in position. Returns 0, or 1 + i if the following error of
-    slider i is the first that is beyond `limit` [m].
+    `fastest` [m/s] is the velocity above which a slider `jumps`: then the pose stays unchanged, as it does where
+    the sliders belong to none; `room` (2, 3) is workspace. While the commanded motion `stands`, and no backlash is
+    being taken up, `monitored` records whether the robot is in position. Returns 0, or 1 + i if the following error
+    of slider i is the first beyond `limit` [m].
     """
     now, before, told = feedback[0], feedback[1], record[0]
     written[:-1] = written[1:]
@@ -119,7 +130,7 @@ def observe(
         told.backlash[i] = due_offset(kept, age, i)
         if not now.follows[i]:
             told.following_error[i] = 0.0
-        elif now.age[i] <= OLDEST:  # else what was due then is not known any more, and the error stays what it was
+        elif now.age[i] <= OLDEST:  # else the setpoint due then is no longer known, and the error stays unchanged
             told.following_error[i] = written[len(written) - 2 - age, i] - now.position[i]
         if beyond == 0 and not abs(told.following_error[i]) <= limit:
             beyond = 1 + i
@@ -139,7 +150,7 @@ def observe(
 
 @compiled()
 def _record_command(motion: Array, sliders: Array, progress: float, remaining: float, record: NDArray[np.void]) -> None:
-    """Write what is commanded into the record."""
+    """Write the commanded values into the record."""
     told = record[0]
     for i in range(3):
         told.commanded_pose[i] = motion[0, 0, i]
@@ -153,6 +164,17 @@ def _record_command(motion: Array, sliders: Array, progress: float, remaining: f
 
 
 @compiled()
+def _drifts(motion: Array, found: Array) -> bool:
+    """Whether the platform moves; then `found` holds its change and velocity."""
+    for n in range(3):
+        change = motion[0, 0, n] - motion[1, 0, n]
+        if not (abs(change) <= DRIFT and abs(motion[0, 1, n]) <= DRIFT_VELOCITY):
+            found[0], found[1] = change, motion[0, 1, n]
+            return True
+    return False
+
+
+@compiled()
 def _solve(
     legs: Array,
     bounds: NDArray[np.void],
@@ -161,10 +183,13 @@ def _solve(
     kept: NDArray[np.void],
     found: Array,
 ) -> int:
-    """Solve the sliders for the platform's motion; leave them as they are where the last gate refuses it.
+    """Solve the sliders for the platform's motion; leave them unchanged where the last gate refuses it.
 
-    Returns 0, 1 + i where leg i is singular or a number is not finite, or 3 + a code of trirail.motion.limits.gate.
+    Returns 0, 1 + i where leg i is singular or a number is not finite, 3 + a code of trirail.motion.limits.gate, or
+    DRIFTS.
     """
+    if bounds[0].allowed == _NONE and _drifts(motion, found):
+        return DRIFTS
     singular = inverse_motion(legs, motion[0], sliders[1])
     if singular:
         return singular
@@ -203,18 +228,23 @@ def command(
     found: Array,
     record: NDArray[np.void],
 ) -> int:
-    """Move the platform on along its path, to a time of its law [s], and solve the sliders for that.
+    """Move the platform along its path, to a time of its law [s], and solve the sliders for it.
 
-    `target` is the rate that the law leads to, `furthest` (1,) the greatest time along the path so far [s]: less is
-    refused. The goal under way began and ends at the times `begun` and `end` along the path, and the law comes there at
-    `arrival` [s]. Returns a sum of PASSED, STANDS and 4 times what is refused: see `refusal`.
+    `target` is the rate that the law leads to, `furthest` (1,) the greatest time yet along the path [s]: less is
+    refused. The goal under way began and ends at the times `begun` and `end` along the path, and the law reaches its
+    end at `arrival` [s]. Returns a sum of PASSED, STANDS and 4 times the refusal: see `refusal`.
     """
     law = law_at(law_knots, law_pieces, time)
     s, rate, change = law
     motion[1] = motion[0]
     if platform_at(legs, knots, pieces, in_sliders, tools, law, motion[1, 0], motion[0]) != 0:
         motion[0] = math.nan
-    if s >= furthest[0] - FALL:
+    if bounds[0].allowed == _BRAKING and target == 0.0:
+        bounds[0].allowed = _BRAKED
+    if bounds[0].allowed == _BRAKED and target != 0.0:
+        found[0], found[1] = target, rate
+        refused = RUNS_ON
+    elif s >= furthest[0] - MAX_TIME_FALL_S:
         furthest[0] = max(s, furthest[0])
         refused = _solve(legs, bounds, motion, sliders, kept, found)
     else:
@@ -238,7 +268,7 @@ def hold(
     found: Array,
     record: NDArray[np.void],
 ) -> int:
-    """Solve the sliders for a platform that stays as it is; returns as `command`."""
+    """Solve the sliders for a platform at rest; return the code of `command`."""
     motion[1] = motion[0]
     refused = _solve(legs, bounds, motion, sliders, kept, found)
     _record_command(motion, sliders, 0.0, 0.0, record)
@@ -246,10 +276,10 @@ def hold(
 
 
 def refusal(code: int) -> int:
-    """Return what is refused, from what `command` and `hold` return.
+    """Return the refusal in a result of `command` or `hold`.
 
-    0 for nothing, BACKWARDS, 1 + i where leg i is singular or a number is not finite, or 3 + a code for
-    Bounds.violation.
+    0 for nothing, BACKWARDS, DRIFTS, RUNS_ON, 1 + i where leg i is singular or a number is not finite, or 3 + a code
+    for Bounds.violation.
     """
     return code >> 2
 
@@ -267,11 +297,11 @@ def follow(
     kept: NDArray[np.void],
     record: NDArray[np.void],
 ) -> None:
-    """Command the pose that is measured, at rest, and lead each slider to where it is, by a `step` [m] at most.
+    """Command the measured pose, at rest, and lead each setpoint to its slider, by a `step` [m] at most.
 
     A position that jumps is not followed, nor one that an enabled drive holds where `held`, nor any where all drives
-    were `stopped_now`. A drive that moves by itself gets its own position at once, and so does one without power whose
-    setpoint is FAR from it: that came of a position that was none.
+    were `stopped_now`. A drive that moves by itself gets its own position immediately, and so does one without power
+    whose setpoint is FAR from it, since that setpoint followed a wrong position.
     """
     let_go(kept)
     now, told = feedback[0], record[0]

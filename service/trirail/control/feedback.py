@@ -1,4 +1,4 @@
-"""What the drives say, put together: where the platform is, how fast the sliders are and how far behind."""
+"""Measured state from the drives' feedback: the platform's pose, the sliders' velocities and following errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trirail.control.in_position import Settling
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.robot import forward_into
 from trirail.motion.backlash_reserve import NO_BACKLASH, TakeUp
-from trirail.motion.runs import STILL
+from trirail.motion.runs import ZERO_RATES
 from trirail.wire.records import DTYPE
 
 WINDOWS = InPosition()
@@ -21,10 +21,10 @@ CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerSta
 
 
 class Measured:
-    """The newest feedback, beside the setpoints that it answers; all of it in the cycle's record.
+    """Newest feedback, beside the setpoints that it answers; all of it in the cycle's record.
 
-    `step` [m] is how far a slider can go in a cycle, `limit` [m] what following errors are held against, `windows` what
-    residuals are held against where the robot is to stand, `taken` how the sliders' backlash is taken up.
+    `step` [m] is a slider's greatest travel in a cycle, `limit` [m] the limit of following errors, `windows` the limits
+    of residuals at rest, `taken` the take-up of the sliders' backlash.
     """
 
     def __init__(
@@ -36,20 +36,20 @@ class Measured:
         windows: InPosition = WINDOWS,
         taken: TakeUp = NO_BACKLASH,
     ) -> None:
-        self.feedback = Feedback(STILL, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
+        self.feedback = Feedback(ZERO_RATES, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
         self.record = np.zeros(1, DTYPE)
-        """The cycle's record, (1,): what is measured here, what is commanded by the setpoints."""
+        """The cycle's record, (1,): measured values are written here, commanded ones by the setpoints."""
         self.numbers = np.zeros(2, cycle.FEEDBACK)
-        """The feedback's numbers, and those of the one before."""
+        """Numbers of the feedback, and of the one before."""
         self.jumping = np.zeros(3, np.bool)
-        """Which sliders were measured where none can be so soon: what they say is not followed."""
+        """Whether each slider's position jumped faster than it can move: such positions are not followed."""
         self.settling = Settling(windows, period)
         """Whether the robot is in position."""
         self.backlash = backlash(taken, period)
-        """What of the setpoints takes up backlash, (2,) of trirail.control.backlash.BACKLASH."""
+        """Backlash compensation of the setpoints, (2,) of trirail.control.backlash.BACKLASH."""
         self.legs = legs
         self._period = period
-        self.fastest = 2.0 * step / period  # the age may be one off, and makes a step a double one
+        self.fastest = 2.0 * step / period  # the age may be wrong by one, which doubles a step
         self.limit = limit
         self._packed = self.numbers.view(np.uint8).data
         self.written = np.zeros((2 + cycle.OLDEST, 3))
@@ -63,7 +63,7 @@ class Measured:
 
     @property
     def pose(self) -> Triple:
-        """The newest pose to which measured sliders belonged."""
+        """Newest pose to which measured sliders belonged."""
         return self._recorded("pose")
 
     @property
@@ -73,12 +73,12 @@ class Measured:
 
     @property
     def following_error(self) -> Triple:
-        """Setpoint due less position [m]; none for a drive that moves by itself."""
+        """Setpoint due less position [m]; zero for a drive that moves by itself."""
         return self._recorded("following_error")
 
     @property
     def jumps(self) -> tuple[bool, bool, bool]:
-        """Which sliders were measured where none can be so soon."""
+        """Whether each slider's position jumped faster than it can move."""
         a, b, c = self.jumping.tolist()
         return a, b, c
 
@@ -88,12 +88,17 @@ class Measured:
         return any(state in CAN_MOVE for state in self.feedback.state)
 
     @property
+    def unready(self) -> tuple[str, ...]:
+        """Reasons why drives cannot be reset yet, a line for each, and one for all where the bus is lost."""
+        return tuple(dict.fromkeys(str(each) for each in self.feedback.unready if each is not None))
+
+    @property
     def homed(self) -> bool:
-        """Whether it is known where the sliders are."""
+        """Whether the positions of all sliders are known."""
         return all(self.feedback.homed)
 
     def start(self, feedback: Feedback) -> None:
-        """Take the first feedback, for the setpoints of the past too."""
+        """Take the first feedback, also as the past setpoints."""
         self._pack(feedback)
         self.numbers[1] = self.numbers[0]
         self.written[:] = self.record["commanded_position"] = feedback.position
@@ -101,7 +106,7 @@ class Measured:
     def update(self, feedback: Feedback, stands: bool = False) -> int:
         """Take the feedback of the next cycle; return 0, or 1 + i if slider i's following error is beyond its limit.
 
-        `stands` tells whether the motion that was commanded until now does.
+        `stands` is whether the motion commanded until now is at rest.
         """
         self._pack(feedback)
         return cycle.observe(
@@ -120,7 +125,7 @@ class Measured:
         )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
-        """Return the pose to which setpoints belong, the one nearest to the newest; None if they belong to none."""
+        """Return the pose of setpoints that is nearest to the newest pose; None if they belong to none."""
         self.room[:] = sliders, self.pose
         self.room[0] -= self.backlash[0]["offset"]
         if forward_into(self.legs, self.room[0], self.room[1], self.room[1]):

@@ -1,4 +1,4 @@
-"""Which goal is planned next, which ones wait, and which must not begin any more."""
+"""Queue of goals: the one to plan next, those that wait, and those that must no longer begin."""
 
 from __future__ import annotations
 
@@ -11,31 +11,36 @@ from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger, Withdrawal
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.goal_motion import Place
-from trirail.motion.goal_planner import meant
+from trirail.motion.goal_motion import PoseSource
+from trirail.motion.goal_planner import resolve_goal
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goals import Goal
 from trirail.wire.messages import Notice, Outcome
 from trirail.wire.packets import GoalRequest
 
+MAX_PASSES = 8
+"""Goals of other users that are planned before one whose planning is lengthy; then they wait for it."""
 FURTHEST = 0.5
-"""How long ago, or how far ahead, a target may have been where a track says [s]: farther nobody knows where it is."""
+"""Greatest age, or lead, of a target's time in a track [s]: beyond it the target's position is unknown."""
 
 
 class _Sent(NamedTuple):
-    """A goal that has come, and when it was sent, as a cycle: what waited at the gateway is older than the cycle."""
+    """A received goal, and the cycle in which it was sent: one that waited at the gateway is older than the cycle."""
 
     request: GoalRequest
     cycle: float
+    passes: int = 0
+    """Number of goals of other users for which its planning has been given up."""
 
     def known_since(self, period: float) -> float:
-        """Return when a target was where a track says, as a cycle."""
+        """Return the time of a track's target, as a cycle."""
         return self.cycle - self.request.age / period
 
 
 class GoalQueue:
-    """Takes goals in their order to the planner, and to the ledger what becomes of them."""
+    """Queue that passes goals to the planner in their order, and their outcomes to the ledger."""
 
     def __init__(
         self,
@@ -56,20 +61,20 @@ class GoalQueue:
         self._period = period
         self._waiting: deque[_Sent] = deque()
         self._served: dict[str, int] = {}
-        """When each user's last goal had its turn, counted since there was none to plan."""
+        """Turn of each user's last goal, counted since the queue was last idle."""
         self._planned: _Sent | None = None
         self._told_busy = False
 
     @property
     def idle(self) -> bool:
-        """Whether no goal is being planned and none waits for that."""
+        """Whether no goal is being planned and none waits."""
         return not self._waiting and not self._planner.busy
 
     def due(self, cycle: int) -> float:
-        """Return before which cycle, `cycle` or a later one, there is something to think about, if nothing is heard."""
+        """Return the cycle, `cycle` or a later one, before which `think` is due if nothing is received."""
         expiring = min((goal.expires for number, goal in enumerate(self._ledger.goals) if number), default=math.inf)
         if self._planner.busy and self._planned is not None:
-            request, sent = self._planned
+            request, sent, _ = self._planned
             valid = request.goal.valid_for
             expiring = min(expiring, self._alive_until(self._planned))
             expiring = min(expiring, sent + valid / self._period if valid is not None else math.inf)
@@ -78,9 +83,9 @@ class GoalQueue:
         return min(math.floor(expiring) + 1 if math.isfinite(expiring) else math.inf, cycle + self._planner.due)
 
     def enqueue(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Take a goal before a cycle, at a time of the monotonic clock; it waits for its user's turn.
+        """Enqueue a goal before a cycle, at a time of the monotonic clock; it waits for its user's turn.
 
-        A renewal that comes often takes the place of the one before it that still waits.
+        A frequent renewal replaces the one before it that still waits.
         """
         age = (now_ns - request.received_ns) * 1e-9 / self._period
         sent = _Sent(request, cycle - age)
@@ -94,12 +99,15 @@ class GoalQueue:
         self._waiting.append(sent)
         self._ledger.keep_alive(request, self._alive_until(sent))
 
-    def think(self, cycle: int, admit: Callable[[], bool], place: Place) -> GoalRequest | None:
-        """Have the next goal planned if none is, and take what has been planned; return a goal that begins.
+    def think(self, cycle: int, admit: Callable[[], bool], place: PoseSource) -> GoalRequest | None:
+        """Have the next goal planned if none is, and take a finished plan; return a goal that begins.
 
-        `admit` raises RefusedError where the robot takes no goal, and says whether it is moving to one; `place` says
-        from where a move begins.
+        `admit` raises RefusedError where the robot accepts no goal, and returns whether it is moving to one; `place`
+        returns the pose from which a move begins.
         """
+        if self._planned is not None and self._is_passed(self._planned):
+            self._planner.give_up()
+            self._waiting.appendleft(self._planned._replace(passes=self._planned.passes + 1))
         if not self._planner.busy and self._waiting:
             self._planned = self._next()
             try:
@@ -121,7 +129,7 @@ class GoalQueue:
             return None
         if taken is None or self._planned is None:
             return None
-        request, sent = self._planned
+        request, sent, _ = self._planned
         valid = request.goal.valid_for
         expires = sent + valid / self._period if valid is not None else math.inf
         same = [later for later in (self._planned, *self._waiting) if later.request.id == request.id]
@@ -129,7 +137,7 @@ class GoalQueue:
         return request
 
     def withdraw(self, outcome: Withdrawal, reason: str) -> None:
-        """End what has been sent but not begun."""
+        """End goals that have been sent but not begun."""
         requests = [sent.request for sent in self._waiting]
         if self._planner.busy and self._planned is not None:
             requests.insert(0, self._planned.request)
@@ -138,8 +146,8 @@ class GoalQueue:
         for request in requests:
             self._ledger.withdraw(request, outcome, reason)
 
-    def stop_alone(self, goal_id: str, reason: str) -> bool:
-        """Stop a goal that has not begun; whether that was all. Raises RefusedError if it is not under way at all."""
+    def stop_alone(self, goal_id: str, reason: EventText) -> bool:
+        """Stop a goal that has not begun; return False for the one under way. Raises RefusedError for any other id."""
         if self._ledger.goal is not None and self._ledger.goal.id == goal_id:
             return False
         for number, goal in enumerate(self._ledger.goals):
@@ -148,30 +156,36 @@ class GoalQueue:
                 return True
         if self._planner.busy and self._planned is not None and self._planned.request.id == goal_id:
             self._planner.give_up()
-            self._ledger.withdraw(self._planned.request, "stopped", reason)
+            self._ledger.withdraw(self._planned.request, "stopped", reason.text)
             return True
         for sent in self._waiting:
             if sent.request.id == goal_id:
                 self._waiting.remove(sent)
-                self._ledger.withdraw(sent.request, "stopped", reason)
+                self._ledger.withdraw(sent.request, "stopped", reason.text)
                 return True
         raise RefusedError(RefusalCode.NO_GOAL, f"goal {goal_id!r} is not under way: it has ended, or never was")
 
     def expire(self, cycle: int) -> None:
-        """Let go of waiting goals that can no more begin in time, and of those behind them."""
+        """Drop waiting goals that can no longer begin in time, and those behind them."""
         for number, goal in enumerate(self._ledger.goals):
             if number and cycle > goal.expires:
-                self._drop(number, goal.id, "expired", "it has not begun in time")
+                self._drop(number, goal.id, "expired", coded("it has not begun in time", EventCode.TOO_LATE))
                 return
 
     def _next(self) -> _Sent:
-        """Take the oldest goal of the user who has waited longest for his turn."""
+        """Take the oldest goal of the user with the longest wait for a turn."""
         sent = min(self._waiting, key=lambda sent: self._served.get(sent.request.user, 0))
         self._waiting.remove(sent)
         self._served[sent.request.user] = max(self._served.values(), default=0) + 1
         return sent
 
-    def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool], place: Place) -> None:
+    def _is_passed(self, planned: _Sent) -> bool:
+        """Whether another user's goal takes precedence over the one being planned."""
+        if not self._planner.awaits_answer or not planned.request.goal.lengthy or planned.passes >= MAX_PASSES:
+            return False
+        return any(sent.request.user != planned.request.user for sent in self._waiting)
+
+    def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool], place: PoseSource) -> None:
         """Begin to plan a goal, or refuse it."""
         ledger, request, goal = self._ledger, sent.request, sent.request.goal
         ledger.check_id(request)
@@ -183,7 +197,7 @@ class GoalQueue:
             goal.check_beginning()
         moving = admit()
         self._check_age(sent, cycle)
-        planned = self._timed(meant(goal, self._frames, place), sent, cycle)
+        planned = self._timed(resolve_goal(goal, self._frames, place), sent, cycle)
         blend = ledger.goals[-1].blend if moving and ledger.goals and goal.follows else None
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
@@ -191,7 +205,7 @@ class GoalQueue:
         self._planner.plan(planned, blend)
 
     def _timed(self, planned: Goal, sent: _Sent, cycle: int) -> Goal:
-        """Return a goal with its time as the schedule counts it. Raises RefusedError where that is too far from now.
+        """Return a goal with its time in the schedule's count. Raises RefusedError where that is too far from now.
 
         The setpoints of the schedule's cycle, which is commanded now, are taken up at this cycle's SYNC: that is now.
         """
@@ -213,16 +227,16 @@ class GoalQueue:
         return planned.at(self._schedule.cycle * self._period - ago)
 
     def _tell_busy(self, request: GoalRequest) -> None:
-        """Tell everyone, once until it has said something, that a goal waits for a planner that is busy."""
+        """Report that a goal waits for a busy planner, once until the planner answers."""
         busy = self._planner.how_busy
         if busy and not self._told_busy:
-            self._ledger.notices.append(
-                Notice("service", "warning", f"{busy}: goal {request.id} waits", user=request.user)
-            )
+            words, silence = f"{busy}: goal {request.id} waits", self._planner.silence
+            text = coded(words, EventCode.PLANNER_BUSY, goal=request.id, silence=silence)
+            self._ledger.notices.append(Notice("service", "warning", text.text, user=request.user, **text.fields))
         self._told_busy = bool(busy)
 
     def _check_age(self, sent: _Sent, cycle: int) -> None:
-        """Refuse what can no more begin in time."""
+        """Raise RefusedError for a goal that can no longer begin in time."""
         valid = sent.request.goal.valid_for
         why = f"; {self._planner.how_busy}" if self._planner.how_busy else ""
         if valid is not None and cycle - sent.cycle > valid / self._period:
@@ -233,12 +247,14 @@ class GoalQueue:
             )
 
     def _alive_until(self, sent: _Sent) -> float:
-        """Return the cycle in which a goal ends that nobody renews; infinite for those that need not be."""
+        """Return the cycle in which a goal ends unless renewed; infinite for goals that need no renewal."""
         return sent.cycle + sent.request.goal.timeout / self._period
 
-    def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: str) -> None:
-        """End a goal that waits, and those behind it."""
-        self._ledger.end("stopped", f"goal {goal_id} before it {outcome}", but=number + 1)
+    def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: EventText) -> None:
+        """End a waiting goal and those behind it."""
+        words = f"goal {goal_id} before it {outcome}"
+        before = coded(words, EventCode.EARLIER_GOAL_ENDED, goal=goal_id, outcome=outcome)
+        self._ledger.end("stopped", before, but=number + 1)
         self._ledger.end(outcome, reason, but=number)
         self._schedule.drop(number - 1)
-        self._planner.run_at(self._planner.override)
+        self._planner.update_rate()

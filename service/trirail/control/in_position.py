@@ -1,7 +1,7 @@
-"""Whether the robot is where it is to be, by what is measured: the windows, the dwell and the time-out.
+"""Detection of in-position from the measurement: the windows, the dwell and the time-out.
 
-As long as the commanded motion stands, every cycle's measured sliders, and the pose that belongs to them, are held
-against the commanded ones. In position means: all six inside their windows, in every cycle of the dwell, to the newest.
+While the commanded motion is at rest, each cycle's measured sliders and their pose are compared with the commanded
+ones. In position means: all six inside their windows, in every cycle of the dwell, up to the newest.
 """
 
 from __future__ import annotations
@@ -16,41 +16,42 @@ from trirail_drivers.interface import NAMES, Triple
 from trirail.config import InPosition
 from trirail.kinematics.compiled import compiled
 from trirail.naming import Labels
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Residual
 
 __all__ = ["MONITOR", "Settled", "Settling", "monitor"]
 
 MOVES = 1e-9
-"""Velocity of a slider's setpoints below which that is rounding [m/s]."""
+"""Greatest velocity of a slider's setpoints that is rounding [m/s]."""
 
 MONITOR = np.dtype(
     [
         ("window", "<f8", (2, 3)),  # of the sliders [m]; of x, y [m] and phi [rad]
-        ("residual", "<f8", (2, 3)),  # likewise, commanded less measured
-        ("heading", "<f8", 3),  # 1 or -1: in which direction a slider was last commanded to move; 0 for not at all
-        ("overshoot", "<f8", 3),  # of the sliders, since they were to stand [m]
+        ("residual", "<f8", (2, 3)),  # commanded less measured, in the same order
+        ("heading", "<f8", 3),  # 1 or -1: direction in which a slider was last commanded to move; 0 for no motion
+        ("overshoot", "<f8", 3),  # of the sliders, since the end of the path [m]
         ("dwell", "<i8"),  # cycles
         ("inside", "<i8"),  # cycles in a row until now
-        ("moved", "u1"),  # whether the commanded motion has moved in the cycle before
+        ("moved", "u1"),  # whether the commanded motion moved in the previous cycle
     ],
     align=True,
 )
-"""What is kept from cycle to cycle, as compiled code takes it."""
+"""State of the monitor between cycles, for compiled code."""
 
 
 class Settled(NamedTuple):
-    """How a goal settled, or how far it was from that when its time was over; the fields of an event of its end."""
+    """Settling of a goal, or its residuals at the time-out; fields of the event of its end."""
 
     settle: float | None
     """Time from the end of the path to the first cycle of the dwell [s]; None where it did not settle."""
     residual: Residual
-    """Commanded less measured when it ended."""
+    """Commanded less measured at its end."""
     overshoot: Triple
-    """How far each slider was beyond its target since the end of the path [m]."""
+    """Greatest distance of each slider beyond its target since the end of the path [m]."""
 
 
 class Settling:
-    """Judges the goal whose path has ended; `monitored` is what the compiled cycle keeps."""
+    """Judgement of the goal whose path has ended; `monitored` is the state of the compiled cycle."""
 
     def __init__(self, limits: InPosition, period: float) -> None:
         self.monitored = np.zeros(1, MONITOR)
@@ -63,26 +64,26 @@ class Settling:
 
     @property
     def under_way(self) -> bool:
-        """Whether a goal's path has ended, and the goal has not."""
+        """Whether a goal's path has ended but the goal has not."""
         return self._since is not None
 
     @property
     def ends(self) -> int | None:
-        """The cycle in which its time is over; None where there is no such goal."""
+        """Cycle of the goal's time-out; None where there is no such goal."""
         return self._since + self._timeout if self._since is not None else None
 
     def begin(self, cycle: int) -> None:
-        """The path has ended, with the setpoints of this cycle."""
+        """Begin to settle: the path has ended with the setpoints of this cycle."""
         self._since = cycle
         self.monitored["inside"] = 0
         self.monitored["overshoot"] = 0.0
 
     def leave(self) -> None:
-        """There is no such goal any more."""
+        """Stop judging the goal."""
         self._since = None
 
     def over(self, cycle: int) -> Settled | None:
-        """Return how it has ended by the measurement of this cycle; None while it has not."""
+        """Return the result by the measurement of this cycle; None while undecided."""
         if self._since is None:
             return None
         inside = int(self.monitored["inside"][0])
@@ -91,35 +92,37 @@ class Settling:
         return self.now(None) if cycle - self._since >= self._timeout else None
 
     def now(self, settle: float | None) -> Settled:
-        """Return how far it is from where it is to be."""
+        """Return the current residuals and overshoot."""
         sliders, pose, overshoot = map(
             tuple, (*self.monitored["residual"][0].tolist(), *self.monitored["overshoot"].tolist())
         )
         return Settled(settle, Residual(sliders, pose), overshoot)
 
-    def said(self, settled: Settled, labels: Labels = NAMES) -> str:
-        """Say in words how it has settled, or where the robot is instead."""
+    def describe(self, settled: Settled, labels: Labels = NAMES) -> EventText:
+        """Return the goal's settling time, or its residuals, as text."""
         if settled.settle is not None:
             x, y, phi = map(abs, settled.residual.pose)
             left = (
                 f"{max(map(abs, settled.residual.sliders)) * 1e6:.2f} µm of a slider, {max(x, y) * 1e6:.2f} µm in x, y"
             )
-            return f"arrived, settled in {settled.settle * 1e3:g} ms; left to go: {left}, {phi * 1e6:.2f} µrad"
+            words = f"arrived, settled in {settled.settle * 1e3:g} ms; left to go: {left}, {phi * 1e6:.2f} µrad"
+            return coded(words, EventCode.SETTLED, settle=settled.settle)
         x, y, phi = settled.residual.pose
         errors = zip(labels, settled.residual.sliders, strict=True)
-        said = [f"slider {name} {error * 1e3:.3f} mm" for name, error in errors]
-        said += [f"x {x * 1e3:.3f} mm", f"y {y * 1e3:.3f} mm", f"phi {phi * 1e3:.3f} mrad"]
-        return (
+        residuals = [f"slider {name} {error * 1e3:.3f} mm" for name, error in errors]
+        residuals += [f"x {x * 1e3:.3f} mm", f"y {y * 1e3:.3f} mm", f"phi {phi * 1e3:.3f} mrad"]
+        words = (
             f"not in position {self._limits.timeout:g} s after the end of its path; "
-            f"left to go: {', '.join(said)} (limits.in_position)"
+            f"left to go: {', '.join(residuals)} (limits.in_position)"
         )
+        return coded(words, EventCode.NOT_IN_POSITION, timeout=self._limits.timeout)
 
 
 @compiled()
 def monitor(record: NDArray[np.void], known: bool, stands: bool, monitored: NDArray[np.void]) -> None:
-    """Hold what was just measured, in the record, against what is commanded in it; tell whether the robot has settled.
+    """Compare the measured values in the record with the commanded ones; record whether the robot has settled.
 
-    `known` tells whether the measured sliders belong to a pose, `stands` whether the commanded motion does.
+    `known` is whether the measured sliders belong to a pose, `stands` whether the commanded motion is at rest.
     """
     kept, told = monitored[0], record[0]
     if not stands:

@@ -1,7 +1,7 @@
-"""The lease: who alone may move the robot, for as long as his client gives signs of life. One at a time, or nobody.
+"""The lease: the exclusive right of one user to move the robot, for as long as the user's client gives signs of life.
 
-It is kept here, behind gateway and planner, so that whatever is lost on the way from the holder's hand ends it: his
-program, the network, the gateway. Time is counted in cycles, so that a recorded session comes out again.
+It is kept here, behind gateway and planner, so that the loss of any link to the holder ends it: their program, the
+network, the gateway. Time is counted in cycles, so that a recorded session can be reproduced.
 """
 
 from __future__ import annotations
@@ -10,18 +10,19 @@ import math
 from typing import NamedTuple
 
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Level
 from trirail.wire.vocabulary import AcquireLease, LeasePolicy, ReleaseLease
 
 REMEMBERED_IDS = 1000
-"""Leases that have ended and do not come back by a late sign of life; older ones are forgotten."""
+"""Number of ended leases that a late sign of life cannot revive; older ones are forgotten."""
 
 
 class LeaseChange(NamedTuple):
-    """The lease has another holder, or none: what everyone is told."""
+    """Notice to everyone that the lease has another holder, or none."""
 
     level: Level
-    message: str
+    message: EventText
 
 
 class _Held(NamedTuple):
@@ -29,11 +30,11 @@ class _Held(NamedTuple):
     id: str | None
     timeout: float
     alive_until: int
-    """The cycle in which it ends unless there has been a sign of life."""
+    """Last cycle of the lease without another sign of life."""
 
 
 class LeaseArbiter:
-    """Who holds it, and what follows. `check` says whether a user may move the robot."""
+    """Holder of the lease, and its rules; `check` raises for a user that may not move the robot."""
 
     def __init__(self, policy: LeasePolicy, period: float) -> None:
         self._required = policy == "required"
@@ -44,16 +45,16 @@ class LeaseArbiter:
 
     @property
     def user(self) -> str | None:
-        """Who holds it; None for nobody."""
+        """Holder of the lease; None for nobody."""
         return self._held.user if self._held is not None else None
 
     @property
     def alive_until(self) -> float:
-        """The last cycle in which it is held without another sign of life; infinite where nobody holds it."""
+        """Last cycle of the lease without another sign of life; infinite where nobody holds it."""
         return self._held.alive_until if self._held is not None else math.inf
 
     def check(self, user: str) -> None:
-        """Raise RefusedError where a user's goals and commands do not move the robot now."""
+        """Raise RefusedError where a user may not move the robot now."""
         if self._held is None:
             if self._required:
                 raise RefusedError(
@@ -66,26 +67,32 @@ class LeaseArbiter:
             )
 
     def acquire(self, user: str, lease: AcquireLease, cycle: int) -> LeaseChange | None:
-        """Let a user have the lease; None for a sign of life of who has it. Raises RefusedError."""
+        """Give a user the lease; return None for a sign of life of its holder. Raises RefusedError."""
         before = self._held
         if lease.id is not None and (why := self._over.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: acquire a new one")
         again = before is not None and (before.user, before.id) == (user, lease.id)
-        change = None if again else LeaseChange("info", f"lease acquired by {user}")
+        change = (
+            None
+            if again
+            else LeaseChange("info", coded(f"lease acquired by {user}", EventCode.LEASE_ACQUIRED, user=user))
+        )
         if before is not None and not again:
             if not lease.force:
                 whose = "another client of the same user" if before.user == user else before.user
                 problem = f"{whose} holds the lease: wait until it is free, or take it over"
                 raise RefusedError(RefusalCode.LEASED, problem)
-            change = self._end("warning", f"lease taken over by {user} from {before.user}")
+            words = f"lease taken over by {user} from {before.user}"
+            taken = coded(words, EventCode.LEASE_TAKEN_OVER, user=user, before=before.user)
+            change = self._end("warning", taken)
         self._held = _Held(user, lease.id, lease.timeout, cycle + round(lease.timeout / self._period))
         return change
 
     def release(self, user: str, lease: ReleaseLease) -> LeaseChange:
-        """Let a user give his lease back. Raises RefusedError where he has none, or not that one."""
+        """Release a user's lease. Raises RefusedError where they have none, or not that one."""
         held = self._held
         if held is not None and held.user == user and lease.id in (None, held.id):
-            return self._end("info", f"lease released by {held.user}")
+            return self._end("info", coded(f"lease released by {user}", EventCode.LEASE_RELEASED, user=user))
         if lease.id is not None and (why := self._over.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: there is nothing to release")
         if held is None:
@@ -94,16 +101,18 @@ class LeaseArbiter:
         raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease, and only its holder can release it")
 
     def silent(self, cycle: int) -> LeaseChange | None:
-        """End the lease where no sign of life has come in time."""
+        """End the lease where no sign of life has arrived in time."""
         held = self._held
         if held is None or cycle <= held.alive_until:
             return None
-        return self._end("warning", f"lease of {held.user} is over: no sign of life for {held.timeout:g} s")
+        words = f"lease of {held.user} is over: no sign of life for {held.timeout:g} s"
+        expired = coded(words, EventCode.LEASE_EXPIRED, user=held.user, timeout=held.timeout)
+        return self._end("warning", expired)
 
-    def _end(self, level: Level, why: str) -> LeaseChange:
+    def _end(self, level: Level, why: EventText) -> LeaseChange:
         held, self._held = self._held, None
         if held is not None and held.id is not None:
-            self._over[held.user, held.id] = why
+            self._over[held.user, held.id] = why.text
             if len(self._over) > REMEMBERED_IDS:
                 del self._over[next(iter(self._over))]
         return LeaseChange(level, why)

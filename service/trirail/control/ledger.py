@@ -1,4 +1,4 @@
-"""Who asked for what, and what became of it: every goal ends once, every command is answered once."""
+"""Goals and commands with their users and outcomes: every goal ends once, every command is answered once."""
 
 from __future__ import annotations
 
@@ -13,25 +13,21 @@ from trirail_drivers.interface import Triple
 from trirail.control.in_position import Settled
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goals import Goal
-from trirail.wire.messages import REMEMBERED_IDS, Level, Notice, Outcome
+from trirail.wire.messages import REMEMBERED_IDS, GoalReply, Level, Notice, Outcome
 from trirail.wire.packets import (
     Accepted,
     Answer,
     CommandRequest,
     Confirmed,
     GoalRequest,
-    Looked,
-    PoseChanged,
     Refused,
-    RefusedRequest,
-    Remark,
-    Request,
 )
 from trirail.wire.vocabulary import Command
 
 Withdrawal = Literal["stopped", "faulted"]
-"""How a goal ends that has been sent but did not begin: the outcome in its event, and the code of its refusal."""
+"""Outcome of a goal that was sent but did not begin: in its event, and as the code of its refusal."""
 _LEVELS: dict[Outcome, Level] = {
     "faulted": "error",
     "rejected": "warning",
@@ -41,31 +37,31 @@ _LEVELS: dict[Outcome, Level] = {
 
 
 class ActiveGoal(NamedTuple):
-    """A goal that the robot is moving to, or that is to follow it."""
+    """A goal that the robot is moving to, or a queued one."""
 
     id: str
     user: str
     kind: type[Goal]
     blend: float | None
-    """How far from its end the next goal may begin [m]; None where that preempts it."""
+    """Distance from its end at which the next goal may begin [m]; None where that preempts it."""
     expires: float
-    """In which cycle it is too late to begin."""
+    """Last cycle in which it may begin."""
     alive_until: float
-    """In which cycle it ends unless it has been renewed."""
+    """Cycle in which it ends unless renewed."""
     released: bool = False
-    """Whether that has happened: what nobody renewed does not come back."""
+    """Whether that cycle has passed: a late renewal does not revive it."""
     bound: str | None = None
-    """The limit before which a jog comes to rest, or beyond which a track's target is."""
+    """Limit before which a jog stops, or beyond which a track's target is."""
     settles: bool = True
     """Whether it is done only when the robot is in position."""
     target: Triple | None = None
-    """The pose that a track's target was last told to have."""
+    """Last reported pose of a track's target."""
     lag: float | None = None
-    """Likewise, trirail.wire.messages.GoalReply."""
+    """Last lag of a track: trirail.wire.messages.GoalReply."""
 
 
 class _Ended(NamedTuple):
-    """How a goal has ended; `bound` as of an ActiveGoal, where a jog has ended at it."""
+    """End of a goal; `bound` is that of its ActiveGoal, where a jog has ended there."""
 
     user: str
     kind: type[Goal]
@@ -74,7 +70,7 @@ class _Ended(NamedTuple):
     bound: str | None
 
     def over(self, goal_id: str) -> RefusedError:
-        """Return what is said to one who would renew it."""
+        """Return the error for a renewal of the ended goal."""
         if self.bound is not None:
             text = f"jog {goal_id!r} has ended at the limit of {self.bound}: begin a new one, away from it"
             return RefusedError(RefusalCode.AT_LIMIT, text)
@@ -85,27 +81,27 @@ class _Ended(NamedTuple):
 
 
 class Ledger:
-    """Keeps the goals and the commands under way; what it has to say waits in `answers` and `notices`."""
+    """Goals and commands under way; outgoing messages wait in `answers` and `notices`."""
 
     def __init__(self) -> None:
         self.goals: deque[ActiveGoal] = deque()
-        """The goal that the robot is moving to, and those to follow it."""
+        """Goal that the robot is moving to, and the queued ones."""
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
         self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, _Ended] = {}
         self._refused: tuple[str, RefusalCode] | None = None
-        """The track of which something was refused last, and why."""
+        """Id of the last refused frequent goal, and the code of the refusal."""
 
     # ------------------------------------------------------------------ goals
 
     @property
     def goal(self) -> ActiveGoal | None:
-        """The goal that the robot is moving to."""
+        """Goal that the robot is moving to."""
         return self.goals[0] if self.goals else None
 
     def check_id(self, request: GoalRequest) -> None:
-        """Raise RefusedError if the id has been used; what renews a goal shares its own."""
+        """Raise RefusedError if the id has been used; a renewal shares its goal's id."""
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
         ended = self._ended.get(goal_id)
@@ -117,16 +113,16 @@ class Ledger:
             raise _not_renewed(goal_id)
 
     def pass_over(self, request: GoalRequest) -> None:
-        """Accept a renewal in whose place a newer one is taken up."""
-        self.answers.append(Accepted(request.ticket, request.id, math.inf, 1.0, stops_first=False, queued=False))
+        """Accept a renewal that a newer one replaces."""
+        self.answers.append(Accepted(request.ticket, GoalReply(request.id, None)))
 
     def keep_alive(self, request: GoalRequest, until: float) -> None:
-        """Let the goal under way go on until a cycle, if this renews it and it is not to end."""
+        """Extend the goal under way until a cycle, if the request renews it and it is not ending."""
         if self.renewed_by(request) and self.goals[0].alive_until > -math.inf:
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> ActiveGoal | None:
-        """Return the goal under way if it has not been renewed in time, the first time that this is so."""
+        """Return the goal under way if it has not been renewed in time; only once."""
         goal = self.goal
         if goal is None or goal.released or cycle <= goal.alive_until:
             return None
@@ -138,20 +134,16 @@ class Ledger:
     ) -> None:
         """Accept a goal; those before it are preempted, unless it follows them or renews the one under way.
 
-        `at_end` tells whether the motion before it has ended: to a goal with a blend, that goal is done.
+        `at_end` is whether the motion before it has ended: if that was to a goal with a blend, the goal is done.
         """
-        self.answers.append(
-            Accepted(
-                request.ticket, request.id, taken.duration, taken.slowed, taken.stops_first, taken.queued, taken.lag
-            )
-        )
+        self.answers.append(Accepted(request.ticket, structs.replace(taken.reply, id=request.id)))
         if self.renewed_by(request):
             self._renew(request, taken)
             return
         goal, last = request.goal, self.goals[-1] if self.goals else None
         passes = at_end and last is not None and last.blend is not None and goal.follows
-        if not taken.queued and not passes:
-            self.end("preempted", f"preempted by goal {request.id}")
+        if not taken.reply.queued and not passes:
+            self.end("preempted", coded(f"preempted by goal {request.id}", EventCode.PREEMPTED, goal=request.id))
         begun = ActiveGoal(request.id, request.user, type(goal), goal.blend, expires, alive_until, settles=goal.settle)
         self.goals.append(begun)
         if passes:
@@ -160,28 +152,31 @@ class Ledger:
             self._renew(request, taken)
 
     def _renew(self, request: GoalRequest, taken: AcceptedPlan) -> None:
-        """Take in what was told of the goal under way; where a target is out of reach, everyone is to know."""
+        """Update the goal under way from its renewal; notify everyone where a target is out of reach."""
         goal, told = request.goal, self.goals[0]
         if goal.target is not None and taken.bound not in (None, told.bound):
-            text = f"the target of goal {told.id} is beyond the limit of {taken.bound}: the robot waits there"
-            self.notices.append(Notice("service", "warning", text, user=told.user))
-        bound = taken.bound or (told.bound if goal.target is not None else None)  # a limit is told of once
-        self.goals[0] = told._replace(bound=bound, target=goal.target, lag=taken.lag)
+            words = f"the target of goal {told.id} is beyond the limit of {taken.bound}: the robot waits there"
+            text = coded(words, EventCode.BEYOND_LIMIT, goal=told.id)
+            self.notices.append(Notice("service", "warning", text.text, user=told.user, **text.fields))
+        bound = taken.bound or (told.bound if goal.target is not None else None)  # a limit is reported once
+        self.goals[0] = told._replace(bound=bound, target=goal.target, lag=taken.reply.lag)
 
     def pass_on(self) -> None:
-        """The first goal is reached, and the one that waited for it has begun."""
+        """End the first goal as done: the one behind it has begun."""
         goal = self.goals.popleft()
-        self._ending(goal.id, goal.user, goal.kind, "done", f"passed on the way to goal {self.goals[0].id}")
+        following = self.goals[0].id
+        reason = coded(f"passed on the way to goal {following}", EventCode.PASSED, goal=following)
+        self._ending(goal.id, goal.user, goal.kind, "done", reason)
 
-    def end(self, outcome: Outcome, reason: str, but: int = 0, settled: Settled | None = None) -> None:
-        """End the goals, but so many of the first."""
+    def end(self, outcome: Outcome, reason: EventText, but: int = 0, settled: Settled | None = None) -> None:
+        """End all goals except the first `but`."""
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
             goal = self.goals.popleft()
             at_limit = outcome == "done" and not goal.released and not goal.kind.waits_at_end
             bound = goal.bound if at_limit else None
-            words = f"at the limit of {bound}" if bound else reason
-            self._ending(goal.id, goal.user, goal.kind, outcome, words, bound, settled)
+            text = coded(f"at the limit of {bound}", EventCode.STOPPED_AT_LIMIT) if bound else reason
+            self._ending(goal.id, goal.user, goal.kind, outcome, text, bound, settled)
         self.goals.extend(kept)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
@@ -190,43 +185,49 @@ class Ledger:
             Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
         )
         if not self.renewed_by(request):
-            self._ending(request.id, request.user, type(request.goal), outcome, reason)
+            refusal = RefusedError(RefusalCode(outcome), reason)
+            ended = coded(reason, EventCode.REFUSED)
+            self._ending(request.id, request.user, type(request.goal), outcome, ended, refusal=refusal)
 
     def is_all_of(self, user: str | None) -> bool:
-        """Whether the goals and commands under way that need the lease are all a user's."""
+        """Whether all goals and commands under way that need the lease belong to a user."""
         commands = (request for under_way in self._commands.values() for request, _ in under_way)
         senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.everybodys]
         return all(sender == user for sender in senders)
 
-    def refuse(self, request: Request, refusal: RefusedError) -> None:
-        """Answer that a request is not carried out. A goal that is refused has ended; a used id has its own ending.
+    def refuse(self, request: GoalRequest | CommandRequest, refusal: RefusedError) -> None:
+        """Answer that a request is refused. A refused goal has ended; a used id already has its own end.
 
-        Everyone is told, of renewals that come often once: hundreds may follow before their sender hears of it.
+        Everyone is notified, of frequent renewals once: hundreds may follow before the answer reaches their sender.
         """
-        if isinstance(request, RefusedRequest | PoseChanged | Looked | Remark):
-            return
-        text = str(refusal)
-        self.answers.append(Refused(request.ticket, refusal.code, text, refusal.slider, refusal.value, refusal.limit))
+        text = answered = str(refusal)
+        if isinstance(request, GoalRequest) and request.goal.frequent and not self.renewed_by(request):
+            ended = refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER)
+            answered = text if ended else f"{text}; goal {request.id!r} is over, begin a new one"
+        self.answers.append(
+            Refused(request.ticket, refusal.code, answered, refusal.slider, refusal.value, refusal.limit)
+        )
         if isinstance(request, CommandRequest):
-            self.notices.append(Notice("refused", "warning", f"{request.name} refused: {text}", user=request.user))
+            self.notices.append(_refused(f"{request.name} refused: {text}", request.user, refusal))
             return
         if request.goal.frequent:
             before, self._refused = self._refused, (request.id, refusal.code)
             if before == self._refused:
                 return
         if refusal.code in (RefusalCode.DUPLICATE_ID, RefusalCode.AT_LIMIT, RefusalCode.JOG_OVER):
-            self.notices.append(Notice("refused", "warning", text, user=request.user))
+            self.notices.append(_refused(text, request.user, refusal))
         else:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
-                self.notices.append(Notice("refused", "warning", text, user=request.user))
-                if not request.goal.frequent:  # whoever asked for that is not to have the old one either
+                self.notices.append(_refused(text, request.user, refusal))
+                if not request.goal.frequent:  # a refused renewal also ends the goal that it would renew
                     self.keep_alive(request, -math.inf)
             else:
-                self._ending(request.id, request.user, type(request.goal), outcome, text)
+                reason = coded(text, EventCode.REFUSED)
+                self._ending(request.id, request.user, type(request.goal), outcome, reason, refusal=refusal)
 
     def renewed_by(self, request: GoalRequest) -> bool:
-        """Whether it renews the goal that is under way; only its own user can."""
+        """Whether a request renews the goal under way; only its own user can."""
         goal = self.goal
         return (
             goal is not None
@@ -241,24 +242,26 @@ class Ledger:
         user: str,
         kind: type[Goal],
         outcome: Outcome,
-        reason: str,
+        reason: EventText,
         bound: str | None = None,
         settled: Settled | None = None,
+        refusal: RefusedError | None = None,
     ) -> None:
-        if goal_id in self._ended:  # by what also withdraws its renewals
+        if goal_id in self._ended:  # by the same event, which also withdraws its renewals
             return
         level = _LEVELS.get(outcome, "info")
-        self._ended[goal_id] = _Ended(user, kind, outcome, reason, bound)
+        self._ended[goal_id] = _Ended(user, kind, outcome, reason.text, bound)
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
         words = f"goal {goal_id} {outcome}: {reason}"
-        said = Notice("goal", level, words, id=goal_id, outcome=outcome, reason=reason, user=user)
+        said = Notice("goal", level, words, id=goal_id, outcome=outcome, reason=reason.text, user=user, **reason.fields)
+        said = _with_code(said, refusal) if refusal is not None else said
         self.notices.append(structs.replace(said, **settled._asdict()) if settled is not None else said)
 
     # ------------------------------------------------------------------ commands
 
     def undertake(self, request: CommandRequest, cycle: int) -> None:
-        """Take a command on; it is answered once it has been carried out."""
+        """Add a command; it is answered once it has been carried out."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
     @property
@@ -269,9 +272,9 @@ class Ledger:
     def settle(self, verdict: Callable[[Command, int], str | None], mode: str, cycle: int) -> None:
         """Answer the commands that are done or never will be.
 
-        `verdict`, given a command's name and the cycle it came in, is "" for done, None for not yet, else why not.
-        What is done shows from `cycle` on. A command is never done before an earlier one of its name: where that is
-        not, the later ones are not looked at.
+        `verdict`, given a command's name and the cycle of its arrival, is "" for done, None for not yet, else the
+        reason. The effect shows from `cycle` on. A command is never done before an earlier one of its name: while that
+        one is not done, later ones are not judged.
         """
         for name, under_way in self._commands.items():
             while under_way and (why := verdict(name, under_way[0][1])) is not None:
@@ -280,6 +283,16 @@ class Ledger:
                     self.answers.append(Refused(request.ticket, RefusalCode.FAILED, f"{name} failed: {why}"))
                 else:
                     self.answers.append(Confirmed(request.ticket, name, mode, cycle))
+
+
+def _refused(text: str, user: str, refusal: RefusedError) -> Notice:
+    return _with_code(Notice("refused", "warning", text, user=user, event_code=EventCode.REFUSED), refusal)
+
+
+def _with_code(notice: Notice, refusal: RefusedError) -> Notice:
+    """Return a notice with the fields of a refusal, for programs."""
+    about = {name: getattr(refusal, name) for name in ("code", "slider", "value", "limit")}
+    return structs.replace(notice, **about)
 
 
 def _not_renewed(goal_id: str) -> RefusedError:

@@ -1,4 +1,4 @@
-"""The planner in this process, for replays, tests and tools: it answers a set number of cycles after it was asked."""
+"""Planner in this process, for replays, tests and tools: it answers a set number of cycles after each request."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 
 
 class LocalPlanner:
-    """Answers what the control asks: trirail.control.plan_requests.PlannerPort."""
+    """Planner of this process: a trirail.control.plan_requests.PlannerPort."""
 
     def __init__(self, config: Config, delay: int = 1) -> None:
         self.delay = delay
-        """Cycles from the question to the answer."""
+        """Cycles from the request to the answer."""
         self._planner = MotionPlanner(config)
         self._answers: deque[tuple[int, PlanAnswer]] = deque()
         self._turns = 0
@@ -24,7 +24,7 @@ class LocalPlanner:
         self._answers.append((self._turns + self.delay, self._planner.plan(request)))
 
     def answers(self) -> list[PlanAnswer]:
-        """Return what is to be given to the control in this cycle; asked once in each."""
+        """Return the answers that are due in this cycle; call once in each."""
         self._turns += 1
         due = []
         while self._answers and self._answers[0][0] <= self._turns:

@@ -1,4 +1,4 @@
-"""The modes of the service as a pure state machine: what each event does in each mode."""
+"""Modes of the service as a pure state machine: the effect of each event in each mode."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail.wire.vocabulary import Mode
 
 
 class ModeEvent(Enum):
-    """What can happen: requests, what the motion and the drives report, and what goes wrong."""
+    """Event of the state machine: a request, a report of the motion or the drives, or a failure."""
 
     ENABLE = auto()
     DISABLE = auto()
@@ -20,12 +20,12 @@ class ModeEvent(Enum):
     RESET = auto()
     PAUSE = auto()
     RESUME = auto()
-    NOT_RENEWED = auto()  # nobody renews the jog or the track any more
+    NOT_RENEWED = auto()  # the jog or the track is no longer renewed
     HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
-    HOMED = auto()  # all drives know where they are, and follow setpoints again
-    STANDSTILL = auto()  # the commanded motion has come to rest
-    ARRIVED = auto()  # so it has, and at the end of its path
+    HOMED = auto()  # all drives know their position, and follow setpoints again
+    STANDSTILL = auto()  # the commanded motion is at rest
+    ARRIVED = auto()  # the commanded motion is at rest at the end of its path
     FAULT = auto()  # a drive, the bus or a setpoint is bad
     GATEWAY_LOST = auto()
     LATE = auto()  # too many ticks missed in a row
@@ -33,7 +33,7 @@ class ModeEvent(Enum):
 
 
 class Action(Enum):
-    """What the loop does on the way from one state to the next, in the same cycle."""
+    """Action of the loop between one state and the next, in the same cycle."""
 
     NOTHING = auto()
     POWER_UP = auto()
@@ -48,7 +48,7 @@ class Action(Enum):
 
 
 class ModeState(NamedTuple):
-    """A mode, and what is to come once the robot stands: its drives disabled, the same goal again, or a jog's end."""
+    """A mode, and what follows once the robot is at rest: its drives disabled, the same goal again, or a jog's end."""
 
     mode: Mode
     disable_after: bool = False
@@ -62,14 +62,14 @@ class ModeState(NamedTuple):
 
 
 class Step(NamedTuple):
-    """The next state, and what to do on the way."""
+    """Next state, and the action on the way."""
 
     state: ModeState
     action: Action = Action.NOTHING
 
 
 class Refusal(NamedTuple):
-    """The event makes no sense in this mode: the state stays."""
+    """Refusal of an event that makes no sense in a mode: the state stays."""
 
     code: RefusalCode
     message: str
@@ -226,10 +226,10 @@ STATES = tuple(_TABLE)
 
 
 def step(state: ModeState, event: ModeEvent) -> Step | Refusal:
-    """Decide what `event` does in `state`; what is not in the table changes nothing.
+    """Return the effect of `event` in `state`; an event without an entry in the table changes nothing.
 
-    What is already so is confirmed, not refused: enabling an enabled robot, stopping one that stands. The first
-    fault is the one that stays: neither a second one nor anything but a reset leads out of it, and a reset never
-    leads further than to disabled.
+    Requests that are already fulfilled are confirmed, not refused: enabling an enabled robot, stopping one at rest.
+    The first fault stays latched: only a reset leaves it, a second fault does not, and a reset never leads further
+    than to disabled.
     """
     return _TABLE[state].get(event, Step(state))

@@ -1,7 +1,7 @@
-"""Asks the planner for motions, one goal at a time, and takes its answers where they fit the motion under way.
+"""Requests to the planner, one goal at a time, and use of its answers where they fit the motion under way.
 
-The planner thinks beside the loop: its answer may come late, twice, for a motion that is not under way any more, or
-never. Nothing that stops the robot waits for it.
+The planner runs beside the loop: its answer may come late, twice, for a motion that is no longer under way, or never.
+Nothing that stops the robot waits for it.
 """
 
 from __future__ import annotations
@@ -21,58 +21,54 @@ from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
 from trirail.motion.motion_planner import revision
 from trirail.motion.packing import pack_run, unpack_law, unpack_path, unpack_run
-from trirail.motion.paths import Path, constant
+from trirail.motion.paths import Path, constant_law
 from trirail.motion.rate_change import RateChange
-from trirail.motion.runs import STILL, MotionState, Run, nominal, rest
+from trirail.motion.runs import ZERO_RATES, MotionState, Run, nominal_motion, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import Goal
+from trirail.wire.messages import GoalReply
 from trirail.wire.plan_packets import Extended, NotPlanned, PlanAnswer, Planned, PlanRequest
 
 LEADS = (0.003, 0.012, 0.048)
-"""How long before it is to begin a motion from motion is asked for, each time that it has to be asked for anew [s]."""
+"""Lead of the request before the begin of a motion from motion, for the first request and each repetition [s]."""
 LEAST_LEAD = 2
-"""And in cycles: an answer comes in the next one at the earliest."""
+"""Least lead in cycles: an answer arrives in the next one at the earliest."""
 PATIENCE = 8.0
-"""How long a goal waits for the planner, as for the goals before it; one that has died is told at once [s]."""
+"""Time that a goal waits for the planner, as for the goals before it [s]; a dead planner is reported immediately."""
 BUSY = 0.5
-"""A planner that has said nothing for so long is told to be busy [s]."""
+"""Silence after which the planner is reported busy [s]."""
 SLACK = 2
-"""A motion that came too late is asked for so many times as far ahead as the answer took."""
+"""Lead of the request for a motion that came too late, in multiples of the time that its answer took."""
 ROUND = 12
-"""Cycles that a change of rate has for itself before a goal is planned all the same."""
+"""Cycles that a change of rate has for itself before a goal is planned regardless."""
 ROUNDING = (1e-9, 1e-7, 1e-5)
-"""By so much may a motion begin beside the one commanded, in position, velocity and acceleration [m, rad, …]."""
+"""Greatest step from the commanded motion to a new one, in position, velocity and acceleration [m, rad, …]."""
 
 
 class PlannerPort(Protocol):
-    """Where the planner can be asked."""
+    """Port for requests to the planner."""
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Send a request; never waits. What the planner answers is given to the control in a later cycle."""
+        """Send a request without waiting. The planner's answer reaches the control in a later cycle."""
 
 
 class AcceptedPlan(NamedTuple):
-    """A goal is the robot's now."""
+    """Acceptance of a goal by the robot."""
 
-    duration: float
-    """Expected time from now to the end of its path [s]; infinite while the override is zero."""
-    slowed: float
-    stops_first: bool
-    queued: bool
-    """Whether it begins when the one before it is reached."""
+    reply: GoalReply
+    """Reply to its sender, without the goal's id."""
     bound: str | None = None
-    """The limit before which a jog comes to rest, or beyond which a track's target is."""
-    lag: float | None = None
-    """Of a track: trirail.wire.messages.GoalReply."""
+    """Limit before which a jog brakes, or beyond which a track's target is."""
 
 
 class PlanRequests:
-    """Decides how the schedule of motions goes on: its rate by itself, goals by what the planner answers."""
+    """Continuation of the schedule of motions: changes of rate made here, goals by the planner's answers."""
 
     def __init__(self, config: Config, port: PlannerPort, schedule: Schedule) -> None:
         self.override = 1.0
-        """The rate at which motions are to run."""
+        """Rate at which motions shall run while the mode is moving."""
+        self._running = False
         robot, self._period = corrected_geometry(config), config.period
         limits = planned_limits(config.limits, config.correction.backlash)
         checker = Checker(robot, limits, Bounds(limits, self._period, labels=robot.labels), self._period)
@@ -90,11 +86,11 @@ class PlanRequests:
         self._lost: str | None = None
         self._times = 0
         self._took = 0
-        """Cycles from the last question to its answer."""
+        """Cycles from the last request to its answer."""
         self._since: int | None = None
         self._change: RateChange | None = None
         self._greatest_rate = math.inf
-        """Of the goal under way."""
+        """Greatest rate of the goal under way."""
 
     @property
     def busy(self) -> bool:
@@ -102,8 +98,13 @@ class PlanRequests:
         return self._goal is not None
 
     @property
+    def awaits_answer(self) -> bool:
+        """Whether the planner has been asked for a goal and has not answered."""
+        return self._goal is not None and self._asked is not None and self._answer is None
+
+    @property
     def due(self) -> float:
-        """In how many cycles there is something to think about, if nothing is heard: 0 for now."""
+        """Number of cycles until `think` is due if nothing is received: 0 for now."""
         if self._goal is None:
             return math.inf if self._change is None else 0
         asked, answer, now = self._asked, self._answer, self._schedule.cycle
@@ -117,20 +118,20 @@ class PlanRequests:
 
     @property
     def silence(self) -> float:
-        """How long the planner has been asked for a goal, and has said nothing [s]."""
+        """Time since the planner was asked for a goal that it has not answered [s]."""
         return (self._schedule.cycle - self._since) * self._period if self._since is not None else 0.0
 
     @property
     def how_busy(self) -> str:
-        """That the planner is busy, for people; empty while it is not."""
+        """Message that the planner is busy, for people; empty while it is not."""
         silence = self.silence
         return f"the planner is busy, it has said nothing for {silence:.1f} s" if silence > BUSY else ""
 
     def warm_up(self) -> None:
-        """Take a motion and stop it, on a schedule that nobody runs: what runs for the first time is slow."""
-        nowhere = Schedule(rest(STILL), self._period)
+        """Take a motion and stop it, on a schedule that is never run: the first run of code is slow."""
+        nowhere = Schedule(rest(ZERO_RATES), self._period)
         path = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
-        nowhere.replace_runs(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant(1.0), 1.0)))]))
+        nowhere.replace_runs(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant_law(1.0), 1.0)))]))
         RateChange(self._scaling, nowhere, 0.0, self._period).step()
 
     def plan(self, goal: Goal, blend: float | None = None) -> None:
@@ -139,34 +140,40 @@ class PlanRequests:
         self._asked = self._answer = self._lost = None
 
     def give_up(self) -> None:
-        """Have the goal planned no longer: what is answered is left aside."""
+        """Stop planning the goal; ignore later answers."""
         self._goal = self._asked = self._answer = self._lost = self._since = None
 
-    def run_at(self, rate: float) -> None:
-        """Let the goal's motion run at another rate, as soon as the sliders allow."""
-        self._change = RateChange(self._scaling, self._schedule, min(rate, self._greatest_rate), self._period)
+    def set_running(self, running: bool) -> None:
+        """Run the motion under way at the override, or brake it; only the mode decides which."""
+        self._running = running
+        self._start_rate_change()
 
-    def leave_rate(self) -> None:
-        """The motion has ended: leave its rate alone."""
-        self._change = None
+    def update_rate(self) -> None:
+        """Apply a new override, or a changed path, to the motion under way; a braking one continues to brake."""
+        if self._running:
+            self._start_rate_change()
+
+    def discard_rate_change(self) -> None:
+        """Stop changing the rate: no motion is under way."""
+        self._running, self._change = False, None
 
     def hear(self, answer: PlanAnswer) -> None:
-        """Take what the planner has said in this cycle; all but the first answer to what was last asked is left."""
+        """Take the planner's answer of this cycle; ignore all but the first answer to the last request."""
         asked = self._asked
         if asked is not None and (answer.number, answer.version) == (asked.number, asked.version) and not self._answer:
             self._answer, self._since = answer, None
             self._took = self._schedule.cycle - asked.cycle
 
     def lose(self, reason: str) -> None:
-        """The planner will not answer what it was asked: a goal that waits for that is refused."""
+        """Have the waiting goal refused: the planner will not answer its request."""
         if self._since is not None:
             self._lost = reason
 
     def think(self) -> AcceptedPlan | None:
-        """Take one look at a change of rate, then ask for the goal or take its motion; return how a goal is reached.
+        """Step a change of rate, then request the goal's motion or take it; return the accepted plan of a goal.
 
-        A change of rate goes first; where the sliders do not allow it yet, a goal does not wait for it: it is planned
-        from the motion as it is. While that is asked for only what makes the robot slower changes its motion. Raises
+        A change of rate has priority; where the sliders do not allow it yet, a goal does not wait for it, but is
+        planned from the present motion. While a request is pending only a lower rate changes the motion. Raises
         RefusedError where the goal cannot be reached.
         """
         self._change_rate()
@@ -177,22 +184,31 @@ class PlanRequests:
         if self._lost is not None:
             raise RefusedError(RefusalCode.PLANNER_LOST, f"{self._lost}: send the goal again")
         if self._asked is not None and self._asked.version != self._schedule.version:
-            self._asked = None  # it was asked from a motion that has become another one
+            self._asked = None  # the motion has changed since the request
         if self._asked is None:
-            if self._change is None or self._change.made or self._change.tried >= ROUND:
+            if self._change is None or self._change.applied or self._change.cycles >= ROUND:
                 self._request_plan(self._goal)
             return None
         return self._apply(self._answer) if self._answer is not None else None
 
     # ------------------------------------------------------------------ inside
 
+    @property
+    def _rate(self) -> float:
+        """Rate that the motion under way shall have."""
+        return min(self.override, self._greatest_rate) if self._running else 0.0
+
+    def _start_rate_change(self) -> None:
+        """Bring the motion under way to its rate, as soon as the sliders allow."""
+        self._change = RateChange(self._scaling, self._schedule, self._rate, self._period)
+
     def _change_rate(self) -> None:
         change = self._change
-        if change is not None and (self._asked is None or change.lowers) and change.step():
+        if change is not None and (self._asked is None or change.lowers_rate) and change.step():
             self._change = None
 
     def _request_plan(self, goal: Goal) -> None:
-        """Ask for the goal's motion from the one under way; RefusedError when that has been asked too often."""
+        """Request the goal's motion from the one under way. Raises RefusedError after too many requests."""
         if self._times == len(self._leads):
             text = f"its motion came too late {self._times} times, or the motion under way changed: send the goal again"
             raise RefusedError(RefusalCode.NO_PLAN, text)
@@ -216,14 +232,14 @@ class PlanRequests:
         self._port.request_plan(self._asked)
 
     def _lead(self, goal: Goal) -> int:
-        """Return in how many cycles a motion is to begin: of a goal that is renewed often, as the last one came."""
+        """Return the cycles until a motion shall begin; for a frequently renewed goal, from the last answer's delay."""
         lead = self._leads[self._times]
         if self._times:
             return max(lead, SLACK * self._took)
         return max(lead, self._took + 1) if goal.frequent else lead
 
     def _apply(self, answer: PlanAnswer) -> AcceptedPlan | None:
-        """Carry out what the planner has decided, once its time has come; ask anew where it does not fit any more."""
+        """Apply the planner's answer once it is due; request again where it no longer fits."""
         if isinstance(answer, NotPlanned):
             raise answer.error()
         try:
@@ -240,26 +256,21 @@ class PlanRequests:
             return None  # it waits for its time
         run = unpack_run(self._legs, planned.run)
         runs = deque([run])
-        if planned.stops_first and schedule.runs:
+        if planned.reply.stops_first and schedule.runs:
             runs.appendleft(self._stopping(schedule.runs[0], planned))
         if planned.first not in (None, schedule.cycle) or not self._continues(runs):
             self._asked = None
             return None
         schedule.replace_runs(runs)
-        self._change, self._greatest_rate = None, self._goal.greatest_rate if self._goal else math.inf
-        if run.target != min(self.override, self._greatest_rate):
-            self.run_at(self.override)
-        return AcceptedPlan(
-            planned.duration if planned.duration is not None else math.inf,
-            planned.slowed,
-            planned.stops_first,
-            queued=False,
-            bound=planned.bound,
-            lag=planned.lag,
-        )
+        # The goal begins in this cycle, and with it the mode is moving, whatever it was.
+        self._running, self._change = True, None
+        self._greatest_rate = self._goal.greatest_rate if self._goal else math.inf
+        if run.target != self._rate:
+            self._start_rate_change()
+        return AcceptedPlan(planned.reply, planned.bound)
 
     def _stopping(self, under_way: Run, planned: Planned) -> Run:
-        """Return the motion under way as it stops, with no goal on its way."""
+        """Return the motion under way, stopping, with no goal on its path."""
         run = under_way.copy()
         run.seams.clear()
         if planned.stop is not None:
@@ -267,9 +278,9 @@ class PlanRequests:
         return run
 
     def _continues(self, runs: Iterable[Run]) -> bool:
-        """Whether runs begin with the motion that is commanded now, each of them where the one before it stands.
+        """Whether the runs begin with the present commanded motion, and each where the one before it ends at rest.
 
-        From rest a trajectory may begin with an acceleration: that is a jerk, which the planner has looked at.
+        From rest a trajectory may begin with an acceleration: the planner has checked that jerk.
         """
         state = self._schedule.commanded
         for run in runs:
@@ -278,23 +289,26 @@ class PlanRequests:
                 state = state._replace(acceleration=begins.acceleration)
             if not _same(begins, state):
                 return False
-            state = rest(run.state(run.ends - run.time, state.pose).pose)
+            state = rest(run.state(run.end_time - run.time, state.pose).pose)
         return True
 
     def _extend(self, extended: Extended) -> AcceptedPlan | None:
         schedule = self._schedule
         path = unpack_path(extended.path, 3)
         run = schedule.runs[-1] if schedule.runs else None
-        if run is None or run.at.s >= extended.s or not _same(nominal(run.path, extended.s), nominal(path, 0.0)):
+        if (
+            run is None
+            or run.law_state.s >= extended.s
+            or not _same(nominal_motion(run.path, extended.s), nominal_motion(path, 0.0))
+        ):
             self._asked = None
             return None
         schedule.append(extended.s, path)
-        duration = schedule.remaining if run.target else math.inf
-        return AcceptedPlan(duration, extended.slowed, stops_first=False, queued=True)
+        return AcceptedPlan(extended.reply.with_duration(schedule.remaining if run.target else math.inf))
 
 
 def _same(one: MotionState, other: MotionState) -> bool:
-    """Whether two states of motion are one but for rounding; what is not a number is not."""
+    """Whether two states of motion are equal except for rounding; NaN never is."""
     return all(
         abs(a - b) <= allowed
         for allowed, here, there in zip(ROUNDING, one, other, strict=True)

@@ -1,8 +1,9 @@
-"""The sliders' setpoints: solved for the commanded motion behind the last gate, or led to where the sliders are."""
+"""Setpoints of the sliders: solved for the commanded motion behind the last gate, or led to the measured sliders."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +13,27 @@ from trirail.control import cycle
 from trirail.control.feedback import Measured
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
+from trirail.kinematics.closed_forward import sign_of_det_j2
 from trirail.kinematics.robot import inverse_into
-from trirail.motion.limits import Bounds
-from trirail.motion.runs import Run
+from trirail.motion.limits import AllowedMotion, Bounds
+from trirail.motion.runs import ZERO_RATES, Run
 from trirail.motion.schedule import Schedule
+from trirail.wire.event_codes import EventCode, EventText, coded
+from trirail.wire.vocabulary import Mode
+
+_ALLOWED = {Mode.HOLDING: AllowedMotion.NONE, Mode.STOPPING: AllowedMotion.BRAKING}
+"""Motion allowed by mode; the gate is not used in modes in which the commanded motion follows the measured one."""
 
 
 class Setpoints:
-    """The setpoints of the next SYNC. `step` [m] is how far a slider can go in a cycle."""
+    """Setpoints of the next SYNC.
 
-    def __init__(self, legs: Array, bounds: Bounds, measured: Measured, step: float) -> None:
+    `tolerance` is trirail.motion.limits.standing_tolerance, `step` [m] a slider's greatest travel in a cycle.
+    """
+
+    def __init__(self, legs: Array, bounds: Bounds, tolerance: Array, measured: Measured, step: float) -> None:
         self._legs = legs
+        self._tolerance = tolerance
         self._bounds = bounds
         self._measured = measured
         self.step = step
@@ -33,78 +44,94 @@ class Setpoints:
 
     @property
     def bounds(self) -> NDArray[np.void]:
-        """The last gate's, (1,) of trirail.motion.limits.BOUNDS."""
+        """Bounds of the last gate, (1,) of trirail.motion.limits.BOUNDS."""
         return self._bounds.packed
 
     @property
     def found(self) -> Array:
-        """What the last gate has found, (2,)."""
-        return self._bounds.found
+        """Values of the last gate's refusal, (2,)."""
+        return self._bounds.last_violation
 
     @property
     def rows(self) -> list[list[float]]:
         """Rows position, velocity, acceleration of the sliders, then those of the cross slides."""
-        return self.sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not tell of what type its lists are
+        return self.sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not annotate the type of its lists
 
     @property
     def sent(self) -> tuple[Triple, Triple]:
-        """What the drives get: positions [m] and velocities [m/s]."""
+        """Setpoints for the drives: positions [m] and velocities [m/s]."""
         (a, b, c), (u, v, w) = self._sent.tolist()
         return (a, b, c), (u, v, w)
 
     def start(self) -> None:
-        """Begin where the sliders are."""
+        """Begin at the sliders' measured positions."""
         self.sliders[0, 0] = self._measured.position
 
-    def solve(self, schedule: Schedule, run: Run | None) -> int:
-        """Move the commanded motion on, by the run under way, and solve the sliders by the paper's recursion.
+    def allow(self, mode: Mode) -> None:
+        """Set the last gate to refuse motion that a mode, entered now, does not allow."""
+        self.bounds[0]["allowed"] = _ALLOWED.get(mode, AllowedMotion.ANY)
 
-        Where the last gate refuses that they stay as they are. Returns what trirail.control.cycle.command does.
+    def solve(self, schedule: Schedule, run: Run | None) -> int:
+        """Advance the commanded motion by the run under way, and solve the sliders by the paper's recursion.
+
+        Where the last gate refuses the result, they stay unchanged. Returns the code of trirail.control.cycle.command.
         """
-        legs, bounds, found = self._legs, self._bounds.packed, self._bounds.found
+        legs, bounds, found = self._legs, self._bounds.packed, self._bounds.last_violation
         motion, sliders, record = schedule.motion, self.sliders, self._measured.record
         kept = self._measured.backlash
         if run is None:
             return cycle.hold(legs, bounds, motion, sliders, kept, found, record)
-        path, law, (begun, end, arrival) = run.path, run.law, run.course
+        path, law, (begun, end, arrival) = run.path, run.law, run.goal_span
         return cycle.command(
             *(legs, bounds, *path, law.knots, law.pieces, run.time, run.target, run.furthest),
             *(begun, end, arrival, motion, sliders, kept, found, record),
         )
 
     def refusal(self, code: int) -> str | None:
-        """Say why the last gate has refused what was just solved; None where it has not."""
+        """Return the reason of the last gate's refusal; None where it has not refused."""
         refused = cycle.refusal(code)
         if refused == 0:
             return None
+        now, other = self._bounds.last_violation.tolist()
         if refused == cycle.BACKWARDS:
-            now, furthest = self._bounds.found.tolist()
-            return f"no setpoint: time along the path would run backwards, from {furthest:.6g} to {now:.6g} s"
+            return f"no setpoint: time along the path would run backwards, from {other:.6g} to {now:.6g} s"
+        if refused == cycle.DRIFTS:
+            return (
+                f"setpoint refused: the platform would move by {now:.3g} m or rad in a cycle while the mode is holding"
+            )
+        if refused == cycle.RUNS_ON:
+            return f"setpoint refused: the motion would run on at {now:.0%} of its speed while the mode is stopping"
         if refused <= len(NAMES):
             slider = f"slider {self._bounds.labels[refused - 1]}"
             return f"{slider}: no setpoint, the commanded pose is singular or not a number"
         return f"setpoint refused: {self._bounds.violation(refused - len(NAMES))}"
 
     def follow(self, schedule: Schedule, *, held: bool, stopped_now: bool) -> None:
-        """Command the pose that is measured, and every drive that holds none the position that it measures.
+        """Command the measured pose, and each drive that holds no position to its measured one.
 
-        Nothing moves on enable. Where that is not where the slider was commanded to be, the setpoint goes there at the
-        slider's speed: a drive that missed the command to stop must not jump either. A position that jumps is not
-        followed. A drive that moves by itself, to be homed, gets no setpoint: what is meant for it is its position at
-        once. `held` tells whether drives that are enabled hold theirs, `stopped_now` whether all were stopped in this
-        cycle: then no setpoint is sent.
+        Nothing moves on enable. A setpoint that differs from the measured position moves there at the slider's speed:
+        a drive that missed the command to stop must not jump either. A position that jumps is not followed. A drive
+        that moves by itself, to home, follows no setpoint: its setpoint is its position immediately. `held` is whether
+        enabled drives hold theirs, `stopped_now` whether all were stopped in this cycle: then no setpoint is sent.
         """
         measured = self._measured
         arrays = schedule.motion, self.sliders, measured.backlash, measured.record
         cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self.step, *arrays)
 
+    def stand_at(self, pose: Sequence[float]) -> None:
+        """Set the cross slides to their positions at a pose: the next setpoint is compared with those."""
+        self._motion[:] = 0.0
+        self._motion[0] = pose
+        if inverse_into(self._legs, self._motion, self._tried) == 0:
+            self.sliders[0, 3:] = self._tried[3:]
+
     def tell_progress(self, progress: float, remaining: float) -> None:
-        """Let the record say how much of the goal under way is over, as a share, and what remains [s]."""
+        """Record the progress of the goal under way, as a share, and the time that remains [s]."""
         record = self._measured.record
         record["progress"], record["remaining"] = progress, remaining
 
     def check_rest(self) -> None:
-        """Refuse to enable while a setpoint is on its way to where its slider is."""
+        """Raise RefusedError on enable while a setpoint still moves towards its slider."""
         places = self._measured.position
         for name, setpoint, position in zip(self._bounds.labels, self.rows[0], places, strict=True):
             if not abs(setpoint - position) <= self.step:
@@ -113,22 +140,37 @@ class Setpoints:
                     f"slider {name} moves too fast for its setpoint to follow: enable when it stands",
                 )
 
-    def check_start(self) -> None:
-        """Refuse to begin where the robot stands outside what it may do."""
-        position = self._measured.position
-        pose = self._measured.pose_of(position)
+    def check_start(self) -> EventText | None:
+        """Return a warning where the robot is beyond a limit by more than the measurement's tolerance; else None.
+
+        From there only motion back is accepted. Raises RefusedError where the robot is at or behind a singular pose,
+        which no motion may pass.
+        """
+        pose = self._measured.pose_of(self._measured.position)
         self._motion[:] = 0.0
         self._motion[0] = pose or math.nan
         if pose is None or inverse_into(self._legs, self._motion, self._tried):
             raise RefusedError(
                 RefusalCode.SINGULAR, "the measured sliders belong to no pose: move them by hand, then enable"
             )
-        self._tried[0] += self._measured.backlash[0]["offset"]
-        violation = self._bounds.pose(pose) or self._bounds.setpoint(self._tried)
-        if violation:
+        if sign_of_det_j2(self._legs, pose) != sign_of_det_j2(self._legs, ZERO_RATES):
             raise RefusedError(
-                RefusalCode.OUT_OF_WORKSPACE,
-                f"the robot stands outside its limits: {violation}; move it inside by hand, then enable",
-                value=violation.value,
-                limit=violation.limit,
+                RefusalCode.SINGULAR, "the robot stands behind a singular pose: move it back by hand, then enable"
             )
+        self._tried[0] += self._measured.backlash[0]["offset"]
+        violation = self._bounds.standing_violation(
+            np.concatenate([pose, self._tried[0], self._tried[3]]), self._tolerance
+        )
+        if violation is None:
+            return None
+        words = f"the robot stands outside its limits, only motion back is accepted: {violation}"
+        return coded(
+            words,
+            EventCode.OUTSIDE_LIMITS,
+            part=violation.part,
+            name=violation.name,
+            quantity=violation.quantity,
+            value=violation.value,
+            limit=violation.limit,
+            unit=violation.unit,
+        )

@@ -1,4 +1,4 @@
-"""What a configuration is likely to mean otherwise than it says: each check is a function of the configuration."""
+"""Checks for values of a configuration that are valid but probably unintended."""
 
 from trirail.diagnosis.check import Check, Verdict
 from trirail.diagnosis.configured import diagnose, failed_checks

@@ -1,14 +1,13 @@
-"""The bare loop: a cycle's frames and nothing else, in one compiled call; what the machine leaves to any loop on it.
+"""Bare loop, which only exchanges a cycle's frames in one compiled call: the best timing that this machine allows.
 
-Each cycle waits for an absolute deadline, sends SYNC, takes what has arrived by recvmmsg(2), and sends three setpoints
-by sendmmsg(2). The drives are a process of their own, off the loop's processor where there is another; they answer each
-SYNC with three positions over a pair of AF_UNIX sockets, so that each SYNC wakes somebody.
+Each cycle waits for an absolute deadline, sends SYNC, reads the frames that arrived and sends three setpoints, with the
+same compiled functions as the service's cycle. A separate process, on another processor if there is one, stands in for
+the drives: it answers each SYNC with three positions over a pair of AF_UNIX sockets, so that each SYNC wakes a process.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import socket
 import subprocess
@@ -17,38 +16,37 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 from trirail_drivers.bus.can_frame import CAN_FRAME
+from trirail_drivers.bus.frames import Frame
+from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames, packed_frames
+from trirail_drivers.driver.cyclic import MOST_FRAMES, TIMES
 from trirail_drivers.interface import NAMES
 
 from trirail.config import LoopTable
 from trirail.processes import realtime
 from trirail.processes.operating_system import python
+from trirail.wire.state import Percentiles
 
-TURN: Final = 0.25
-"""For so long the compiled call goes on, and then Python looks at signals and progress [s]."""
+BATCH_S: Final = 0.25
+"""Duration of one compiled call, after which Python handles signals and progress [s]."""
 _MODULE: Final = "trirail.diagnosis.bare_loop"
 _SYNC, _SETPOINT, _POSITION = 0x080, 0x201, 0x181
 """Identifiers of CiA 301's predefined connections, of the first node."""
 _DATA: Final = bytes(8)
-_ROOM: Final = 8
-"""Frames that are taken in one cycle at most."""
-_MONOTONIC, _ABSOLUTE = 1, 1
-"""CLOCK_MONOTONIC and TIMER_ABSTIME of linux/time.h."""
 
 
 class Cycles(NamedTuple):
-    """What so many cycles took."""
+    """Measured times of the cycles."""
 
     lateness: NDArray[np.int64]
-    """How late each began, ticks missed before it included, (n,) [ns]."""
+    """Lateness of each start, missed ticks included, (n,) [ns]."""
     work: NDArray[np.int64]
-    """From there until its setpoints were sent, (n,) [ns]."""
+    """Time from the start until the setpoints were sent, (n,) [ns]."""
     period: int
-    """[ns]."""
+    """Cycle period [ns]."""
     answers: int
-    """Positions that came, of three a cycle."""
+    """Number of positions received, three per cycle if none is lost."""
 
     @property
     def missed(self) -> NDArray[np.int64]:
@@ -56,98 +54,52 @@ class Cycles(NamedTuple):
         return self.lateness // self.period
 
 
-class _Frames(NamedTuple):
-    """Frames in memory, and `struct mmsghdr` of sendmmsg(2) for each: linux/socket.h, 64 bits."""
+class _Bus:
+    """Memory for the frames of a cycle, as trirail.processes.cycle_frames exchanges them over a socket."""
 
-    headers: NDArray[np.uint64]
-    """(n, 8): name, its length, vectors, their number, control, its length, flags, length of the packet."""
-    vectors: NDArray[np.uint64]
-    """(n, 2) `struct iovec`: address and length."""
-    content: NDArray[np.uint8]
-    """(n, 16) `struct can_frame`."""
+    def __init__(self, descriptor: int) -> None:
+        self._bus = np.array(BusAccess(descriptor), np.int64)
+        self._sync = packed_frames([Frame(_SYNC)])
+        self._setpoints = packed_frames([Frame(_SETPOINT + i, _DATA) for i in range(len(NAMES))])
+        self._arrived = PackedFrames(MOST_FRAMES)
+        self._times, self._moment = np.zeros(1, TIMES), np.zeros(2, np.int64)
 
+    def exchange(self, period_ns: int, lateness: NDArray[np.int64], work: NDArray[np.int64]) -> int:
+        """Fill `lateness` and `work`, (n,) each, by n cycles; return the number of frames received."""
+        # Loading compiled code takes seconds, and only a measurement needs it.
+        from trirail.processes.cycle_frames import exchange_frames
 
-def _frames(packed: bytes) -> _Frames:
-    content = np.frombuffer(packed, np.uint8).reshape(-1, CAN_FRAME.size).copy()
-    vectors, headers = np.zeros((len(content), 2), np.uint64), np.zeros((len(content), 8), np.uint64)
-    vectors[:, 0] = [row.ctypes.data for row in content]
-    vectors[:, 1] = CAN_FRAME.size
-    headers[:, 2] = [row.ctypes.data for row in vectors]
-    headers[:, 3] = 1
-    return _Frames(headers, vectors, content)
-
-
-@functools.cache
-def _compiled() -> Callable[..., int]:
-    """Compile the loop, which takes seconds: here, for only a measurement needs it."""
-    from numba import njit
-    from numba.core import types as numba_types
-
-    types: Any = numba_types
-    i32, u32, i64, u64, address = types.int32, types.uint32, types.int64, types.uint64, types.intp
-    clock_gettime = types.ExternalFunction("clock_gettime", i32(i32, address))
-    clock_nanosleep = types.ExternalFunction("clock_nanosleep", i32(i32, i32, address, address))
-    send = types.ExternalFunction("send", i64(i32, address, u64, i32))
-    sendmmsg = types.ExternalFunction("sendmmsg", i32(i32, address, u32, i32))
-    recvmmsg = types.ExternalFunction("recvmmsg", i32(i32, address, u32, i32, address))
-    wait_for_none, size = int(socket.MSG_DONTWAIT), CAN_FRAME.size
-
-    def monotonic(time):  # type: ignore[no-untyped-def]
-        clock_gettime(_MONOTONIC, time.ctypes.data)
-        return time[0] * 1_000_000_000 + time[1]
-
-    now: Any = njit(monotonic)
-
-    def run(carrier, period, sync, setpoints, inbox, time, lateness, work):  # type: ignore[no-untyped-def]
-        answers = 0
-        deadline = now(time)
-        for k in range(len(lateness)):
-            deadline += period
-            time[0], time[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
-            while clock_nanosleep(_MONOTONIC, _ABSOLUTE, time.ctypes.data, 0) != 0:  # a signal came
-                pass
-            began = now(time)
-            send(carrier, sync.ctypes.data, size, wait_for_none)
-            answers += max(0, recvmmsg(carrier, inbox.ctypes.data, len(inbox), wait_for_none, 0))
-            sendmmsg(carrier, setpoints.ctypes.data, len(setpoints), wait_for_none)
-            work[k] = now(time) - began
-            lateness[k] = began - deadline
-            deadline += (began - deadline) // period * period
-        return answers
-
-    integers, headers = types.Array(types.int64, 1, "C"), types.Array(types.uint64, 2, "C")
-    frame = types.Array(types.uint8, 2, "C")
-    signature = i64(i64, i64, frame, headers, headers, integers, integers, integers)
-    return njit(signature)(run)  # type: ignore[no-any-return]
+        sync, setpoints, arrived = self._sync, self._setpoints, self._arrived
+        sent = sync.headers, sync.frames, setpoints.headers, setpoints.frames
+        memory = arrived.headers, arrived.frames, self._times, self._moment
+        return exchange_frames(self._bus, period_ns, *sent, *memory, lateness, work)
 
 
 def prepare() -> None:
-    """Compile the loop ahead of its first call."""
-    _compiled()
+    """Compile the loop before its first cycle."""
+    none = np.zeros(0, np.int64)
+    _Bus(0).exchange(1, none, none)
 
 
 def measure(loop: LoopTable, rate_hz: int, seconds: float, progress: Callable[[float], None] | None = None) -> Cycles:
-    """Run the bare loop for so long, with the rights that this process has; `progress` is told of the share done."""
-    run, period = _compiled(), 1_000_000_000 // rate_hz
+    """Run the bare loop for `seconds` [s], with this process's rights; `progress` receives the share completed."""
+    period = 1_000_000_000 // rate_hz
     cycles = max(1, round(seconds * rate_hz))
-    lateness, work, time = np.zeros(cycles, np.int64), np.zeros(cycles, np.int64), np.zeros(2, np.int64)
-    sync = _frames(CAN_FRAME.pack(_SYNC, 0, _DATA))
-    setpoints = _frames(b"".join(CAN_FRAME.pack(_SETPOINT + i, 8, _DATA) for i in range(len(NAMES))))
-    inbox = _frames(bytes(_ROOM * CAN_FRAME.size))
-    answers, each, empty = 0, max(1, round(TURN * rate_hz)), inbox.headers
+    lateness, work = np.zeros(cycles, np.int64), np.zeros(cycles, np.int64)
+    answers, each = 0, max(1, round(BATCH_S * rate_hz))
+    prepare()
     with _drives(loop) as carrier:
+        bus = _Bus(carrier.fileno())
         for first in range(0, cycles, each):
             part = slice(first, min(cycles, first + each))
-            answers += run(
-                carrier.fileno(), period, sync.content, setpoints.headers, empty, time, lateness[part], work[part]
-            )  # fmt: skip
+            answers += bus.exchange(period, lateness[part], work[part])
             if progress is not None:
                 progress(part.stop / cycles)
     return Cycles(lateness, work, period, answers)
 
 
 def measure_alone(loop: LoopTable, rate_hz: int, seconds: float) -> Cycles:
-    """The same in a process that takes the loop's rights for it, and ends with them."""
+    """Run the bare loop with the loop's real-time rights, which this process keeps until it ends."""
     prepare()
     realtime.acquire(loop)
     return measure(loop, rate_hz, seconds)
@@ -155,7 +107,7 @@ def measure_alone(loop: LoopTable, rate_hz: int, seconds: float) -> Cycles:
 
 @contextlib.contextmanager
 def _drives(loop: LoopTable) -> Iterator[socket.socket]:
-    """What stands for three drives, in a process of its own; it ends when the other end of its socket does."""
+    """Start the process that stands in for three drives; it ends when its socket is closed."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     processor, priority = realtime.processor(loop), max(1, loop.priority - realtime.DRIVES_BELOW)
     command = python("-m", _MODULE, *(str(each) for each in (theirs.fileno(), processor, priority)))
@@ -163,7 +115,7 @@ def _drives(loop: LoopTable) -> Iterator[socket.socket]:
         theirs.close()
         try:
             if ours.recv(1) != b"\n":
-                raise OSError("the drives of the bare loop could not start")
+                raise OSError("bare loop: the process of its drives did not start")
             yield ours
         finally:
             ours.close()
@@ -171,7 +123,7 @@ def _drives(loop: LoopTable) -> Iterator[socket.socket]:
 
 
 def _answer(carrier: socket.socket, processor: int, priority: int) -> None:
-    """Answer every SYNC with three positions, until the loop has gone."""
+    """Answer every SYNC with three positions, until the loop closes its socket."""
     with contextlib.suppress(OSError):
         others = set(range(os.cpu_count() or 1)) - {processor}
         if others:
@@ -188,18 +140,9 @@ def _answer(carrier: socket.socket, processor: int, priority: int) -> None:
                     carrier.send(position)
 
 
-class Spread(Struct, frozen=True):
-    """Percentiles of a time [µs]."""
-
-    p50: float
-    p99: float
-    p999: float
-    max: float
-
-
-def spread(values: NDArray[Any]) -> Spread:
-    """Percentiles of times in nanoseconds."""
-    return Spread(*(float(each) / 1e3 for each in np.percentile(values, (50.0, 99.0, 99.9, 100.0))))
+def compute_percentiles(values: NDArray[Any]) -> Percentiles:
+    """Return the percentiles [µs] of times in nanoseconds."""
+    return Percentiles(*(float(each) / 1e3 for each in np.percentile(values, (50.0, 99.0, 99.9, 100.0))))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a check finds, and which robots have no hardware that could come to harm."""
+"""Check results, checks of a configuration, and the test for robots without hardware."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ Verdict = Literal["ok", "warning", "failure"]
 
 
 class Check(Struct, frozen=True):
-    """What was looked at, what is so, and what to do about it."""
+    """Result of a check: its subject, verdict, finding and remedy."""
 
     name: str
     verdict: Verdict
     found: str
     remedy: str = ""
     key: str = ""
-    """Of the configuration, where one is to be changed."""
+    """Configuration key to correct, if there is one."""
 
 
-class Judgement(NamedTuple):
-    """A check of a configuration."""
+class ConfigCheck(NamedTuple):
+    """Check of a configuration."""
 
     reads: tuple[str, ...]
-    """Keys, or tables for all that is in them, that the answer depends on."""
-    of: Callable[[Config], Iterator[Check]]
+    """Keys, or whole tables, that the result depends on."""
+    run: Callable[[Config], Iterator[Check]]
 
 
 def is_simulated(section: Can) -> bool:
-    """Whether the drives are programs: on the bus of this process, or on one without a wire."""
+    """Return True if the drives are programs: on this process's own bus, or on a bus without a wire."""
     wireless = section.interface in {"simulated", "unix", "virtual", "udp_multicast"}
     return wireless or (section.interface == "socketcan" and section.channel.startswith("vcan"))
 
 
-def value(key: str, number: float, unit: str = "") -> str:
-    """Return a key with its value, as the file has it."""
+def format_value(key: str, number: float, unit: str = "") -> str:
+    """Return a key with its value, as in the file."""
     return f"{key} = {number:g}{f' {unit}' if unit else ''}"

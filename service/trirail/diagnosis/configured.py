@@ -1,4 +1,4 @@
-"""Every check of a configuration, and a file with all that is wrong in it."""
+"""All checks of a configuration, and the mistakes of a file as failed checks."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from trirail.config import Config, Mistake, overlap
 from trirail.diagnosis import contradictions, dial_gauge, drive_checks, stopping, times
 from trirail.diagnosis.check import Check
 
-JUDGEMENTS = (
-    *dial_gauge.JUDGEMENTS,
-    *stopping.JUDGEMENTS,
-    *contradictions.JUDGEMENTS,
-    *times.JUDGEMENTS,
-    *drive_checks.JUDGEMENTS,
+CONFIG_CHECKS = (
+    *dial_gauge.CONFIG_CHECKS,
+    *stopping.CONFIG_CHECKS,
+    *contradictions.CONFIG_CHECKS,
+    *times.CONFIG_CHECKS,
+    *drive_checks.CONFIG_CHECKS,
 )
 
 
 def diagnose(config: Config, impossible: Sequence[str] = ()) -> list[Check]:
-    """Return what every check finds that reads no `impossible` key."""
-    return [check for each in JUDGEMENTS if not overlap(each.reads, impossible) for check in each.of(config)]
+    """Return the results of all checks that read no `impossible` key."""
+    return [check for each in CONFIG_CHECKS if not overlap(each.reads, impossible) for check in each.run(config)]
 
 
 def failed_checks(path: Path, mistakes: Sequence[Mistake]) -> list[Check]:

@@ -1,4 +1,4 @@
-"""Limits that contradict each other, or the robot: none is refused, for each alone might be meant."""
+"""Limits that contradict each other or the robot. They are warnings, because each limit alone may be intended."""
 
 from __future__ import annotations
 
@@ -6,35 +6,39 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from trirail_drivers.interface import Triple
 
 from trirail.config import Config, SliderLimits, geometry, room
-from trirail.diagnosis.check import Check, Judgement, is_simulated, value
+from trirail.diagnosis.check import Check, ConfigCheck, format_value, is_simulated
 from trirail.kinematics.geometry import gains, travels
+from trirail.quantities import FAMILIAR_UNITS
 
-RAMP = 1e-3, 10.0
-"""Between these is what any slider takes to its limit of velocity, or of acceleration [s]."""
-LOPSIDED = 300.0
-"""The two sides of a range differ by less, if both are meant."""
-OUT_OF_STEP = 30.0
-"""The sliders' rates differ by less from those that the platform's limits ask of them, if both are meant."""
-REACHED = 0.1
-"""Least share of the platform's limits that the sliders reach."""
-COARSE = 0.02
-"""Greatest share of a range that is a window to settle in."""
-_PLACES = 15
-"""Where that is looked at, along each axis."""
+RAMP_TIMES_S = 1e-3, 10.0
+"""Plausible times to reach a velocity or acceleration limit, shortest and longest [s]."""
+MAX_ASYMMETRY = 300.0
+"""Plausible ratio of a range's two sides."""
+MAX_RATE_MISMATCH = 30.0
+"""Plausible ratio of a slider's limit to the rate that the platform's limits need, either way."""
+MAX_RATE_EXCESS = 5.0
+"""Plausible ratio of an axis' limit to the rate that the sliders reach; the shipped robots have 0.7."""
+MIN_REACHED_SHARE = 0.1
+"""Plausible minimum of the share of the platform's limits that the sliders reach."""
+MAX_WINDOW_SHARE = 0.02
+"""Plausible maximum of an in-position window, relative to its range."""
+_SAMPLES = 15
+"""Samples of the platform's limits along each axis."""
 _ORDERS = (("velocity", "acceleration", "", "/s"), ("acceleration", "jerk", "/s²", "/s³"))
 _AXES = (("x", "m"), ("y", "m"), ("phi", "rad"))
 
 
 def _each(slider: SliderLimits, quantity: str) -> Triple:
-    """Return a limit of each slider by its key for all."""
+    """Return the limit of each slider for a quantity."""
     return {"velocity": slider.velocities, "acceleration": slider.accelerations, "jerk": slider.jerks}[quantity]
 
 
 def _ramps(config: Config) -> Iterator[Check]:
-    """Nothing reaches its velocity within a millisecond, or takes ten seconds; so for acceleration."""
+    """Check the times to reach the velocity limit by the acceleration limit, and that by the jerk limit."""
     slider, platform = config.limits.slider, config.limits.platform
     for rate, by, _, _ in _ORDERS:
         sliders = list(zip(_each(slider, rate), _each(slider, by), strict=True))
@@ -49,47 +53,48 @@ def _ramps(config: Config) -> Iterator[Check]:
                 for k, (axis, _) in enumerate(_AXES)
             ),
         ]
-        for name, reached, slope in tables:
-            time = reached / slope
-            if not RAMP[0] <= time <= RAMP[1]:
-                said = f"{name}: {rate} {reached:g} is reached in {time:.2g} s by {by} {slope:g}"
+        for name, limit, slope in tables:
+            time = limit / slope
+            if not RAMP_TIMES_S[0] <= time <= RAMP_TIMES_S[1]:
+                finding = f"{name}: {rate} {limit:g} is reached in {time:.2g} s by {by} {slope:g}"
                 table = name.partition(" ")[0]
-                remedy = f"one of the two is another unit's, or has a factor of ten too many: SI units, {table}"
-                yield Check("limits", "warning", said, remedy, f"{table}.{rate}")
+                remedy = f"one of the two is in another unit or off by a power of ten; use SI units in {table}"
+                yield Check("limits", "warning", finding, remedy, f"{table}.{rate}")
 
 
 def _ranges(config: Config) -> Iterator[Check]:
+    """Check that the sides of each range are of similar size, and that it contains 0."""
     platform, slider = config.limits.platform, config.limits.slider
     ranges = {f"limits.platform.{axis}": getattr(platform, axis) for axis, _ in _AXES}
     ranges |= dict(zip(slider.keys("position"), slider.positions, strict=True))
     ranges["limits.slider.passive"] = slider.passive
     for key, (low, high) in ranges.items():
         small, large = sorted((abs(low), abs(high)))
-        said = f"{key} = [{low:g}, {high:g}]"
-        if small and large > LOPSIDED * small:
-            found = f"{said}: one side is {large / small:.3g} times the other"
-            yield Check("limits", "warning", found, "metres and radians: is one of them in mm?", key)
+        name = f"{key} = [{low:g}, {high:g}]"
+        if small and large > MAX_ASYMMETRY * small:
+            finding = f"{name}: one side is {large / small:.3g} times the other"
+            yield Check("limits", "warning", finding, "use metres and radians: is one of them in mm?", key)
         if config.geometry.l0 is not None and not low <= 0.0 <= high:
-            found = f"{said} leaves out 0, where all sliders at 0 have the platform"
-            yield Check("limits", "warning", found, "is a sign wrong? enable the robot within its limits", key)
+            finding = f"{name} excludes 0, the platform's position with all sliders at 0"
+            yield Check("limits", "warning", finding, "is a sign wrong? the robot starts outside its limits", key)
 
 
 def _reached(config: Config) -> Iterator[Check]:
-    """Of the platform's limits sliders and passive joints reach a good part, or one of them is wrong."""
+    """Check that the sliders and passive joints reach a good part of the platform's limits."""
     platform = config.limits.platform
-    axes = [np.linspace(*each, _PLACES) for each in (platform.x, platform.y, platform.phi)]
+    axes = [np.linspace(*each, _SAMPLES) for each in (platform.x, platform.y, platform.phi)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     share = float(room(config.limits).holds(travels(geometry(config.geometry), poses)).mean())
-    if share < REACHED:
-        found = f"the sliders reach {share:.1%} of limits.platform"
-        remedy = "trirail workspace shows where: limits.platform, limits.slider or geometry is wrong"
-        yield Check("reach", "warning", found, remedy, "limits.platform")
+    if share < MIN_REACHED_SHARE:
+        finding = f"the sliders reach {share:.1%} of limits.platform"
+        remedy = "correct limits.platform, limits.slider or geometry; trirail workspace shows the reach"
+        yield Check("reach", "warning", finding, remedy, "limits.platform")
     else:
         yield Check("reach", "ok", f"the sliders reach {share:.0%} of limits.platform")
 
 
 def _rates(config: Config) -> Iterator[Check]:
-    """The sliders' limits of velocity, acceleration and jerk are of the size that the platform's ask of them."""
+    """Compare the sliders' limits of velocity, acceleration and jerk with the rates that the platform's limits need."""
     platform, slider = config.limits.platform, config.limits.slider
     middle = [sum(each) / 2.0 for each in (platform.x, platform.y, platform.phi)]
     try:
@@ -97,69 +102,85 @@ def _rates(config: Config) -> Iterator[Check]:
     except np.linalg.LinAlgError:
         return
     for quantity in ("velocity", "acceleration", "jerk"):
+        yield from _too_fast(config, per_pose, quantity)
         every = (per_pose @ np.array(getattr(platform, quantity))).tolist()
         limits, keys = _each(slider, quantity), slider.keys(quantity)
-        asked = every if len(set(keys)) > 1 else [max(every)] * 3
-        for key, limit, most in dict.fromkeys(zip(keys, limits, asked, strict=True)):
-            if not 1.0 / OUT_OF_STEP < limit / most < OUT_OF_STEP:
-                found = f"{value(key, limit)}, and limits.platform.{quantity} asks for {most:.3g}"
-                yield Check("limits", "warning", found, "one of them cannot be used", key)
+        needed = every if len(set(keys)) > 1 else [max(every)] * 3
+        for key, limit, need in dict.fromkeys(zip(keys, limits, needed, strict=True)):
+            if not 1.0 / MAX_RATE_MISMATCH < limit / need < MAX_RATE_MISMATCH:
+                finding = f"{format_value(key, limit)}, but limits.platform.{quantity} needs {need:.3g}"
+                yield Check("limits", "warning", finding, "correct the one in another unit", key)
+
+
+def _too_fast(config: Config, per_pose: NDArray[np.float64], quantity: str) -> Iterator[Check]:
+    """Find rates of the platform that are far beyond the sliders, as if given in mm or degrees."""
+    limits = getattr(config.limits.platform, quantity)
+    shares = (per_pose * limits / np.array(_each(config.limits.slider, quantity))[:, None]).max(axis=0).tolist()
+    per = dict(zip(("velocity", "acceleration", "jerk"), ("/s", "/s²", "/s³"), strict=True))[quantity]
+    for k, ((axis, unit), limit, share) in enumerate(zip(_AXES, limits, shares, strict=True)):
+        if share > MAX_RATE_EXCESS:
+            key = f"limits.platform.{quantity}[{k}]"
+            finding = f"{format_value(key, limit, unit + per)}: {share:.3g} times what the sliders reach along {axis}"
+            size = FAMILIAR_UNITS[unit][0]
+            yield Check("limits", "warning", finding, f"did you mean {limit * size:.3g} {unit}{per}?", key)
 
 
 def _windows(config: Config) -> Iterator[Check]:
-    """A robot that is in position, or in error, is so by windows that lie between a cycle's way and the travel."""
+    """Check the following-error and in-position windows: larger than a cycle's motion, much smaller than the travel."""
     slider, drives, settling = config.limits.slider, config.drives, config.limits.in_position
-    way, travel = slider.fastest * config.period, min(high - low for low, high in slider.positions)
+    step, travel = slider.fastest * config.period, min(high - low for low, high in slider.positions)
     for key, window in (
         ("limits.slider.following_error", slider.following_error),
         ("drives.following_error", drives.following_error),
     ):
-        if window < way:
-            found = f"{value(key, window, 'm')}, and a slider goes {way:.3g} m in a cycle at limits.slider.velocity"
-            yield Check("limits", "warning", found, f"motion alone would be a fault: beyond {way:.3g}", key)
+        if window < step:
+            finding = (
+                f"{format_value(key, window, 'm')}: a slider moves {step:.3g} m per cycle at limits.slider.velocity"
+            )
+            yield Check("limits", "warning", finding, f"set more than {step:.3g}: normal motion would be a fault", key)
         if window > travel / 10.0:
-            found = f"{value(key, window, 'm')}, of a travel of {travel:.3g} m"
-            yield Check("limits", "warning", found, "a slider that is stuck would hardly be noticed", key)
+            finding = f"{format_value(key, window, 'm')}: over a tenth of the travel, {travel:.3g} m"
+            yield Check("limits", "warning", finding, "set less: it would hardly detect a stuck slider", key)
     corners = list(itertools.product(*(getattr(config.limits.platform, axis) for axis, _ in _AXES)))
-    most = np.abs([gains(geometry(config.geometry), corner) for corner in corners]).max(axis=0).sum(axis=1)
+    pose_gains = np.abs([gains(geometry(config.geometry), corner) for corner in corners]).max(axis=0).sum(axis=1)
     ranges = [*slider.positions] + [getattr(config.limits.platform, axis) for axis, _ in _AXES]
-    errors = [slider.following_error] * 3 + (most * slider.following_error).tolist()
-    widest = [min(error, COARSE * (high - low)) for error, (low, high) in zip(errors, ranges, strict=True)]
+    errors = [slider.following_error] * 3 + (pose_gains * slider.following_error).tolist()
+    widest = [min(error, MAX_WINDOW_SHARE * (high - low)) for error, (low, high) in zip(errors, ranges, strict=True)]
     for i, (window, wide) in enumerate(zip((*settling.sliders, *settling.pose), widest, strict=True)):
         key = f"limits.in_position.{('sliders', 'pose')[i // 3]}[{i % 3}]"
         if window > wide:
-            found = f"{value(key, window)} is no window to settle in: every goal would be done at once"
-            yield Check("limits", "warning", found, f"at most {wide:.2g}", key)
+            finding = f"{format_value(key, window)}: too wide, every goal would be done before it has settled"
+            yield Check("limits", "warning", finding, f"at most {wide:.2g}", key)
 
 
 def _simulated(config: Config) -> Iterator[Check]:
-    """Simulated servos that cannot follow: their lag is what feed-forward leaves, for a time constant."""
+    """Check that simulated servos can follow: they lag by the motion that feed-forward leaves, for a time constant."""
     if not is_simulated(config.can):
         return
     slider, servo = config.limits.slider, config.can.simulated
     lag = slider.fastest * (abs(1.0 - servo.feed_forward_gain) * servo.time_constant + config.period)
     if lag > slider.following_error:
-        found = f"simulated servos lag {lag * 1e3:.3g} mm behind at limits.slider.velocity, beyond its following_error"
-        remedy = "a shorter time_constant, or a feed_forward_gain nearer to 1"
-        yield Check("simulated", "warning", found, remedy, "can.simulated.time_constant")
-    for key, most, limit in (
+        finding = f"simulated servos lag {lag * 1e3:.3g} mm at limits.slider.velocity, beyond its following_error"
+        remedy = "set a shorter time_constant, or a feed_forward_gain nearer to 1"
+        yield Check("simulated", "warning", finding, remedy, "can.simulated.time_constant")
+    for key, maximum, limit in (
         ("max_velocity", servo.max_velocity, slider.fastest),
         ("max_acceleration", servo.max_acceleration, max(slider.accelerations)),
     ):
-        if most < limit:
-            found = f"{value(f'can.simulated.{key}', most)} is less than the sliders' limit, {limit:g}"
-            yield Check("simulated", "warning", found, "they cannot follow", f"can.simulated.{key}")
+        if maximum < limit:
+            finding = f"{format_value(f'can.simulated.{key}', maximum)} is less than the sliders' limit, {limit:g}"
+            yield Check("simulated", "warning", finding, "set more: the servos cannot follow", f"can.simulated.{key}")
 
 
 _RATES = tuple(f"limits.{of}.{rate}" for of in ("slider", "platform") for rate in ("velocity", "acceleration", "jerk"))
 _POSES = "limits.platform.x", "limits.platform.y", "limits.platform.phi", "limits.singularity_margin", "geometry"
 _TRAVEL = "limits.slider.position", "limits.slider.passive"
 _WINDOWS = "limits.slider.following_error", "drives.following_error", "limits.in_position"
-JUDGEMENTS = (
-    Judgement(_RATES, _ramps),
-    Judgement((*_POSES, *_TRAVEL), _ranges),
-    Judgement((*_POSES, *_TRAVEL), _reached),
-    Judgement((*_RATES, *_POSES), _rates),
-    Judgement((*_POSES, *_WINDOWS, "limits.slider.velocity", "limits.slider.position", "loop.rate_hz"), _windows),
-    Judgement(("limits.slider", "can", "loop.rate_hz"), _simulated),
+CONFIG_CHECKS = (
+    ConfigCheck(_RATES, _ramps),
+    ConfigCheck((*_POSES, *_TRAVEL), _ranges),
+    ConfigCheck((*_POSES, *_TRAVEL), _reached),
+    ConfigCheck((*_RATES, *_POSES), _rates),
+    ConfigCheck((*_POSES, *_WINDOWS, "limits.slider.velocity", "limits.slider.position", "loop.rate_hz"), _windows),
+    ConfigCheck(("limits.slider", "can", "loop.rate_hz"), _simulated),
 )

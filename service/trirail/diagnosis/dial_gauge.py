@@ -1,4 +1,4 @@
-"""What each slider of a stage moves for a small motion of its table: so that a dial gauge tells which kind it is."""
+"""Slider travels for small motions of a stage's table, to identify its kind with a dial gauge."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from trirail.config import Config, geometry
-from trirail.diagnosis.check import Check, Judgement
+from trirail.diagnosis.check import Check, ConfigCheck
 from trirail.errors import KinematicsError
 from trirail.kinematics.geometry import Geometry, other_kind, travels
 
@@ -17,26 +17,26 @@ MOTIONS = (
     ("1 mm in y", (0.0, 0.001, 0.0)),
     ("1° in φ", (0.0, 0.0, math.radians(1.0))),
 )
-"""From x = y = φ = 0 [m, rad]."""
-APART = 1e-6
-"""Sliders of the two kinds that differ by less are the same to a dial gauge [m]."""
+"""Motions from x = y = φ = 0 [m, rad]."""
+GAUGE_RESOLUTION_M = 1e-6
+"""Difference of the two kinds that a dial gauge shows [m]."""
 _KINDS = {"3-PRP": "pivots on the carriages", "3-PPR": "cross slides on the carriages"}
 
 
-def _moved(robot: Geometry, pose: tuple[float, float, float]) -> list[float]:
+def _travel(robot: Geometry, pose: tuple[float, float, float]) -> list[float]:
     at_zero, there = travels(robot, [(0.0, 0.0, 0.0), pose])[0]
-    moved: list[float] = (there - at_zero).tolist()
-    return moved
+    distances: list[float] = (there - at_zero).tolist()
+    return distances
 
 
-def _words(robot: Geometry, moved: list[float]) -> str:
-    return ", ".join(f"{leg} {way * 1e3:+.4f} mm" for leg, way in zip(robot.labels, moved, strict=True))
+def _format(robot: Geometry, distances: list[float]) -> str:
+    return ", ".join(f"{leg} {length * 1e3:+.4f} mm" for leg, length in zip(robot.labels, distances, strict=True))
 
 
 def _kind(config: Config) -> Iterator[Check]:
-    """What the configured mechanism does, and what the other kind would do with carriages in the same places."""
+    """Report the slider travels of the configured mechanism, and of the other kind with the same carriages."""
     robot = geometry(config.geometry)
-    said = [f"{name} moves {_words(robot, _moved(robot, pose))}" for name, pose in MOTIONS]
+    motions = [f"{name} moves {_format(robot, _travel(robot, pose))}" for name, pose in MOTIONS]
     turned = MOTIONS[-1][1]
     try:
         other = other_kind(robot)
@@ -44,14 +44,14 @@ def _kind(config: Config) -> Iterator[Check]:
         other = None
     remedy = ""
     if other is not None:
-        moved = _moved(other, turned)
-        if np.abs(np.subtract(moved, _moved(robot, turned))).max() > APART:
-            remedy = f"of kind {other.kind}, {_KINDS[other.kind]}, {MOTIONS[-1][0]} would move {_words(robot, moved)}"
-    yield Check("kind", "ok", f"{robot.kind}, {_KINDS[robot.kind]}: {'; '.join(said)}", remedy, "geometry.kind")
+        moved = _travel(other, turned)
+        if np.abs(np.subtract(moved, _travel(robot, turned))).max() > GAUGE_RESOLUTION_M:
+            remedy = f"of kind {other.kind}, {_KINDS[other.kind]}, {MOTIONS[-1][0]} would move {_format(robot, moved)}"
+    yield Check("kind", "ok", f"{robot.kind}, {_KINDS[robot.kind]}: {'; '.join(motions)}", remedy, "geometry.kind")
 
 
 def _zero(config: Config) -> Iterator[Check]:
-    """At x = y = φ = 0, if the robot may be there, no slider is beyond its travel."""
+    """Check that no slider exceeds its travel at x = y = φ = 0, if that pose is within the limits."""
     platform = config.limits.platform
     if not all(low <= 0.0 <= high for low, high in (platform.x, platform.y, platform.phi)):
         return
@@ -59,13 +59,17 @@ def _zero(config: Config) -> Iterator[Check]:
     at_zero = travels(robot, (0.0, 0.0, 0.0))[0].tolist()
     for leg, at, (low, high) in zip(robot.labels, at_zero, config.limits.slider.positions, strict=True):
         if not low <= at <= high:
-            found = f"at x = y = φ = 0 slider {leg} would be at {at:.4g} m, beyond its travel, [{low:g}, {high:g}]"
+            finding = f"at x = y = φ = 0 slider {leg} would be at {at:.4g} m, beyond its travel, [{low:g}, {high:g}]"
             yield Check(
-                "reach", "warning", found, "home, anchor and limits.slider.position of that leg: metres?", "geometry"
+                "reach",
+                "warning",
+                finding,
+                "check home, anchor and limits.slider.position of that leg: metres?",
+                "geometry",
             )
 
 
-JUDGEMENTS = (
-    Judgement(("geometry",), _kind),
-    Judgement(("geometry", "limits.platform", "limits.slider"), _zero),
+CONFIG_CHECKS = (
+    ConfigCheck(("geometry",), _kind),
+    ConfigCheck(("geometry", "limits.platform", "limits.slider"), _zero),
 )

@@ -1,4 +1,4 @@
-"""How far and how long the sliders go on once they are to stop, and whether rails and time-outs have room for it."""
+"""Stopping distances and times of the sliders, and whether rails and time-outs allow them."""
 
 from __future__ import annotations
 
@@ -8,113 +8,117 @@ from collections.abc import Iterator
 from msgspec import Struct
 
 from trirail.config import Config
-from trirail.diagnosis.check import Check, Judgement, is_simulated, value
+from trirail.diagnosis.check import Check, ConfigCheck, format_value, is_simulated
 
 
 class Stops(Struct, frozen=True):
-    """A slider that stops from its limit of velocity, and the rail that is left for it."""
+    """Stops of a slider from its velocity limit, and the rail available for them."""
 
     velocity: float
-    """[m/s]."""
+    """Velocity limit [m/s]."""
     way: float
-    """Of a controlled stop [m]."""
+    """Distance of a controlled stop [m]."""
     time: float
-    """[s]."""
+    """Duration of a controlled stop [s]."""
     quick_way: float
-    """Of the drives' quick-stop ramp [m]."""
+    """Distance of the drives' quick-stop ramp [m]."""
     quick_time: float
-    """[s]."""
+    """Duration of that ramp [s]."""
     travel: tuple[float, float]
     """limits.slider.position [m]."""
     rail: tuple[float, float] | None
-    """Where the rails end [m]; None where legs were measured, which does not tell."""
+    """Ends of the rails [m]; None for measured legs, which do not contain them."""
 
     @property
     def left(self) -> float | None:
-        """The rail beyond the travel, on the side where there is less [m]."""
+        """Rail beyond the travel, on the side with less [m]."""
         return None if self.rail is None else min(self.travel[0] - self.rail[0], self.rail[1] - self.travel[1])
 
 
 def stops(config: Config) -> Stops:
-    """Return how a slider stops from its limit of velocity: the one that needs most of its travel for that.
+    """Return the stops of the slider that needs the largest share of its travel for them.
 
-    A controlled stop is limited in acceleration a and jerk j: it takes v / a + a / j, or 2 sqrt(v / j) where a is not
-    reached, and half of that times v is its way. A quick stop takes v / q, and v² / 2q.
+    A controlled stop from v, limited in acceleration a and jerk j, takes t = v / a + a / j, or 2 sqrt(v / j) if a is
+    not reached, over v t / 2. A quick stop at deceleration q takes v / q, over v² / 2q.
     """
     slider, quick = config.limits.slider, config.drives.quick_stop_deceleration
     rail = None
-    if config.geometry.l0 is not None:  # the sides of the paper's triangle; a slider reads 0 at a third of one
+    if config.geometry.l0 is not None:  # the rails are the sides of the paper's triangle, 0 is at a third of each
         third = config.geometry.l0 / math.sqrt(3.0)
         rail = -third, 2.0 * third
-    found = []
+    candidates = []
     for v, a, j, travel in zip(slider.velocities, slider.accelerations, slider.jerks, slider.positions, strict=True):
         time = v / a + a / j if v >= a * a / j else 2.0 * math.sqrt(v / j)
-        found.append(Stops(v, v * time / 2.0, time, v * v / (2.0 * quick), v / quick, travel, rail))
-    return max(found, key=lambda each: each.way / (each.travel[1] - each.travel[0]))
+        candidates.append(Stops(v, v * time / 2.0, time, v * v / (2.0 * quick), v / quick, travel, rail))
+    return max(candidates, key=lambda each: each.way / (each.travel[1] - each.travel[0]))
 
 
 def _rail(config: Config) -> Iterator[Check]:
-    """A slider at full velocity at the end of its travel, by a wrong scale or home, has to stop on the rail."""
-    found = stops(config)
-    speed = f"from {found.velocity * 1e3:g} mm/s"
-    ways = f"{speed} a quick stop takes {found.quick_way * 1e3:.3g} mm, a controlled one {found.way * 1e3:.3g} mm"
-    longer = max(found.way, found.quick_way)
-    if found.left is None:
-        remedy = "see that so much of each rail is left beyond limits.slider.position: measured legs do not tell"
+    """Check that a slider at full velocity at the end of its travel, from a wrong scale or home, stops on the rail."""
+    stop = stops(config)
+    speed = f"from {stop.velocity * 1e3:g} mm/s"
+    ways = f"{speed} a quick stop takes {stop.quick_way * 1e3:.3g} mm, a controlled stop {stop.way * 1e3:.3g} mm"
+    longer = max(stop.way, stop.quick_way)
+    if stop.left is None:
+        remedy = "check that each rail extends as far beyond limits.slider.position: measured legs do not contain it"
         yield Check("rail", "ok", ways, remedy)
-    elif found.left < 0.0:
-        low, high = found.rail or found.travel
-        said = f"limits.slider.position = [{found.travel[0]:g}, {found.travel[1]:g}] goes beyond the rails: with "
-        said += f"geometry.l0 = {config.geometry.l0:g} m they end at {low:.4g} and {high:.4g} m"
-        yield Check("rail", "failure", said, "correct the one that is wrong", "limits.slider.position")
-    elif longer <= found.left:
-        yield Check("rail", "ok", f"{ways}; {found.left * 1e3:.3g} mm are left beyond the travel")
+    elif stop.left < 0.0:
+        low, high = stop.rail or stop.travel
+        finding = f"limits.slider.position = [{stop.travel[0]:g}, {stop.travel[1]:g}] exceeds the rails: with "
+        finding += f"geometry.l0 = {config.geometry.l0:g} m they end at {low:.4g} and {high:.4g} m"
+        yield Check("rail", "failure", finding, "correct one of the two", "limits.slider.position")
+    elif longer <= stop.left:
+        yield Check("rail", "ok", f"{ways}; {stop.left * 1e3:.3g} mm are left beyond the travel")
     elif is_simulated(config.can):
-        yield Check("rail", "ok", f"{ways}; {found.left * 1e3:.3g} mm are left: enough for simulated drives")
+        yield Check("rail", "ok", f"{ways}; {stop.left * 1e3:.3g} mm are left: enough for simulated drives")
     else:
-        quick = found.quick_way > found.left
+        quick = stop.quick_way > stop.left
         ramp = "drives.quick_stop_deceleration" if quick else "limits.slider.acceleration and jerk"
-        said = f"{ways}; {found.left * 1e3:.3g} mm of rail are left beyond limits.slider.position"
-        remedy = (
-            f"lower limits.slider.velocity, a travel that ends {longer * 1e3:.3g} mm before the rail, or more of {ramp}"
-        )
-        yield Check("rail", "warning", said, remedy, "limits.slider.velocity")
+        finding = f"{ways}; {stop.left * 1e3:.3g} mm of rail are left beyond limits.slider.position"
+        remedy = f"lower limits.slider.velocity, end the travel {longer * 1e3:.3g} mm before the rail, or raise {ramp}"
+        yield Check("rail", "warning", finding, remedy, "limits.slider.velocity")
 
 
 def _travel(config: Config) -> Iterator[Check]:
-    """A velocity is reached, and left again, within the travel."""
-    found = stops(config)
-    travel = found.travel[1] - found.travel[0]
-    if 2.0 * found.way > travel:
-        said = f"from {found.velocity * 1e3:g} mm/s a controlled stop takes {found.way * 1e3:.3g} mm, as getting there "
-        said += f"does: the travel is {travel * 1e3:.3g} mm, so that no motion is ever as fast"
-        remedy = "a lower limits.slider.velocity, or more of its acceleration and jerk"
-        yield Check("travel", "warning", said, remedy, "limits.slider.velocity")
+    """Check that a slider can reach its velocity limit and stop again within its travel."""
+    stop = stops(config)
+    travel = stop.travel[1] - stop.travel[0]
+    if 2.0 * stop.way > travel:
+        finding = (
+            f"acceleration to {stop.velocity * 1e3:g} mm/s and the stop from there take {stop.way * 1e3:.3g} mm each: "
+        )
+        finding += f"no motion within the travel of {travel * 1e3:.3g} mm reaches that velocity"
+        remedy = "set a lower limits.slider.velocity, or more acceleration and jerk"
+        yield Check("travel", "warning", finding, remedy, "limits.slider.velocity")
 
 
 def _quick_stop(config: Config) -> Iterator[Check]:
-    """A quick stop that lasts longer than stop_timeout ends in a fault, with the power cut in motion."""
-    found, timeout = stops(config), config.drives.stop_timeout
+    """Check the duration of a quick stop: beyond stop_timeout power is cut in motion, with a fault."""
+    stop, timeout = stops(config), config.drives.stop_timeout
     key = "drives.quick_stop_deceleration"
-    ramp = value(key, config.drives.quick_stop_deceleration, "m/s²")
-    if found.quick_time > timeout:
-        said = f"from {found.velocity * 1e3:g} mm/s it takes {found.quick_time:.3g} s by {ramp}, and "
-        said += f"drives.stop_timeout is {timeout:g} s: power would be cut in motion, and the stop be a fault"
-        least = found.velocity / timeout
-        remedy = f"drives.quick_stop_deceleration beyond {least:.3g} m/s², or a longer drives.stop_timeout"
-        yield Check("quick stop", "failure", said, remedy, key)
-    elif found.quick_time < config.period:
-        said = f"from {found.velocity * 1e3:g} mm/s it would take {found.quick_time * 1e3:.2g} ms by {ramp}"
-        yield Check("quick stop", "warning", said, "no slider stops within a cycle: as the drives can brake", key)
+    ramp = format_value(key, config.drives.quick_stop_deceleration, "m/s²")
+    if stop.quick_time > timeout:
+        finding = f"from {stop.velocity * 1e3:g} mm/s it takes {stop.quick_time:.3g} s by {ramp}, longer than "
+        finding += f"drives.stop_timeout = {timeout:g} s: power would be cut in motion, with a fault"
+        minimum = stop.velocity / timeout
+        remedy = f"set drives.quick_stop_deceleration above {minimum:.3g} m/s², or a longer drives.stop_timeout"
+        yield Check("quick stop", "failure", finding, remedy, key)
+    elif stop.quick_time < config.period:
+        finding = f"from {stop.velocity * 1e3:g} mm/s it would take {stop.quick_time * 1e3:.2g} ms by {ramp}"
+        yield Check(
+            "quick stop", "warning", finding, "no slider stops within a cycle; set what the drives can brake", key
+        )
     else:
-        said = f"{found.quick_time:.3g} s from {found.velocity * 1e3:g} mm/s, within drives.stop_timeout, {timeout:g} s"
-        yield Check("quick stop", "ok", said)
+        finding = (
+            f"{stop.quick_time:.3g} s from {stop.velocity * 1e3:g} mm/s, within drives.stop_timeout, {timeout:g} s"
+        )
+        yield Check("quick stop", "ok", finding)
 
 
-JUDGEMENTS = (
-    Judgement(("limits.slider", "drives.quick_stop_deceleration", "geometry", "can"), _rail),
-    Judgement(("limits.slider", "drives.quick_stop_deceleration", "geometry"), _travel),
-    Judgement(
+CONFIG_CHECKS = (
+    ConfigCheck(("limits.slider", "drives.quick_stop_deceleration", "geometry", "can"), _rail),
+    ConfigCheck(("limits.slider", "drives.quick_stop_deceleration", "geometry"), _travel),
+    ConfigCheck(
         ("limits.slider", "drives.quick_stop_deceleration", "drives.stop_timeout", "geometry", "loop.rate_hz"),
         _quick_stop,
     ),

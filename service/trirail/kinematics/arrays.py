@@ -1,4 +1,4 @@
-"""What everybody calls the arrays of the mathematics."""
+"""Type aliases of the arrays and vectors in the mathematics."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
 """Calibration: the robot as built, from poses measured from outside and the slider readings at them.
 
-The measured poses are taken to differ from forward(geometry, sliders) by independent normal noise, beside which
-the sliders' encoders are exact. Sought is the geometry for which the weighted squares of the differences are least.
+The measured poses differ from forward(geometry, sliders) by independent normal noise; the sliders' encoders count as
+exact beside it. The result is the geometry with the least weighted squares of the differences.
 
-Of the seven numbers of a leg no such data tells more than five combinations: the PARAMETERS of its mechanism, as
+Such data determines at most five combinations of the seven numbers of a leg: the PARAMETERS of its mechanism, as
 corrections to a starting geometry.
 
-Poses with too little variety tell even less. The combinations of parameters that they leave open show in the
-singular values of each leg's Jacobian; they stay as in the starting geometry, and are named.
+Poses with too little variety determine fewer. The undetermined combinations show in the singular values of each leg's
+Jacobian; they keep the values of the starting geometry, and the result names them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from trirail.kinematics.robot import forward, inverse, jacobians
 
 __all__ = ["Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
 
-TAKES_PART = 0.1  # share of a parameter, in units of its doubt, from which on it is named in an open combination
+MIN_NAMED_SHARE = 0.1  # of a parameter in an undetermined combination, in units of its doubt, for it to be named
 MINIMUM = 6  # each pose is one equation for a leg: five for its parameters, and one to contradict
 MISFIT = 3.0  # root mean square of residual over noise from which on the data cannot be that of this robot
 TOLERANCE = 1e-12
@@ -41,7 +41,7 @@ class CalibrationError(TrirailError):
 
 
 class Open(NamedTuple):
-    """What the data cannot separate: so many independent combinations of these parameters of a leg."""
+    """Parameters of a leg of which the data leaves a number of independent combinations undetermined."""
 
     leg: str
     parameters: tuple[str, ...]
@@ -53,7 +53,7 @@ class Calibration(NamedTuple):
 
     geometry: Geometry
     corrections: Array  # (3, 5), to the starting geometry [m, rad]
-    standard_errors: Array  # (3, 5), by the stated noise; infinite where the parameter is part of what is open
+    standard_errors: Array  # (3, 5), by the stated noise; infinite for a parameter of an undetermined combination
     open: tuple[Open, ...]
     residuals: Array  # (N, 3): measured less computed x, y, phi [m, m, rad]
     misfit: float  # root mean square of residual over noise, per degree of freedom: about 1 if all is well
@@ -90,7 +90,7 @@ def identify(
         derivatives = pose_derivatives(geometry(z), start, reached) / noise[:, None, None]
         return -derivatives.reshape(poses.size, 15) @ basis
 
-    found = least_squares(
+    solution = least_squares(
         residuals,
         np.zeros(basis.shape[1]),
         jacobian,
@@ -99,28 +99,28 @@ def identify(
         gtol=TOLERANCE,
         max_nfev=MAX_EVALUATIONS,
     )
-    misfit = math.sqrt(found.fun @ found.fun / (poses.size - basis.shape[1]))
+    misfit = math.sqrt(solution.fun @ solution.fun / (poses.size - basis.shape[1]))
     if misfit > MISFIT:
-        row, _ = divmod(int(np.argmax(np.abs(found.fun))), 3)
+        row, _ = divmod(int(np.argmax(np.abs(solution.fun))), 3)
         raise CalibrationError(
             f"no geometry fits: the residuals are {misfit:.3g} times the stated noise, and greatest at this pose, "
-            f"{np.max(np.abs(found.fun)):.3g} times; check it, the columns and the units, or state more noise",
+            f"{np.max(np.abs(solution.fun)):.3g} times; check it, the columns and the units, or state more noise",
             row=row,
         )
-    if not found.success:
+    if not solution.success:
         raise CalibrationError(
-            f"no end after {found.nfev} steps: the poses tell too little; vary them more, phi above all"
+            f"no convergence after {solution.nfev} steps: the poses vary too little; vary them more, phi above all"
         )
-    deviations = (basis @ np.linalg.pinv(found.jac)).reshape(3, 5, -1)
+    deviations = (basis @ np.linalg.pinv(solution.jac)).reshape(3, 5, -1)
     errors = np.sqrt(np.sum(deviations**2, axis=2))
     for leg, names, _ in unknown:
         errors[LEGS.index(leg), [start.parameters.index(name) for name in names]] = math.inf
     return Calibration(
-        geometry=geometry(found.x),
-        corrections=(basis @ found.x).reshape(3, 5),
+        geometry=geometry(solution.x),
+        corrections=(basis @ solution.x).reshape(3, 5),
         standard_errors=errors,
         open=unknown,
-        residuals=found.fun.reshape(-1, 3) * noise,
+        residuals=solution.fun.reshape(-1, 3) * noise,
         misfit=misfit,
     )
 
@@ -167,10 +167,10 @@ def _residuals(geometry: Geometry, poses: Array, sliders: Array) -> Array:
 
 
 def _separate(start: Geometry, derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
-    """Return a basis (15, K) of the corrections that the data tells, by the whitened derivatives, and the rest.
+    """Return a basis (15, K) of the corrections that the data determines, by the whitened derivatives, and the rest.
 
-    No correction of one leg can make up for that of another: at each pose their effects are independent. So
-    what is open is open leg by leg, and can be named.
+    No correction of one leg can compensate that of another: at each pose their effects are independent. The
+    undetermined combinations therefore belong to one leg each, and can be named.
     """
     columns: list[Array] = []
     unknown: list[Open] = []
@@ -183,8 +183,10 @@ def _separate(start: Geometry, derivatives: Array) -> tuple[Array, tuple[Open, .
             columns.append(column.ravel())
         if len(rest := directions[values <= 1.0]):
             shares = np.linalg.norm(rest, axis=0)
-            names = tuple(name for name, share in zip(built.PARAMETERS, shares, strict=True) if share > TAKES_PART)
+            names = tuple(name for name, share in zip(built.PARAMETERS, shares, strict=True) if share > MIN_NAMED_SHARE)
             unknown.append(Open(leg, names, len(rest)))
     if not columns:
-        raise CalibrationError("with so much noise the poses tell nothing that drawings do not")
+        raise CalibrationError(
+            "the stated noise is too large: the poses determine nothing that drawings do not; state less, or add poses"
+        )
     return np.stack(columns, axis=1), tuple(unknown)

@@ -1,6 +1,6 @@
-"""Where the platform of a robot is, whichever its mechanism, from its sliders: forward kinematics; compiled.
+"""Compiled forward kinematics of every mechanism: the pose of the platform from its sliders.
 
-Here errors are codes and arrays are written in place. `legs` is Geometry.packed(), poses are (x, y, phi).
+Functions return error codes and write arrays in place. `legs` is Geometry.packed(), poses are (x, y, phi).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry
 
 
 @compiled()
-def _sign_of_det_j2(legs: Array, pose: Vector) -> float:
+def sign_of_det_j2(legs: Array, pose: Vector) -> float:
     """Return -1, 1, or 0 if the pose is singular or not finite."""
     a, b, c = close(legs[0], pose), close(legs[1], pose), close(legs[2], pose)
     rows = beta(a), beta(b), beta(c)
@@ -66,7 +66,7 @@ def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> 
         return LOOPS_OPEN
     # det J2 = A sin phi - B cos phi: it differs in sign between the two solutions, and keeps it on any path
     # that does not pass a singularity.
-    sign = _sign_of_det_j2(legs, (near[0], near[1], near[2]))
+    sign = sign_of_det_j2(legs, (near[0], near[1], near[2]))
     if sign == 0.0 or not square - C * C > ROUNDING * square:
         return J2_SINGULAR
     det = sign * math.sqrt(square - C * C)
@@ -130,7 +130,7 @@ def forward_motion(legs: Array, sliders: Matrix, near: Array, motion: Array) -> 
     """Write the platform's pose, velocity and acceleration (3, 3) for those of the sliders, three rows.
 
     From (16): J2 times the platform's velocity is J1 times the sliders'. Their accelerations are linear in the
-    platform's, with the same matrices: what they are without it is subtracted. Codes of forward_into.
+    platform's, with the same matrices and an offset, which is subtracted. Codes of forward_into.
     """
     code = _forward(legs, sliders[0], near, motion[0])
     if code != 0:

@@ -1,6 +1,6 @@
-"""The closed loops of a robot, whichever its mechanism: inverse kinematics and Jacobians; compiled.
+"""Compiled loop closure of every mechanism: inverse kinematics and Jacobians.
 
-Here errors are codes and arrays are written in place. `legs` is Geometry.packed(), poses are (x, y, phi).
+Functions return error codes and write arrays in place. `legs` is Geometry.packed(), poses are (x, y, phi).
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 @compiled()
 def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
     """Do inverse_into, from compiled code."""
-    told = (
+    commanded = (
         (motion[0, 0], motion[0, 1], motion[0, 2]),
         (motion[1, 0], motion[1, 1], motion[1, 2]),
         (motion[2, 0], motion[2, 1], motion[2, 2]),
     )
     if is_corrected(legs):
-        told = corrected_motion(legs, told)
+        commanded = corrected_motion(legs, commanded)
     for i in range(3):
-        leg = move(legs[i], told[0], told[1], told[2])
+        leg = move(legs[i], commanded[0], commanded[1], commanded[2])
         out[0, i], out[1, i], out[2, i] = leg.closed.slider, leg.rate, leg.acceleration
         out[3, i], out[4, i], out[5, i] = leg.closed.passive, leg.passive_rate, leg.passive_acceleration
         if not leg.regular:
@@ -64,7 +64,7 @@ def jacobians_batch(legs: Array, poses: Array, j1: Array, j2: Array) -> int:
     """Write the diagonals of J1 and all of J2, (17), (N, 3, 3), for poses (N, 3); codes of inverse_batch."""
     for k in range(len(poses)):
         pose, by_pose = (poses[k, 0], poses[k, 1], poses[k, 2]), UNIT
-        if is_corrected(legs):  # the rows of by_pose are the derivatives of what the legs are told by x, y and phi
+        if is_corrected(legs):  # rows of by_pose: derivatives of the corrected pose by x, y and phi
             by_pose = (
                 corrected_motion(legs, (pose, UNIT[0], ZERO))[1],
                 corrected_motion(legs, (pose, UNIT[1], ZERO))[1],

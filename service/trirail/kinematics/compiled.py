@@ -1,4 +1,4 @@
-"""Functions compiled by numba: plain IEEE arithmetic, kept on disk, never stale."""
+"""Functions compiled by numba: plain IEEE arithmetic, cached on disk, never stale."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any, ParamSpec, TypeVar
 
 from numba import njit
 
-__all__ = ["compile_no_more", "compiled", "inlined", "tell_of_compiling"]
+__all__ = ["compile_no_more", "compiled", "inlined", "on_compile"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 ROOMS = ("kinematics", "motion", "control", "processes")
-"""Where compiled functions stand: what is inlined, or fixed as a constant, goes across files and rooms."""
+"""Folders with compiled functions. Inlined code and constants cross files and folders, so all count as one version."""
 
 
 def _sources() -> bytes:
@@ -32,21 +32,21 @@ def _sources() -> bytes:
 
 FINGERPRINT = hashlib.sha256(_sources()).hexdigest()
 FUNCTIONS = len(re.findall(rb"^@compiled\((?!\))", _sources(), re.MULTILINE))
-"""How many functions are compiled ahead of their first call, in all rooms."""
+"""Number of functions in all rooms that are compiled ahead of their first call."""
 
 _listener: list[Callable[[str], None]] = []
 _functions: list[Any] = []
 
 
 def compile_no_more() -> None:
-    """Drop what is needed of the compiled functions to compile others that call them: 16 MB."""
+    """Free the 16 MB that only the compilation of further functions needs."""
     for function in _functions:
         for library in map(operator.attrgetter("library"), function.overloads.values()):
             library._shared_module = None
 
 
-def tell_of_compiling(listener: Callable[[str], None]) -> None:
-    """Have `listener`, and no other, called with the name of each function that is not kept, before it is compiled."""
+def on_compile(listener: Callable[[str], None]) -> None:
+    """Call `listener`, and no other, with the name of each uncached function before it is compiled."""
     _listener[:] = [listener]
 
 
@@ -54,7 +54,7 @@ def tell_of_compiling(listener: Callable[[str], None]) -> None:
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the lock of a cache folder; the kernel takes it from a process that dies."""
     with contextlib.ExitStack() as held:
-        with contextlib.suppress(OSError):  # somebody else's folder: then each compiles for itself
+        with contextlib.suppress(OSError):  # the folder belongs to another user: each process compiles for itself
             folder.mkdir(parents=True, exist_ok=True)
             lock = held.enter_context((folder / "compiling.lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -62,11 +62,10 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _kept(dispatcher: Any) -> Any:
-    """Have what is kept of a function compiled anew after every edit of any of the sources.
+    """Invalidate the cache of a function after every edit of any source file.
 
-    To see whether it is out of date numba looks at the file of the function alone; what is called from there would live
-    on after an edit elsewhere. The version is read before anything else is unpickled: of older code that may name
-    classes that are no more.
+    numba checks the function's own file alone, so that an edit of a function that it calls would go unnoticed. numba
+    reads the version first: unpickling older code may name classes that no longer exist.
     """
     kept = dispatcher._cache._cache_file
     kept._version = (kept._version, FINGERPRINT)
@@ -75,26 +74,26 @@ def _kept(dispatcher: Any) -> Any:
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate the arithmetic of a few lines to stand, compiled, wherever a compiled function calls it.
+    """Decorate a few lines of arithmetic that are inlined into every compiled function that calls them.
 
-    Everything so would take three times as long to compile, and run no faster.
+    Inlining everything takes three times as long to compile, and runs no faster.
     """
     return _kept(njit(function, error_model="numpy", forceinline=True, cache=True))  # type: ignore[no-any-return]
 
 
 def compiled(*signatures: Any, releases: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function to run compiled: now, for these signatures; without any, at its first call.
+    """Decorate a function that is compiled now, for these signatures; without signatures, at its first call.
 
-    Division by zero gives an infinity or NaN, never an exception. Compiled code is kept beside the source, or
-    in the user's cache directory where that cannot be written, and a later start only loads it. One that `releases` the
-    interpreter's lock lets other threads run meanwhile.
+    Division by zero gives an infinity or NaN, never an exception. Compiled code is cached beside the source, or
+    in the user's cache directory where that cannot be written, and a later start only loads it. `releases` frees the
+    GIL during a call.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         dispatcher = _kept(njit(function, error_model="numpy", cache=True, nogil=releases))
         kept = dispatcher._cache._cache_file
         if signatures:
-            # Processes that start together compile each function once: who comes second loads what the first has kept.
+            # Processes that start together compile each function once: the second loads what the first has cached.
             with _alone(Path(kept._cache_path)):
                 if not kept._load_index():
                     for listener in _listener:

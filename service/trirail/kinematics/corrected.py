@@ -1,4 +1,4 @@
-"""A motion on its way through the as-built errors: to what the legs must be told, and back.
+"""Motions through the as-built errors: from the real pose to the pose that the legs are solved for, and back.
 
 Compiled, with motions as rows pose, velocity, acceleration. `legs` is Geometry.packed(), with a
 trirail.kinematics.correction.Correction behind the legs where there is one.
@@ -11,20 +11,20 @@ from typing import NamedTuple, TypeAlias
 from trirail.kinematics.algebra import add, scale, subtract
 from trirail.kinematics.arrays import Array, Matrix, Vector
 from trirail.kinematics.compiled import compiled
-from trirail.kinematics.correction import DEGREE, HEAD, LEG, LEGS
+from trirail.kinematics.correction import DEGREE, HEADER_LENGTH, LEG, LEGS
 
 __all__ = ["corrected_motion", "is_corrected", "real_motion"]
 
-ROUNDS = 20
-"""At most; with STEEPEST twelve bring a correction of 20 mm to the last digit."""
-SAME = 1e-15
-"""Two rounds that differ by less are one [m, rad, s]."""
+MAX_ITERATIONS = 20
+"""With STEEPEST, twelve iterations solve a correction of 20 mm to the last digit."""
+CONVERGED = 1e-15
+"""Largest change of an iteration that has converged [m, rad, s]."""
 
 Four: TypeAlias = tuple[float, float, float, float]
 
 
-class Along(NamedTuple):
-    """The four splines of one axis that are not zero at a place, and how they change as the place moves."""
+class SplineValues(NamedTuple):
+    """The four non-zero splines of one axis at a position, with first and second derivatives by time."""
 
     first: int
     value: Four
@@ -33,7 +33,9 @@ class Along(NamedTuple):
 
 
 @compiled()
-def _along(low: float, per_length: float, cells: int, position: float, velocity: float, acceleration: float) -> Along:
+def _along(
+    low: float, per_length: float, cells: int, position: float, velocity: float, acceleration: float
+) -> SplineValues:
     """Return the splines at a position on an axis whose first cell begins at `low`."""
     place = (position - low) * per_length
     rate, change = velocity * per_length, acceleration * per_length
@@ -47,7 +49,7 @@ def _along(low: float, per_length: float, cells: int, position: float, velocity:
     d = -0.5 * s * s, t * (1.5 * t - 2.0), -s * (1.5 * s - 2.0), 0.5 * t * t
     dd = s, 3.0 * t - 2.0, 3.0 * s - 2.0, t
     square = rate * rate
-    return Along(
+    return SplineValues(
         first,
         w,
         (d[0] * rate, d[1] * rate, d[2] * rate, d[3] * rate),
@@ -76,7 +78,7 @@ def _correction(legs: Array, motion: Matrix) -> Matrix:
             d = x.rate[i] * y.value[j] + x.value[i] * y.rate[j]
             dd = x.change[i] * y.value[j] + 2.0 * x.rate[i] * y.rate[j] + x.value[i] * y.change[j]
             for k in range(DEGREE + 1):
-                at = HEAD + 3 * (((x.first + i) * of_y + y.first + j) * of_z + z.first + k)
+                at = HEADER_LENGTH + 3 * (((x.first + i) * of_y + y.first + j) * of_z + z.first + k)
                 node = numbers[at], numbers[at + 1], numbers[at + 2]
                 value = add(value, scale(w * z.value[k], node))
                 rate = add(rate, scale(d * z.value[k] + w * z.rate[k], node))
@@ -92,7 +94,7 @@ def is_corrected(legs: Array) -> bool:
 
 @compiled()
 def corrected_motion(legs: Array, motion: Matrix) -> Matrix:
-    """Return the motion that the legs have to be told, for one of the platform: p + c(p), and its derivatives."""
+    """Return the motion that the legs are solved for, given the platform's: p + c(p), and its derivatives."""
     more = _correction(legs, motion)
     return add(motion[0], more[0]), add(motion[1], more[1]), add(motion[2], more[2])
 
@@ -103,13 +105,13 @@ def _apart(a: Vector, b: Vector) -> float:
 
 
 @compiled()
-def real_motion(legs: Array, told: Matrix) -> Matrix:
-    """Return the platform's motion when the legs are told one: p = q - c(p), and its derivatives, by iteration."""
-    motion = told
-    for _ in range(ROUNDS):
+def real_motion(legs: Array, of_legs: Matrix) -> Matrix:
+    """Return the platform's motion, given that of the legs: p = q - c(p), and its derivatives, by iteration."""
+    motion = of_legs
+    for _ in range(MAX_ITERATIONS):
         less = _correction(legs, motion)
-        real = subtract(told[0], less[0]), subtract(told[1], less[1]), subtract(told[2], less[2])
-        same = max(_apart(real[0], motion[0]), _apart(real[1], motion[1]), _apart(real[2], motion[2])) <= SAME
+        real = subtract(of_legs[0], less[0]), subtract(of_legs[1], less[1]), subtract(of_legs[2], less[2])
+        same = max(_apart(real[0], motion[0]), _apart(real[1], motion[1]), _apart(real[2], motion[2])) <= CONVERGED
         motion = real
         if same:
             break

@@ -1,4 +1,4 @@
-"""As-built errors: a smooth map from where the platform is to the pose that the legs must be told for that.
+"""Smooth map of as-built errors, from the real pose of the platform to the pose that the legs are solved for.
 
 At the pose p the legs as configured have to be solved for q = p + c(p). The correction c is a tensor product of uniform
 cubic B-splines in x, y and phi: twice differentiable, so that a motion whose acceleration is continuous keeps that, and
@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 
-__all__ = ["DEGREE", "HEAD", "LEG", "LEGS", "STEEPEST", "Correction", "splines"]
+__all__ = ["DEGREE", "HEADER_LENGTH", "LEG", "LEGS", "STEEPEST", "Correction", "splines"]
 
 DEGREE = 3
-"""Of the splines: so many nodes more than cells along each axis."""
+"""Degree of the splines: along each axis they have this many nodes more than cells."""
 STEEPEST = 0.05
-"""Share of a motion's velocity that a correction may add: real_motion then gains more than a digit each time round."""
+"""Share of a motion's velocity that a correction may add: real_motion then gains more than a digit per iteration."""
 LEGS, LEG = 3, 4 * 13
 """The legs in front of a packed correction, and the numbers of each."""
-HEAD = 9
+HEADER_LENGTH = 9
 """Numbers in front of the nodes: where the first cell begins, cells per metre or radian, and how many nodes there are,
 along each axis."""
 
@@ -38,7 +38,7 @@ def splines(
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return the value of every spline at poses (N, 3), (N, nodes), and the poses' cells, (N, 3).
 
-    For who looks at a few poses, or at many once.
+    For a few poses, or for many at a time; the cycle uses the compiled trirail.kinematics.corrected.
     """
     rows, at = np.ones((len(poses), 1)), np.zeros((len(poses), 3), dtype=np.int64)
     for axis, (begin, end, number) in enumerate(zip(low, high, cells, strict=True)):
@@ -87,18 +87,18 @@ class Correction:
 
     @property
     def cells(self) -> tuple[int, int, int]:
-        """How many cells there are along x, y and phi."""
+        """Number of cells along x, y and phi."""
         l, m, n, _ = self.nodes.shape  # noqa: E741 - as above
         return l - DEGREE, m - DEGREE, n - DEGREE
 
     @property
     def size(self) -> Array:
-        """Of a cell, (3,) [m, m, rad]."""
+        """Size of a cell, (3,) [m, m, rad]."""
         return np.subtract(self.high, self.low) / self.cells
 
     @property
     def bound(self) -> Array:
-        """What no correction in x, y and phi is beyond, (3,) [m, m, rad]."""
+        """Upper bound of the correction in x, y and phi, (3,) [m, m, rad]."""
         bound: Array = np.abs(self.nodes).max(axis=(0, 1, 2))
         return bound
 

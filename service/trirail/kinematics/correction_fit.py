@@ -1,11 +1,11 @@
-"""A correction from measured poses: what the robot does beside its geometry, by errors of the geometry and splines.
+"""A correction from measured poses: deviations from the geometry, as errors of the geometry plus splines.
 
-At a measured pose p the sliders stand where the geometry has the pose q: the correction there is q - p. Near a singular
+At a measured pose p the sliders are where the geometry has the pose q: the correction there is q - p. Near a singular
 angle small errors of the geometry become large ones of the pose, over a short way: no smooth map through measured poses
-would know that. So what is sought first is how much of all these differences errors of the geometry explain, by the
-derivatives of trirail.kinematics.calibration, written as splines. What they leave is fitted by penalised splines
-(P-splines): with as little curvature as tells nothing of poses that were left out. The weight of the nodes' second
-differences is the one with which a fit to four fifths of the poses foretells the rest best (Eilers and Marx, Flexible
+would know that. The fit first determines how much of these differences errors of the geometry explain, by the
+derivatives of trirail.kinematics.calibration, written as splines. Penalised splines (P-splines) fit the rest, with the
+curvature that predicts left-out poses best. The weight of the nodes' second
+differences is the one with which a fit to four fifths of the poses predicts the rest best (Eilers and Marx, Flexible
 smoothing with B-splines and penalties, 1996, and cross-validation).
 """
 
@@ -25,23 +25,23 @@ from trirail.kinematics.correction import DEGREE, Correction, splines
 from trirail.kinematics.geometry import Geometry, Room, travels
 from trirail.kinematics.robot import forward
 
-__all__ = ["FEWEST", "Fit", "fit"]
+__all__ = ["MIN_POSES", "Fit", "fit"]
 
-FEWEST = 30
-"""Poses: a grid of three in x, y and phi, and a few more."""
-ENDS = 0.15
-"""Share of what the robot reaches, at either end, in which poses may lack."""
+MIN_POSES = 30
+"""A grid of three in x, y and phi, and a few more."""
+END_SHARE = 0.15
+"""Share of the robot's reach, at either end, that may be without a measured pose."""
 SAMPLES = 21
-"""Along each axis, to see what the robot reaches, and what errors of its geometry do there."""
-BEYOND = 0.02
-"""Of the sliders' travel, where that is looked at too: so that it is known to the ends of it [m]."""
-STIFF = 2e-4
-"""The weight of curvature where there are so many samples: enough for what lies beyond them."""
+"""Samples along each axis of the robot's reach and of the effects of geometry errors."""
+TRAVEL_MARGIN_M = 0.02
+"""Distance beyond the sliders' travel that is sampled too, so that the effects are known up to its ends."""
+GEOMETRY_CURVATURE_WEIGHT = 2e-4
+"""Weight of curvature for the effects of geometry errors: enough to continue them beyond the samples."""
 WEIGHTS = tuple(10.0**k for k in range(-6, 4))
-"""Of curvature, that are tried."""
+"""Weights of curvature to choose from."""
 FOLDS = 5
 SEED = 1
-"""Of which poses are left out together."""
+"""Seed of the choice of poses that are left out together."""
 NAMES = ("x", "y", "phi")
 
 
@@ -52,26 +52,28 @@ class Fit(NamedTuple):
     before: Array
     """The pose errors that were measured (N, 3): measured less computed x, y, phi [m, m, rad]."""
     residuals: Array
-    """What the correction leaves of them."""
-    foretold: Array
-    """What a correction leaves that was made without the pose in question: what to expect elsewhere."""
+    """Pose errors that remain with the correction."""
+    predicted: Array
+    """Pose errors that remain with a correction made without the pose in question: the errors to expect elsewhere."""
     empty: int
-    """Cells without a measured pose: what is there comes from beside it."""
+    """Number of cells without a measured pose, which continue their neighbours."""
 
 
 def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Sequence[int]) -> Fit:
     """Return the correction of a geometry from measured `poses` and `sliders`, both (N, 3) in m and rad.
 
-    It is for the whole room, with so many `cells` along x, y and phi. CalibrationError if there are too few poses, or
-    if they do not reach as far as the robot does, or where the geometry has no pose near a measured one.
+    The correction covers the whole room, with `cells` along x, y and phi. CalibrationError if there are too few poses,
+    if they do not cover the robot's reach, or if the geometry has no pose near a measured one.
     """
     low, high = room.low, room.high
-    if len(poses) < FEWEST:
-        raise CalibrationError(f"{len(poses)} poses are too few for a map: {FEWEST} are the least, a hundred are good")
+    if len(poses) < MIN_POSES:
+        raise CalibrationError(
+            f"{len(poses)} poses are too few for a map: {MIN_POSES} are the least, a hundred are good"
+        )
     reached = _reached(geometry, room)
     for name, measured, within in zip(NAMES, poses.T, reached.T, strict=True):
         (begin, end), (least, most) = ((float(each.min()), float(each.max())) for each in (within, measured))
-        spare = ENDS * (end - begin)
+        spare = END_SHARE * (end - begin)
         if least > begin + spare or most < end - spare:
             raise CalibrationError(
                 f"{name} was measured from {least:.4g} to {most:.4g}, and the robot goes from {begin:.4g} to "
@@ -93,26 +95,26 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
     def nodes(among: NDArray[np.bool], weight: float) -> Array:
         return _nodes(rows[among], by_geometry, wanted[among], scale, curvature * weight)
 
-    def foretold(weight: float) -> Array:
+    def predicted(weight: float) -> Array:
         left = np.empty_like(wanted)
         for out in (fold == number for number in range(FOLDS)):
             left[out] = wanted[out] - rows[out] @ nodes(~out, weight)
         return left
 
-    trials = [foretold(weight) for weight in WEIGHTS]
+    trials = [predicted(weight) for weight in WEIGHTS]
     best = int(np.argmin([float(((left / scale) ** 2).sum()) for left in trials]))
-    found = nodes(fold >= 0, WEIGHTS[best])
+    solution = nodes(fold >= 0, WEIGHTS[best])
     return Fit(
-        Correction(_triple(low), _triple(high), found.reshape(*shape, 3)),
+        Correction(_triple(low), _triple(high), solution.reshape(*shape, 3)),
         before=-wanted,
-        residuals=wanted - rows @ found,
-        foretold=trials[best],
+        residuals=wanted - rows @ solution,
+        predicted=trials[best],
         empty=math.prod(cells) - len(np.unique(at, axis=0)),
     )
 
 
 def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
-    """Return poses all over the room that the sliders' travel allows, or so much more of it [m]: (N, 3)."""
+    """Return poses all over the room within the sliders' travel, or up to `beyond` [m] outside it: (N, 3)."""
     axes = [np.linspace(low, high, SAMPLES) for low, high in zip(room.low, room.high, strict=True)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     reached: Array = poses[room.holds(travels(geometry, poses), beyond)]
@@ -135,22 +137,22 @@ def _curvature(shape: Sequence[int]) -> Array:
 def _solve(rows: Array, wanted: Array, penalty: Array) -> Array:
     """Return the nodes, (nodes, 3)."""
     try:
-        found: Array = np.linalg.solve(rows.T @ rows + penalty, rows.T @ wanted).astype(np.float64)
+        solution: Array = np.linalg.solve(rows.T @ rows + penalty, rows.T @ wanted).astype(np.float64)
     except np.linalg.LinAlgError as error:
-        raise CalibrationError("the poses tell too little for a map: vary x, y and phi independently") from error
-    return found
+        raise CalibrationError("the poses vary too little for a map: vary x, y and phi independently") from error
+    return solution
 
 
 def _by_geometry(geometry: Geometry, room: Room, cells: Sequence[int], curvature: Array) -> Array:
-    """Return the nodes of what each parameter of the calibration does to a pose, (nodes, 3, 15)."""
-    reached = _reached(geometry, room, BEYOND)
+    """Return the nodes of the effect of each calibration parameter on a pose, (nodes, 3, 15)."""
+    reached = _reached(geometry, room, TRAVEL_MARGIN_M)
     moved = pose_derivatives(geometry, geometry, reached).reshape(len(reached), -1)
     rows, _ = splines(reached, room.low, room.high, cells)
-    return _solve(rows, moved, curvature * STIFF).reshape(rows.shape[1], 3, -1)
+    return _solve(rows, moved, curvature * GEOMETRY_CURVATURE_WEIGHT).reshape(rows.shape[1], 3, -1)
 
 
 def _nodes(rows: Array, by_geometry: Array, wanted: Array, scale: Array, penalty: Array) -> Array:
-    """Return the nodes, (nodes, 3): those of a geometry's errors, and those of what these leave."""
+    """Return the nodes, (nodes, 3): those of the geometry's errors plus those of the remainder."""
     each = np.tensordot(rows, by_geometry, 1) / scale[:, None]
     parameters, *_ = np.linalg.lstsq(each.reshape(wanted.size, -1), (wanted / scale).ravel(), rcond=None)
     nodes: Array = by_geometry @ parameters.astype(np.float64)

@@ -1,7 +1,7 @@
 """The three legs of a robot, symmetric or as built, and the platform angles at which they are singular.
 
-Lengths are in metres, angles in radians. What a leg is, its mechanism says: prp3.leg and ppr3.leg; here the face of
-trirail.kinematics.leg is all that is known.
+Lengths are in metres, angles in radians. This module uses the interface of trirail.kinematics.leg alone; prp3.leg and
+ppr3.leg implement it.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Three legs A, B, C, and what the robot differs from them by, if that is known.
+    """Three legs A, B, C, and the correction for as-built errors, if there is one.
 
     KinematicsError if a number is not finite, the legs are of two mechanisms or of another `kind`, or the pose
     (0, 0, 0) is singular.
     """
 
     legs: tuple[Any, Any, Any]
-    """Of one mechanism, prp3.leg.Leg or ppr3.leg.CrossLeg; who knows the face alone reads `each`."""
+    """Legs of one mechanism, prp3.leg.Leg or ppr3.leg.CrossLeg; code for every mechanism reads `each`."""
     correction: Correction | None = None
     labels: Labels = field(default=LEGS, compare=False)
-    """What people call the sliders."""
+    """Display names of the sliders."""
     kind: str = ""
     """The mechanism, as [geometry] kind names it: 3-PRP or 3-PPR; that of the legs if it is not given."""
     _packed: Array = field(init=False, repr=False, compare=False)
@@ -103,12 +103,12 @@ class Geometry:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """What calibration can tell of each leg [m, rad]."""
+        """Names of the parameters of each leg that calibration determines [m, rad]."""
         return self.each[0].PARAMETERS
 
     @property
     def arm(self) -> float:
-        """How far from its centre the platform is held at most [m]: what a turn by one radian moves."""
+        """Greatest distance from the platform's centre to a leg [m]: the travel for a rotation by one radian."""
         return max(leg.arm for leg in self.each)
 
 
@@ -125,23 +125,23 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
         B, A = det_j2(geometry, centre, np.array([math.pi, math.pi / 2.0])).tolist()
         angle = math.atan2(B, A)
         return tuple(sorted((wrapped(angle), wrapped(angle + math.pi))))
-    found = [*of_j1]
+    angles = [*of_j1]
     for low, high in zip(of_j1, [*of_j1[1:], of_j1[0] + 2.0 * math.pi], strict=True):
         # det J2 is smooth between two singular angles of J1. Zeros crowd at the ends, so the samples do too.
         phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, 257)[1:-1])
         negative = det_j2(geometry, centre, phi) < 0.0
         changes = np.flatnonzero(negative[1:] != negative[:-1]).tolist()
-        found.extend(_bisect(geometry, centre, float(phi[k]), float(phi[k + 1])) for k in changes)
-    return tuple(sorted(wrapped(phi) for phi in found))
+        angles.extend(_bisect(geometry, centre, float(phi[k]), float(phi[k + 1])) for k in changes)
+    return tuple(sorted(wrapped(phi) for phi in angles))
 
 
 class Room(NamedTuple):
-    """Where a robot may be: the least and the greatest of x, y [m] and phi [rad], of sliders and cross slides [m]."""
+    """Allowed range of x, y [m] and phi [rad], and of sliders and cross slides [m]."""
 
     low: Sequence[float]
     high: Sequence[float]
     position: tuple[float, float] | tuple[tuple[float, float], ...]
-    """Of all sliders, or of each."""
+    """Travel of all sliders, or of each."""
     passive: tuple[float, float]
 
     def holds(self, travelled: Array, spare: float = 0.0) -> NDArray[np.bool]:
@@ -155,20 +155,20 @@ class Room(NamedTuple):
 def travels(geometry: Geometry, poses: ArrayLike) -> Array:
     """Return where sliders and cross slides are at poses (..., 3) of x, y [m], phi [rad]: (2, ..., 3) [m], by (11).
 
-    For who looks at a few poses and has no use for the compiled trirail.kinematics.robot.inverse. Not finite where a
-    cross slide is parallel to its rail.
+    For a few poses, without the compiled trirail.kinematics.robot.inverse. Not finite where a cross slide is parallel
+    to its rail.
     """
-    told = np.array(poses, dtype=np.float64)
+    solved = np.array(poses, dtype=np.float64)
     if geometry.correction is not None:
-        told += geometry.correction.at(told.reshape(-1, 3)).reshape(told.shape)
-    x, y, phi = np.moveaxis(told, -1, 0)
+        solved += geometry.correction.at(solved.reshape(-1, 3)).reshape(solved.shape)
+    x, y, phi = np.moveaxis(solved, -1, 0)
     return np.stack([leg.travels(x, y, phi) for leg in geometry.each], axis=-1)
 
 
 def other_kind(geometry: Geometry) -> Geometry:
     """Return the robot of the other mechanism with rails and cross slides in the same places at the pose (0, 0, 0).
 
-    What an owner has who mistakes one for the other. KinematicsError where that is singular there.
+    An owner who mistakes one mechanism for the other has this robot. KinematicsError where it is singular there.
     """
     sliders = travels(geometry, (0.0, 0.0, 0.0))[0].tolist()
     legs = []

@@ -1,4 +1,4 @@
-"""What every mechanism's leg can say of itself: the face behind which prp3 and ppr3 keep their own symbols.
+"""Interface of a leg, whatever its mechanism; prp3 and ppr3 keep their own symbols behind it.
 
 A leg has a driven slider on a rail of the base, a cross slide that is not driven, and a pivot. Mechanisms differ in the
 order of the last two. Lengths are in metres, angles in radians, a pose is x, y [m] and phi [rad].
@@ -24,7 +24,7 @@ THETA_1 = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # (3)
 
 
 class Crossing(NamedTuple):
-    """Where and how a leg's cross slide is drawn."""
+    """Position and direction of a leg's cross slide, for drawings."""
 
     point: tuple[float, float]
     """The point that the cross slide's travel is counted from: on the platform, in its frame, or on the carriage."""
@@ -40,11 +40,11 @@ class AnyLeg(Protocol):
     KIND: ClassVar[str]
     """The mechanism, as [geometry] kind names it."""
     PARAMETERS: ClassVar[tuple[str, ...]]
-    """What calibration can tell of a leg, five of them [m, rad]."""
+    """Names of the five parameters that calibration determines [m, rad]."""
     DOUBT: ClassVar[tuple[float, ...]]
     """Standard deviation of each beyond which drawings tell as much [m, rad]."""
     CROSS: ClassVar[str]
-    """What the cross slide runs along, in words."""
+    """Name of the cross slide's guide, for messages."""
 
     @property
     def anchor(self) -> tuple[float, float]:
@@ -58,7 +58,7 @@ class AnyLeg(Protocol):
 
     @property
     def home(self) -> float:
-        """Where on the rail the slider reads zero, from the anchor [m]."""
+        """Distance from the anchor to the slider's zero, along the rail [m]."""
         ...
 
     @property
@@ -73,7 +73,7 @@ class AnyLeg(Protocol):
 
     @property
     def arm(self) -> float:
-        """How far from G the platform is held [m]."""
+        """Distance from G to the leg [m]."""
         ...
 
     @property
@@ -134,5 +134,5 @@ def wrapped(angle: float) -> float:
 
 
 def across(point: tuple[float, float], angle: float, distance: float) -> tuple[float, float]:
-    """Return the point so far to the left of a line at this angle."""
+    """Return the point at a distance to the left of a line at this angle."""
     return point[0] - distance * math.sin(angle), point[1] + distance * math.cos(angle)

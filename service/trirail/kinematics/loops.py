@@ -1,4 +1,4 @@
-"""What the compiled mechanisms hand to the robot: a leg that is closed, and a leg's line before the platform turns."""
+"""Results of the compiled mechanisms: a closed leg, and a leg's line before the platform turns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which mechanism a packed leg is, and the calls that go to it: all that compiled code knows of mechanisms.
+"""Dispatch of compiled calls to the mechanism of a packed leg.
 
 The tag is in the array: the second joint of a 3-PRP leg turns, that of a 3-PPR leg slides.
 """
@@ -61,7 +61,7 @@ def demand(leg: Array, line: SlideLine, cosine: float, sine: float) -> tuple[Vec
 @compiled()
 def move(leg: Array, pose: Vector, velocity: Vector, acceleration: Vector) -> MovingLeg:
     """Solve a leg for the motion of its platform."""
-    if _turns_second(leg):  # asked once: what is merged of two mechanisms takes a tenth more time
+    if _turns_second(leg):  # decided once: merging the results of two branches costs a tenth more time
         closed = _close_prp3(leg, pose)
         rates, changes = joint_motion(leg, (closed.slider, pose[2], closed.passive), velocity, acceleration)
         return _moving(closed, rates[0], changes[0], rates[2], changes[2])

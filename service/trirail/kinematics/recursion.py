@@ -14,7 +14,7 @@ A leg is a float64 array of shape (n + 1, 13), made by `joints.serial_leg`, with
     columns 4 to 12  the constant part of q_{k,k-1}, row by row
 
 A platform moves in (x, y, phi): G in T_0 [m], the turning about z_0 [rad], and their time derivatives.
-What is singular or not finite comes out as an infinity or NaN; whoever closes a loop checks.
+A singular or non-finite result is an infinity or NaN; the loop closure checks for it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ __all__ = [
 
 
 class Link(NamedTuple):
-    """Where link T_k is."""
+    """Position and orientation of link T_k."""
 
     revolute: bool
     a: Matrix  # q_{k,k-1}
@@ -61,7 +61,7 @@ class Link(NamedTuple):
 
 
 class LinkMotion(NamedTuple):
-    """How link T_k moves relative to the base, in the components of T_k."""
+    """Motion of link T_k relative to the base, in the components of T_k."""
 
     omega: Vector  # omega_k0
     v: Vector  # v_k0, the velocity of A_k

@@ -80,15 +80,15 @@ def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = Non
     a number is not finite, if no pose closes the loops, or if that pose or `near` is singular.
     """
     sliders = np.asarray(sliders, dtype=np.float64)
-    given, start, pose = np.empty((3, _rows("sliders", sliders), 3))
-    given[:] = sliders
+    rows, start, pose = np.empty((3, _rows("sliders", sliders), 3))
+    rows[:] = sliders
     _fill(start, "near", HOME if near is None else near)
-    code = forward_batch(geometry.packed(), given, start, pose)
+    code = forward_batch(geometry.packed(), rows, start, pose)
     if code != 0:
         row, fault = divmod(code - 1, 5)
         if fault + 1 in {LOOPS_OPEN, J2_SINGULAR}:
-            _refuse_loops(geometry, given[row], start[row], _place(row, sliders))
-        _refuse_slider(geometry, given[row], pose[row], fault, _place(row, sliders))
+            _refuse_loops(geometry, rows[row], start[row], _place(row, sliders))
+        _refuse_slider(geometry, rows[row], pose[row], fault, _place(row, sliders))
     return pose.reshape(sliders.shape)
 
 
@@ -99,13 +99,13 @@ def jacobians(geometry: Geometry, pose: ArrayLike) -> tuple[Array, Array]:
     inverted here, so J2 may be singular. Raises KinematicsError as inverse does, where J1 is.
     """
     pose = np.asarray(pose, dtype=np.float64)
-    given = np.empty((_rows("pose", pose), 3))
-    given[:] = pose
-    j1, j2 = np.zeros((2, len(given), 3, 3))
-    code = jacobians_batch(geometry.packed(), given, j1, j2)
+    rows = np.empty((_rows("pose", pose), 3))
+    rows[:] = pose
+    j1, j2 = np.zeros((2, len(rows), 3, 3))
+    code = jacobians_batch(geometry.packed(), rows, j1, j2)
     if code != 0:
         row, leg = divmod(code - 1, 3)
-        _refuse_pose(geometry, given[row : row + 1], leg, _place(row, pose))
+        _refuse_pose(geometry, rows[row : row + 1], leg, _place(row, pose))
     return j1.reshape(*pose.shape, 3), j2.reshape(*pose.shape, 3)
 
 
@@ -177,15 +177,15 @@ def _refuse_loops(geometry: Geometry, sliders: Array, near: Array, place: str) -
     """Say by how much the loops fail to close, or that they do so singularly."""
     A, B, C = loop_equation(geometry.packed(), sliders)
     reach, needed = math.hypot(A, B), abs(C)
-    given = "{}sliders ({}, {}, {})".format(place, *(worded(slider, "m") for slider in sliders))
+    readings = "{}sliders ({}, {}, {})".format(place, *(worded(slider, "m") for slider in sliders))
     if needed > reach * (1.0 + ROUNDING):
         near_by, wanted = apart(reach, needed, "m")
-        message = f"{given}: no pose closes the loops, which reach {near_by} of the needed {wanted}"
+        message = f"{readings}: no pose closes the loops, which reach {near_by} of the needed {wanted}"
         raise KinematicsError(message, value=reach, limit=needed)
     det = math.sqrt(max((reach - needed) * (reach + needed), 0.0))
     limit = math.sqrt(ROUNDING) * reach
     if det > 2.0 * limit:
         x, y, phi = (worded(value, unit) for value, unit in zip(near.tolist(), ("m", "m", "rad"), strict=True))
-        message = f"{given}: near = ({x}, {y}, {phi}) is a singular pose"
+        message = f"{readings}: near = ({x}, {y}, {phi}) is a singular pose"
         raise KinematicsError(message, value=float(near[2]))
-    raise KinematicsError(f"{given}: singular, |det J2| is {worded(det, 'm')} there", value=det, limit=limit)
+    raise KinematicsError(f"{readings}: singular, |det J2| is {worded(det, 'm')} there", value=det, limit=limit)

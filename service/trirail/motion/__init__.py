@@ -1,1 +1,1 @@
-"""From a goal to a motion within every limit: paths, how their time runs, planning and what is checked before."""
+"""Motion planning: from a goal to a path in time that keeps every limit."""

@@ -1,7 +1,7 @@
-"""How a slider's backlash is taken up: a setpoint's share of its own, within what the limits keep for it.
+"""Share of the sliders' limits that is reserved for taking up backlash.
 
-Where a slider turns back, its motor goes the way of the backlash as well, by the quintic from rest to rest, in a time
-that depends on the widest backlash alone.
+When a slider reverses, its motor additionally crosses the backlash on a quintic from rest to rest. The duration depends
+on the widest backlash alone.
 """
 
 from __future__ import annotations
@@ -15,54 +15,59 @@ import msgspec
 from trirail.config import Limits, SliderLimits
 
 SHARE = 0.1
-"""Of the sliders' limits of velocity, acceleration and jerk, that taking up backlash may make use of."""
+"""Share of the sliders' velocity, acceleration and jerk limits that is reserved for backlash."""
 PEAKS = (15.0 / 8.0, 10.0 / math.sqrt(3.0), 60.0)
-"""Greatest derivatives of the quintic over one way in one unit of time: velocity, acceleration, jerk."""
+"""Greatest velocity, acceleration and jerk of the quintic over unit distance in unit time."""
 
 
 class TakeUp(NamedTuple):
-    """What the sliders' backlash takes."""
+    """Widths of the backlash, and the motion that takes it up."""
 
     widths: Sequence[float]
-    """Of the sliders A, B, C [m]."""
+    """Backlash of the sliders A, B, C [m]."""
     duration: float
-    """Of taking it up [s]; zero where there is none."""
+    """Duration of the take-up [s]; zero without backlash."""
     velocity: float
-    """The greatest, of any slider [m/s]."""
+    """Peak velocity of the slider with the widest backlash [m/s]."""
     acceleration: float
-    """[m/s²]."""
+    """Peak acceleration of that slider [m/s²]."""
     jerk: float
-    """[m/s³]."""
+    """Peak jerk of that slider [m/s³]."""
 
 
 NO_BACKLASH = TakeUp((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
 
 
 def reserve_for_backlash(widths: Sequence[float], slider: SliderLimits) -> TakeUp:
-    """Return how backlash of such widths [m] is taken up as fast as its share of the limits allows."""
-    most = max(widths)
+    """Return the fastest take-up of these widths [m] within the reserved share of the limits."""
+    widest = max(widths)
     limits = min(slider.velocities), min(slider.accelerations), min(slider.jerks)
     powers = (1, 2, 3)
     duration = max(
-        (peak * most / (SHARE * limit)) ** (1.0 / power)
+        (peak * widest / (SHARE * limit)) ** (1.0 / power)
         for peak, limit, power in zip(PEAKS, limits, powers, strict=True)
     )
     if duration == 0.0:
         return NO_BACKLASH
-    v, a, j = (peak * most / duration**power for peak, power in zip(PEAKS, powers, strict=True))
+    v, a, j = (peak * widest / duration**power for peak, power in zip(PEAKS, powers, strict=True))
     return TakeUp(widths, duration, v, a, j)
 
 
 def planned_limits(limits: Limits, widths: Sequence[float]) -> Limits:
-    """Return the limits with what taking up backlash may add left out: those for which motions are planned."""
+    """Return the limits for planning: the robot's limits less the share reserved for backlash.
+
+    The sliders' in-position windows grow by the backlash, because a position is uncertain within it.
+    """
     if not any(widths):
         return limits
-    slider, taken, half = limits.slider, reserve_for_backlash(widths, limits.slider), max(widths) / 2.0
+    slider, take_up, half = limits.slider, reserve_for_backlash(widths, limits.slider), max(widths) / 2.0
     less = msgspec.structs.replace(
         slider,
         position=tuple((low + half, high - half) for low, high in slider.positions),
-        velocity=tuple(each - taken.velocity for each in slider.velocities),
-        acceleration=tuple(each - taken.acceleration for each in slider.accelerations),
-        jerk=tuple(each - taken.jerk for each in slider.jerks),
+        velocity=tuple(each - take_up.velocity for each in slider.velocities),
+        acceleration=tuple(each - take_up.acceleration for each in slider.accelerations),
+        jerk=tuple(each - take_up.jerk for each in slider.jerks),
     )
-    return msgspec.structs.replace(limits, slider=less)
+    windows = limits.in_position
+    wider = tuple(window + width for window, width in zip(windows.sliders, widths, strict=True))
+    return msgspec.structs.replace(limits, slider=less, in_position=msgspec.structs.replace(windows, sliders=wider))

@@ -1,4 +1,4 @@
-"""A motion held against the limits of sliders and platform: how many times too fast, or where out of reach."""
+"""Feasibility of a path: its load on the limits of sliders and platform, and the time when it leaves the workspace."""
 
 from __future__ import annotations
 
@@ -14,86 +14,106 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse_into
-from trirail.motion.limits import COORDINATES, Bounds, Violation
+from trirail.motion.limits import COORDINATES, Bounds, Violation, standing_tolerance
 from trirail.motion.path_sampling import survey
-from trirail.motion.paths import Path, advance, constant, falls, reached, value
-from trirail.motion.runs import STILL
+from trirail.motion.paths import ROUNDING, Path, constant_law, evaluate, law_falls, passing_time, platform_at_law_time
+from trirail.motion.runs import ZERO_RATES
 
-PLANNED = (0.98, 0.98, 0.93)
-"""Share of the sliders' limits of velocity, acceleration and jerk that plans make use of: the rest is for what lies
-between the moments that are looked at, where jerk varies most."""
-LAWS = (0.99, 0.99, 0.98)
-"""Share of the same that changes of a path's rate make use of, on top of what the path itself does."""
-PLATFORM_PLANNED = (0.995, 0.98, 0.957)
-"""Share of the platform's limits of velocity, acceleration and jerk that plans make use of: between what is looked at
-its rates vary less than the sliders' do, and a change of rate adds no velocity."""
-PLATFORM_LAWS = (0.997, 0.99, 0.985)
-"""Share of the same that changes of a path's rate make use of: the room in which a robot at its limits can brake."""
-ROUNDED = 1.0 + 1e-6
-"""How many times more than its share a path or law may take, by rounding."""
+SLIDER_PLAN_SHARES = (0.98, 0.98, 0.93)
+"""Shares of the sliders' velocity, acceleration and jerk limits that plans use. The rest covers peaks between samples;
+jerk varies most there."""
+SLIDER_LAW_SHARES = (0.99, 0.99, 0.98)
+"""Shares of the same limits that a change of rate may use in total, on top of the path itself."""
+PLATFORM_PLAN_SHARES = (0.995, 0.98, 0.957)
+"""Shares of the platform's velocity, acceleration and jerk limits that plans use. They are higher than the sliders',
+because the platform's rates vary less between samples, and because a change of rate adds no velocity."""
+PLATFORM_LAW_SHARES = (0.997, 0.99, 0.985)
+"""Shares of the same limits that a change of rate may use: the margin in which a robot at its limits can brake."""
+ROUNDING_FACTOR = 1.0 + 1e-6
+"""Factor by which rounding may exceed a share."""
 SUBJECTS = ("a slider", *(f"the platform's {name}" for name in (*COORDINATES, "centre in x", "centre in y")))
-"""What the rows of Sampled.worst are of. The centre has its own where a path is that of another point: limits hold for
-both."""
-GAP = 0.005
-"""Between moments at which a path is looked at, besides its knots [s]: where its rate changes as well, an acceleration
-between two moments was once 1.4 % more than at either, 20 ms apart."""
-FEWEST, MOST = 16, 64
-"""Such moments, however short or long the path."""
-KNOTS_A_PART = 48
-"""Knots of a path that is planned which are looked at together: each part has at least FEWEST moments of its own."""
-POWERS = 1.0 / np.arange(1.0, 4.0)
-LONGEST = 600.0
-"""No path is looked at for longer [s]."""
+"""Subjects of the rows of SampleResult.worst. The centre has rows of its own for a path of another point, because the
+limits hold for both points."""
+SAMPLE_INTERVAL_S = 0.005
+"""Interval between samples of a path, in addition to its knots. With samples 20 ms apart, an acceleration between two
+of them was once 1.4 % above both while the rate changed as well."""
+MIN_SAMPLES, MAX_SAMPLES = 16, 64
+"""Bounds on the number of these samples, for a short and a long path."""
+KNOTS_PER_PART = 48
+"""Knots of a planned path that are sampled together; each part has at least MIN_SAMPLES samples."""
+SLOWDOWN_EXPONENTS = 1.0 / np.arange(1.0, 4.0)
+"""Exponents that turn excess velocity, acceleration and jerk into a factor of time."""
+MAX_SAMPLED_S = 600.0
+"""Longest part of a path that one call samples."""
 
 
-class Sampled(NamedTuple):
-    """What was found along a path."""
+class SampleResult(NamedTuple):
+    """Load of a path on the limits, and the time at which it leaves the workspace."""
 
     worst: Array
-    """Velocity, acceleration and jerk (6, 3) of SUBJECTS, as shares of what plans use."""
+    """Greatest velocity, acceleration and jerk (6, 3) of SUBJECTS, as shares of the limits that plans use."""
     within_limits: bool
-    """Whether sliders and platform can bear it, with what is kept for changes of rate, and its time never falls."""
+    """Whether the motion stays within the limits for changes of rate, and its time never falls."""
     leaves_at: float
-    """When it is out of reach [s]; not a number where it never is."""
+    """Time at which it leaves the workspace [s]; NaN if it never does."""
 
     @property
-    def excess(self) -> float:
-        """How many times too fast it is."""
-        return excess(self.worst)
+    def slowdown_factor(self) -> float:
+        """Factor by which it must be slowed to fit; at most 1 if it fits."""
+        return slowdown_factor(self.worst)
 
     @property
     def fits(self) -> bool:
-        """Whether a path can be planned so."""
-        return math.isnan(self.leaves_at) and self.excess <= 1.0
+        """Whether the path keeps the limits of plans and stays in the workspace."""
+        return math.isnan(self.leaves_at) and self.slowdown_factor <= 1.0
 
 
-def excess(worst: Array) -> float:
-    """Return how many times too fast a motion is, from its shares of the limits.
+def slowdown_factor(worst: Array) -> float:
+    """Return the factor by which a motion must be slowed to fit, from its shares (…, 3) of the limits.
 
-    The same path k times slower has k times less velocity, k² less acceleration and k³ less jerk.
+    The same path k times slower has 1/k of the velocity, 1/k² of the acceleration and 1/k³ of the jerk.
     """
-    return float((worst**POWERS).max())
+    return float((worst**SLOWDOWN_EXPONENTS).max())
 
 
-def fastest(worst: Array) -> str:
-    """Name what a motion is too fast for."""
-    return SUBJECTS[int((worst**POWERS).max(axis=1).argmax())]
+def most_exceeded(worst: Array) -> str:
+    """Return the name of the subject that requires the greatest slowdown."""
+    return SUBJECTS[int((worst**SLOWDOWN_EXPONENTS).max(axis=1).argmax())]
 
 
 def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list[tuple[float, float]]:
-    """Return times of a law between which a path is looked at part by part, each with at most so many of its knots."""
+    """Return the start and end of parts of a law's time [s], each with at most `knots` of the path's knots."""
     at = np.zeros((3, 1))
-    value(law.knots, law.pieces, first, at)
+    evaluate(law.knots, law.pieces, first, at)
     begin = int(np.searchsorted(path.knots, at[0, 0], side="right"))
-    value(law.knots, law.pieces, until, at)
+    evaluate(law.knots, law.pieces, until, at)
     end = int(np.searchsorted(path.knots, at[0, 0]))
     between = path.knots[begin + knots - 1 : end : knots].tolist()
-    times = [first, *(reached(law.knots, law.pieces, s, until) for s in between), until]
+    times = [first, *(passing_time(law.knots, law.pieces, s, until) for s in between), until]
     return list(pairwise(times))
 
 
+def _positions(motion: Array, rows: Array) -> Array:
+    """Return the nine limited positions: x, y, phi, the sliders and the cross slides."""
+    return np.concatenate([motion[0], rows[0], rows[3]])
+
+
 class Checker:
-    """Looks at paths of one robot."""
+    """Feasibility checks for the paths of one robot.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The robot as built.
+    limits : Limits
+        Limits for planning, as of backlash_reserve.planned_limits.
+    bounds : Bounds
+        The same limits, for messages.
+    period : float
+        Cycle time of the loop [s].
+    beat : Callable[[], None]
+        Sign of life, called once per sampled path.
+    """
 
     def __init__(
         self,
@@ -110,97 +130,123 @@ class Checker:
         most = sliders.max(axis=1)
         self._shares = most[:, None] / sliders
         each = np.array([most, x, y, phi, x, y])
-        planned = each * [PLANNED, *[PLATFORM_PLANNED] * 5]
+        planned = each * [SLIDER_PLAN_SHARES, *[PLATFORM_PLAN_SHARES] * 5]
         self.slider_limits = planned[0]
-        """Velocity, acceleration and jerk that plans make use of, of the slider that may have most."""
+        """Velocity, acceleration and jerk (3,) that plans use, of the slider with the highest limits."""
         self.each_slider_limits = self.slider_limits[:, None] / self._shares
-        """Likewise of each slider (3, 3)."""
+        """Limits that plans use for each slider: rows velocity, acceleration, jerk (3, 3)."""
         self.platform_limits = planned[1:4]
-        """Likewise of the platform in x, y and phi (3, 3)."""
+        """Limits that plans use for the platform: rows x, y, phi (3, 3)."""
         self.centre_limits = planned[4:]
-        """Likewise of the platform's centre in x and y, on a path of another point (2, 3)."""
-        self.law_limits = each[1:4] * PLATFORM_LAWS
-        """What changes of rate make use of, of the platform (3, 3)."""
-        self._planned = planned * ROUNDED
-        self._laws = each * [LAWS, *[PLATFORM_LAWS] * 5] / planned
+        """Limits that plans use for the platform's centre in x and y on a path of another point (2, 3)."""
+        self.law_limits = each[1:4] * PLATFORM_LAW_SHARES
+        """Limits that changes of rate use for the platform: rows x, y, phi (3, 3)."""
+        self._planned = planned * ROUNDING_FACTOR
+        self._laws = each * [SLIDER_LAW_SHARES, *[PLATFORM_LAW_SHARES] * 5] / planned
         self._legs = geometry.packed()
         self._bounds = bounds
         self._period = period
         self._box = np.array([platform.x, platform.y, platform.phi, *slider.positions, *[slider.passive] * 3]).T.copy()
+        self._tolerance = standing_tolerance(limits, geometry.arm)
 
-    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Sampled:
-        """Sample a path under a law from one time of the law to another [s], from near a pose on.
+    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
+        """Sample a path under a law from one time of the law to another [s].
 
-        It gives a sign of life: each loop of the planner's looks at a path in each of its turns.
+        `pose` is on the branch of the first sample. Each call gives a sign of life: every loop of the planner samples a
+        path in each iteration.
         """
         self._beat()
-        until = max(first, min(until, first + LONGEST))
-        # A path from standstill may begin with an acceleration: the step into it counts, as the one at the end does.
+        until = max(first, min(until, first + MAX_SAMPLED_S))
+        # A path from standstill may begin with an acceleration: the step into it counts, like the step at the end.
         if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():
             first = -self._period
-        even = min(max(FEWEST, int((until - first) / GAP)), MOST)
+        even = min(max(MIN_SAMPLES, int((until - first) / SAMPLE_INTERVAL_S)), MAX_SAMPLES)
         worst, start = np.zeros((len(SUBJECTS), 3)), np.array(pose, dtype=np.float64)
         leaves_at = survey(
-            self._legs, *path, *law[:2], first, until, even, self._period, start, self._box, self._shares, worst
+            self._legs,
+            *path,
+            *law[:2],
+            first,
+            until,
+            even,
+            self._period,
+            start,
+            self._box,
+            self._tolerance,
+            self._shares,
+            worst,
         )
         worst /= self._planned
-        within_limits = math.isnan(leaves_at) and self.bears(worst) and not falls(*law[:2])
-        return Sampled(worst, within_limits, leaves_at)
+        within_limits = math.isnan(leaves_at) and self.keeps_limits(worst) and not law_falls(*law[:2])
+        return SampleResult(worst, within_limits, leaves_at)
 
-    def bears(self, worst: Array) -> bool:
-        """Whether sliders and platform can bear a motion of such shares, with what is kept for changes of rate."""
+    def keeps_limits(self, worst: Array) -> bool:
+        """Return whether shares (6, 3) of plan limits stay within the limits for changes of rate."""
         return bool((worst <= self._laws).all())
 
-    def whole(self, path: Path, pose: Sequence[float]) -> Array:
-        """Return Sampled.worst of a whole path. Raises RefusedError where it leaves the workspace."""
-        law, worst = constant(1.0), np.zeros((len(SUBJECTS), 3))
-        for first, until in parts(path, law, 0.0, path.duration, KNOTS_A_PART):
-            found = self.sample(path, law, first, until, pose)
-            if not math.isnan(found.leaves_at):
-                raise self.refusal(path, found.leaves_at, pose)
-            np.maximum(worst, found.worst, out=worst)
+    def worst_shares(self, path: Path, pose: Sequence[float]) -> Array:
+        """Return SampleResult.worst of a whole path.
+
+        Raises
+        ------
+        RefusedError
+            The path leaves the workspace.
+        """
+        law, worst = constant_law(1.0), np.zeros((len(SUBJECTS), 3))
+        for first, until in parts(path, law, 0.0, path.duration, KNOTS_PER_PART):
+            result = self.sample(path, law, first, until, pose)
+            if not math.isnan(result.leaves_at):
+                raise self.refusal(path, result.leaves_at, pose)
+            np.maximum(worst, result.worst, out=worst)
         return worst
 
     def refusal(self, path: Path, time: float, pose: Sequence[float]) -> RefusedError:
-        """Say what is out of reach at a time along a path, and where on it that is."""
+        """Return the refusal of a path that leaves the workspace at a time along it [s]."""
         where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
         rows = self._rows(path, time, pose)
         if rows is None:
             return RefusedError(RefusalCode.SINGULAR, f"{where}: the robot is singular there")
-        violation = self._beyond(*rows)
+        violation = self._farther_out(path, rows, pose)
         if violation is None:
             return RefusedError(RefusalCode.OUT_OF_WORKSPACE, where)
         return RefusedError(
             RefusalCode.OUT_OF_WORKSPACE,
             f"{where}: {violation}",
-            slider=violation.what if violation.what in LEGS else None,
+            slider=violation.axis if violation.axis in LEGS else None,
             value=violation.value,
             limit=violation.limit,
         )
 
     def bound(self, path: Path, time: float, pose: Sequence[float]) -> str:
-        """Name the limit that a path meets at a time along it, where it is out of reach."""
+        """Return the name of the limit at which a path leaves the workspace, at a time along it [s]."""
         rows = self._rows(path, time, pose)
-        violation = self._beyond(*rows) if rows is not None else None
+        violation = self._farther_out(path, rows, pose) if rows is not None else None
         return violation.bound if violation is not None else "the workspace"
 
-    def stands_beyond(self, pose: Sequence[float]) -> str | None:
-        """Name the limit beyond which the robot would be at a pose; None where it can stand there."""
-        motion, rows = np.array((pose, STILL, STILL)), np.zeros((6, 3))
+    def exceeded_bound(self, pose: Sequence[float]) -> str | None:
+        """Return the name of the limit that a pose exceeds; None if the robot can stand there."""
+        motion, rows = np.array((pose, ZERO_RATES, ZERO_RATES)), np.zeros((6, 3))
         if inverse_into(self._legs, motion, rows):
             return "the workspace"
-        violation = self._beyond(motion, rows)
+        violation = self._violation(_positions(motion, rows))
         return violation.bound if violation is not None else None
 
     def _rows(self, path: Path, time: float, pose: Sequence[float]) -> tuple[Array, Array] | None:
-        """Return the platform's motion and the sliders' at a time along a path; None where the robot is singular."""
-        rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant(1.0)
+        """Return the platform's motion (3, 3) and the sliders' rows (6, 3) at a time along a path; None if singular."""
+        rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant_law(1.0)
         motion = np.zeros((3, 3))
-        if advance(self._legs, *path, *law[:2], time, near, motion) or inverse_into(self._legs, motion, rows):
+        if platform_at_law_time(self._legs, *path, *law[:2], time, near, motion) or inverse_into(
+            self._legs, motion, rows
+        ):
             return None
         return motion, rows
 
-    def _beyond(self, motion: Array, rows: Array) -> Violation | None:
-        """Return which position is beyond its limit."""
-        still = rows[0].tolist(), STILL, STILL, rows[3].tolist()
-        return self._bounds.pose(motion[0].tolist()) or self._bounds.setpoint(still)
+    def _farther_out(self, path: Path, rows: tuple[Array, Array], pose: Sequence[float]) -> Violation | None:
+        """Return the first position that is beyond its limit and farther out than at the start of the path."""
+        begin = self._rows(path, 0.0, pose)
+        return self._violation(_positions(*rows), _positions(*begin) if begin is not None else None)
+
+    def _violation(self, positions: Array, begin: Array | None = None) -> Violation | None:
+        low, high = self._box if begin is None else (np.minimum(self._box[0], begin), np.maximum(self._box[1], begin))
+        beyond = np.flatnonzero((positions < low - ROUNDING) | (positions > high + ROUNDING))
+        return self._bounds.position_violation(int(beyond[0]), float(positions[beyond[0]])) if len(beyond) else None

@@ -1,4 +1,4 @@
-"""What is asked of each kind of goal to plan it: what it means, whether that can be, and the path that leads there."""
+"""Interface of goal kinds to the planner: resolve names and frames, check the request, plan the path."""
 
 from __future__ import annotations
 
@@ -11,32 +11,52 @@ from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goal_kind import GoalKind
 
 G = TypeVar("G", bound=GoalKind)
-Place = Callable[[Literal["commanded", "measured"]], Sequence[float]]
-"""The pose of the platform's centre from which a move begins."""
+PoseSource = Callable[[Literal["commanded", "measured"]], Sequence[float]]
+"""Source of the pose of the platform's centre from which a relative move counts."""
 
 
 class GoalMotion(Generic[G]):
-    """How one robot plans the goals of one kind; each has its own, in trirail.motion.kinds."""
+    """Planning of the goals of one kind; subclasses are in trirail.motion.kinds."""
 
     kind: ClassVar[type[GoalKind]]
     examples: ClassVar[tuple[GoalKind, ...]] = ()
-    """Planned from the middle of the workspace before the first goal comes: what runs for the first time is slow."""
+    """Goals that the warm-up plans from the middle of the workspace, because the first plan of a kind is slow."""
 
     def __init__(self, planner: PathPlanner) -> None:
         self._planner = planner
 
     @staticmethod
-    def meant(goal: G, frames: NamedFrames, place: Place) -> GoalKind:
-        """Return the goal that is planned, in the base frame. Raises RefusedError for names that there are not."""
-        del frames, place
+    def resolve(goal: G, frames: NamedFrames, source: PoseSource) -> GoalKind:
+        """Return the goal in the base frame, with names replaced by their values.
+
+        Raises
+        ------
+        RefusedError
+            A tool, frame or pose has an unknown name.
+        """
+        del frames, source
         return goal
 
     def check(self, goal: G) -> None:
-        """Raise RefusedError for what can be reached from nowhere."""
+        """Raise RefusedError if the goal is impossible from any start."""
 
     def plan(self, goal: G, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan from a state of motion, in which a path begins that is run at a rate, at the loop's time `begins` [s].
+        """Return a path to the goal.
 
-        Raises RefusedError where there is no path.
+        Parameters
+        ----------
+        goal : G
+            A resolved goal.
+        start : MotionState
+            State of the platform's centre at the start of the path.
+        rate : float
+            Rate at which time runs along the path.
+        begins : float
+            Loop time at which the path begins [s].
+
+        Raises
+        ------
+        RefusedError
+            No path leads to the goal.
         """
-        raise NotImplementedError(f"{type(goal).__name__} is planned in other words")
+        raise NotImplementedError(f"{type(goal).__name__} is resolved to another kind of goal")

@@ -1,4 +1,4 @@
-"""From a goal of any kind to the motion that leads there from the present one."""
+"""Planner of goals of any kind, from the motion under way."""
 
 from __future__ import annotations
 
@@ -6,72 +6,80 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from msgspec import structs
+
 from trirail.config import Limits
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry
 from trirail.motion import kinds
 from trirail.motion.feasibility import Checker
-from trirail.motion.goal_motion import GoalMotion, Place
+from trirail.motion.goal_motion import GoalMotion, PoseSource
 from trirail.motion.limits import Bounds
 from trirail.motion.path_planner import TOO_FAST_IN_MOTION, PathPlanner, Plan
-from trirail.motion.paths import HALVINGS, Path, constant
-from trirail.motion.runs import MotionState, Run, nominal, rest, stretched
+from trirail.motion.paths import BISECTIONS, Path, constant_law
+from trirail.motion.runs import MotionState, Run, nominal_motion, rest, stretched
 from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import TimeScaling
 from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.goal_kind import import_all
 from trirail.wire.goals import Goal
+from trirail.wire.messages import GoalReply
 
-SLOWEST = 0.05
-"""Where the time along a path runs slower than this, a new goal is planned from a standstill."""
-STOPS = tuple(0.5**k for k in range(5))
-"""Shares of the quickest stop that are tried when a goal needs one first."""
-SLOWER = 1.3
-"""How much slower a path is made that an override makes too fast."""
-SLOWED = 12
-"""How often: 1.3 to the power of 12 is 23 times."""
+MIN_REPLAN_RATE = 0.05
+"""Lowest rate at which a new goal is planned from motion; below it, from a standstill."""
+STOP_SHARES = tuple(0.5**k for k in range(5))
+"""Shares of the quickest stop that are tried if the robot must stop before a goal."""
+SLOWDOWN_STEP = 1.3
+"""Factor by which a path is slowed if an override makes it too fast."""
+MAX_SLOWDOWNS = 12
+"""Number of such slowdowns: 1.3 to the power of 12 is a factor of 23."""
 
 import_all(kinds)
 MOTIONS: dict[type[Goal], type[GoalMotion[Any]]] = {made.kind: made for made in GoalMotion.__subclasses__()}
-"""How goals are planned, by kind."""
+"""Planning of each kind of goal."""
 
 
-def meant(goal: Goal, frames: NamedFrames, place: Place) -> Goal:
-    """Return the goal that the planner is to be asked for. Raises RefusedError for a name that there is not."""
-    return MOTIONS[type(goal)].meant(goal, frames, place)
+def resolve_goal(goal: Goal, frames: NamedFrames, source: PoseSource) -> Goal:
+    """Return the goal in the base frame, as the planner expects it. Raises RefusedError for an unknown name."""
+    return MOTIONS[type(goal)].resolve(goal, frames, source)
 
 
 class PlannedMotion(NamedTuple):
-    """How a goal is to be reached."""
+    """Planned motion to a goal."""
 
     run: Run
-    duration: float
-    """From when it begins to arrival [s]."""
-    slowed: float = 1.0
-    """How many times slower than was asked for, for the limits' sake."""
-    stops_first: bool = False
-    """Whether the robot stops on its old path before."""
+    reply: GoalReply
+    """Reply to the goal, without its id."""
+    bound: str | None
+    """Limit before which a jog brakes, or beyond which a track's target is."""
     stop: Path | None = None
-    """The law of that stop; None where the law that the motion under way has is the one to stand by."""
+    """Law of that stop; None if the present law already leads to a standstill."""
     first: int | None = None
-    """In which cycle of the schedule it begins; None where the robot stands, and it may begin at any time."""
-    bound: str | None = None
-    """The limit before which a jog comes to rest, or beyond which a track's target is."""
-    lag: float | None = None
-    """How far a point of the platform is at most from where a track's target has it, when it begins [m]."""
+    """Cycle of the schedule in which it begins; None if the robot stands, so that it may begin in any cycle."""
+
+    @property
+    def duration(self) -> float:
+        """Time from the start of the motion to arrival, infinite if it never arrives [s]."""
+        return math.inf if self.reply.duration is None else self.reply.duration
 
 
 class Extension(NamedTuple):
-    """How a goal is to be reached when the ones before it are."""
+    """Planned path of a goal that follows the goals before it."""
 
     s: float
-    """From which time along their path [s]."""
+    """Time along their path at which it begins [s]."""
     path: Path
-    slowed: float
+    reply: GoalReply
+    """Reply to the goal, without its id and duration."""
+
+    @classmethod
+    def from_plan(cls, s: float, plan: Plan) -> Extension:
+        """Return a planned path as an extension that begins at a time along the path before it [s]."""
+        return cls(s, plan.path, structs.replace(plan.reply, queued=True))
 
 
 class GoalPlanner:
-    """Plans the goals of one robot."""
+    """Planner of the goals of one robot; `beat` is called for each path that is sampled."""
 
     def __init__(
         self, geometry: Geometry, limits: Limits, period: float, beat: Callable[[], None] = lambda: None
@@ -85,25 +93,41 @@ class GoalPlanner:
         self.time_scaling = TimeScaling(geometry, checker, period)
 
     def plan(self, goal: Goal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
-        """Return the motion to a goal, its time to run at `rate`, from the commanded state of the motion under way.
+        """Return the motion to a goal from the commanded state.
 
-        Where the robot moves, it begins so many cycles later: as asked for, or with a lower speed or after a stop on
-        the old path, whichever arrives sooner. Raises RefusedError.
+        If the robot moves, the new motion begins `lead` cycles later. If it does not fit as requested, the planner
+        takes the sooner of two: a motion at lower speed, or one after a stop on the old path.
+
+        Parameters
+        ----------
+        goal : Goal
+            A resolved goal.
+        schedule : Schedule
+            The motion under way.
+        rate : float
+            Rate at which time runs along the new path.
+        lead : int
+            Cycles until the new motion may begin.
+
+        Raises
+        ------
+        RefusedError
+            No motion leads to the goal.
         """
         self._motions[type(goal)].check(goal)
-        moves = bool(schedule.runs) and not (schedule.commanded.at_rest and schedule.runs[0].stands)
+        moves = bool(schedule.runs) and not (schedule.commanded.at_rest and schedule.runs[0].at_rest)
         later = schedule.ahead(lead) if moves else schedule
         first = later.cycle if moves else None
         sooner: PlannedMotion | None = None
         try:
-            sooner = self._set_out(goal, later, rate)
+            sooner = self._plan_from_motion(goal, later, rate)
         except RefusedError as error:
             if later.commanded.at_rest or error.code is RefusalCode.WRONG_START:
                 raise
-        if sooner is not None and (later.commanded.at_rest or sooner.slowed <= 1.0):
+        if sooner is not None and (later.commanded.at_rest or sooner.reply.slowed <= 1.0):
             return sooner._replace(first=first)
         try:
-            stopping = self._stop_first(goal, later, rate)
+            stopping = self._plan_after_stop(goal, later, rate)
         except RefusedError:
             if sooner is None:
                 raise
@@ -112,91 +136,96 @@ class GoalPlanner:
         return best._replace(first=first)
 
     def append(self, goal: Goal, run: Run, blend: float, lead: int) -> Extension:
-        """Return the way to a goal from within `blend` [m] of where a run's path ends.
+        """Return the path of a goal that follows a run, from within `blend` [m] of the end of its path.
 
-        It begins in motion where the sliders can do that, else at rest at the end. Raises RefusedError.
+        The path begins in motion if the limits allow it, else at rest at the end. Raises RefusedError.
         """
         self._motions[type(goal)].check(goal)
-        at, end = self._seam(run, blend, lead), run.path.duration
+        at, end = self._blend_start(run, blend, lead), run.path.duration
         if at < end:
             try:
-                plan = self._plan(goal, nominal(run.path, at), 1.0, 0.0)
+                plan = self._plan(goal, nominal_motion(run.path, at), 1.0, 0.0)
                 if self._fits(run, at, plan.path):
-                    return Extension(at, plan.path, plan.slowed)
+                    return Extension.from_plan(at, plan)
             except RefusedError:
                 pass
-        plan = self._plan(goal, rest(nominal(run.path, end).pose), 1.0, 0.0)
-        for _ in range(SLOWED):
+        plan = self._plan(goal, rest(nominal_motion(run.path, end).pose), 1.0, 0.0)
+        for _ in range(MAX_SLOWDOWNS):
             if self._fits(run, end, plan.path):
-                return Extension(end, plan.path, plan.slowed)
-            # It is faster than at full speed, by an override.
-            plan = Plan(stretched(plan.path, SLOWER), SLOWER * plan.slowed)
+                return Extension.from_plan(end, plan)
+            # An override runs the path faster than it was planned.
+            slower = structs.replace(plan.reply, slowed=SLOWDOWN_STEP * plan.reply.slowed)
+            plan = Plan(stretched(plan.path, SLOWDOWN_STEP), slower)
         raise RefusedError(
             RefusalCode.NO_PLAN, "no motion follows at this override: send the goal again when it is lower"
         )
 
-    def _set_out(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
-        """Plan from the commanded motion."""
+    def _plan_from_motion(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+        """Plan from the commanded state, without a stop."""
         start, begins = schedule.commanded, schedule.cycle * self._period
         if start.at_rest:
             plan = self._plan(goal, start, rate, begins)
-            run = self.time_scaling.begin(plan.path, rate, start.pose)
-            return PlannedMotion(run, run.ends if rate else math.inf, plan.slowed, bound=plan.bound, lag=plan.lag)
-        if schedule.runs[0].at.rate < SLOWEST:
+            run = self.time_scaling.start_run(plan.path, rate, start.pose)
+            return PlannedMotion(run, plan.reply.with_duration(run.end_time if rate else math.inf), plan.bound)
+        if schedule.runs[0].law_state.rate < MIN_REPLAN_RATE:
             raise TOO_FAST_IN_MOTION
-        for now in (schedule.runs[0].at.rate, 1.0):  # an override that the old path could take the new one may not
-            # The new path's time goes on at the rate of the old one's: in it, the motion is that much slower.
+        for now in (
+            schedule.runs[0].law_state.rate,
+            1.0,
+        ):  # an override that the old path could take the new one may not
+            # The new path's time runs at the rate of the old one, so that in its own time the motion is slower.
             velocity = [value / now for value in start.velocity]
             acceleration = [value / now**2 for value in start.acceleration]
             plan = self._plan(goal, MotionState(start.pose, velocity, acceleration), now, begins)
-            run = self.time_scaling.begin(plan.path, now, start.pose)
+            run = self.time_scaling.start_run(plan.path, now, start.pose)
             if run.target >= now:
-                final = self.time_scaling.possible(plan.path, rate, start.pose)
+                final = self.time_scaling.possible_rate(plan.path, rate, start.pose)
                 duration = plan.path.duration / final if final else math.inf
-                return PlannedMotion(run, duration, plan.slowed, bound=plan.bound, lag=plan.lag)
+                return PlannedMotion(run, plan.reply.with_duration(duration), plan.bound)
         raise TOO_FAST_IN_MOTION
 
-    def _stop_first(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
-        """Plan from where the motion under way can be stopped."""
+    def _plan_after_stop(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
+        """Plan from the pose at which the motion under way can stop."""
         stop, law = schedule.runs[0].copy(), None
         if stop.target != 0.0:
-            law = self.time_scaling.stop(stop, schedule.commanded.pose, STOPS)
-            if law is not None:  # else it goes on to the end of its path
+            law = self.time_scaling.stop(stop, schedule.commanded.pose, STOP_SHARES)
+            if law is not None:  # without a law it runs to the end of its path
                 stop.change_law(law, 0.0)
-        left = stop.ends - stop.time
+        left = stop.end_time - stop.time
         end = stop.state(left, schedule.commanded.pose).pose
         plan = self._plan(goal, rest(end), rate, schedule.cycle * self._period + left)
-        run = self.time_scaling.begin(plan.path, rate, end)
-        duration = left + run.ends if rate else math.inf
-        return PlannedMotion(run, duration, plan.slowed, stops_first=True, stop=law, bound=plan.bound, lag=plan.lag)
+        run = self.time_scaling.start_run(plan.path, rate, end)
+        duration = left + run.end_time if rate else math.inf
+        reply = structs.replace(plan.reply.with_duration(duration), stops_first=True)
+        return PlannedMotion(run, reply, plan.bound, stop=law)
 
     def _plan(self, goal: Goal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan from a state of motion, in which a path begins that is run at a rate, at a time of the loop's [s]."""
+        """Return a path to the goal: GoalMotion.plan."""
         return self._motions[type(goal)].plan(goal, start, rate, begins)
 
-    def _seam(self, run: Run, blend: float, lead: int) -> float:
-        """Return the time along a run's path from which on it is within `blend` of its end [s], and not yet passed."""
+    def _blend_start(self, run: Run, blend: float, lead: int) -> float:
+        """Return the time along a run's path [s] at which it is within `blend` [m] of its end, after `lead` cycles."""
         end = run.path.duration
-        target = nominal(run.path, end).pose
-        # Strictly ahead, also where time along the path stands still: at override 0 it may be told to run at any time.
-        soonest = run.at.s + lead * self._period * max(run.at.rate, run.target, 1.0)
+        target = nominal_motion(run.path, end).pose
+        # Strictly ahead even at override 0, because the override may rise at any time.
+        soonest = run.law_state.s + lead * self._period * max(run.law_state.rate, run.target, 1.0)
         low, high = max(soonest, run.seams[-1].s if run.seams else 0.0), end
-        if low >= end or self._planner.nearness(nominal(run.path, low).pose, target) <= blend:
+        if low >= end or self._planner.distance(nominal_motion(run.path, low).pose, target) <= blend:
             return min(low, end)
-        for _ in range(HALVINGS // 2):
+        for _ in range(BISECTIONS // 2):
             middle = (low + high) / 2.0
-            if self._planner.nearness(nominal(run.path, middle).pose, target) > blend:
+            if self._planner.distance(nominal_motion(run.path, middle).pose, target) > blend:
                 low = middle
             else:
                 high = middle
         return high
 
     def _fits(self, run: Run, s: float, path: Path) -> bool:
-        """Whether sliders and platform can take a path behind a run's, by the run's law."""
+        """Return whether a path appended to a run stays within the limits under the run's law."""
         longer = run.copy()
         longer.append(s, path)
-        law, first = longer.law, longer.reaches(s)
-        last = longer.reaches(longer.path.duration)
-        if not math.isfinite(last):  # it is to stop before: it will go on at full speed at most, or be looked at anew
-            law, first, last = constant(1.0), s, longer.path.duration
-        return self._checker.sample(longer.path, law, first, last, nominal(run.path, s).pose).within_limits
+        law, first = longer.law, longer.arrival_at(s)
+        last = longer.arrival_at(longer.path.duration)
+        if not math.isfinite(last):  # it stops before; later it runs at full speed at most, or is sampled again
+            law, first, last = constant_law(1.0), s, longer.path.duration
+        return self._checker.sample(longer.path, law, first, last, nominal_motion(run.path, s).pose).within_limits

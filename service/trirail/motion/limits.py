@@ -1,8 +1,10 @@
-"""What may never be exceeded: bounds for paths before they start and for every setpoint before it is sent."""
+"""Limits of sliders and platform: checks of paths before they start and of every setpoint before it is sent."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -20,24 +22,40 @@ from trirail.quantities import beyond, worded
 COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 
-EDGE = 1e-6
-"""By so much may a setpoint be beyond a limit of position that its path was checked against [m, rad]."""
-EXCESS = 1e-3
-"""By that share may a setpoint exceed a limit of velocity, acceleration or jerk that its path was checked against, of
-a slider or the platform."""
+SETPOINT_TOLERANCE = 1e-6
+"""Distance that a setpoint may lie beyond a position limit that its path was checked against [m, rad]."""
+OUTWARD_ROUNDING = 1e-12
+"""Growth of a limit excess from one cycle to the next that counts as rounding [m, rad]."""
+MAX_RELATIVE_EXCESS = 1e-3
+"""Relative excess of a setpoint over the velocity, acceleration and jerk limits that its path was checked against."""
+
+
+class AllowedMotion(IntEnum):
+    """Platform motion that the mode allows; the last gate refuses a setpoint that exceeds it."""
+
+    ANY = 0
+    """Motion within the limits."""
+    BRAKING = 1
+    """Any motion until its law leads to a standstill; the limits may delay that law."""
+    BRAKED = 2
+    """A motion whose law leads to a standstill."""
+    NONE = 3
+    """A standstill; the sliders may take up backlash."""
+
 
 BOUNDS = np.dtype(
     [
-        ("rows", "f8", (4, 3, 3)),  # of position, velocity, acceleration, cross slide, each leg: low, high, slack
-        ("pose", "f8", (3, 2)),  # low and high of x, y, phi
-        ("edge", "f8"),  # slack of these
-        ("step", "f8", 3),  # how far each slider goes in a cycle at most [m]
+        ("rows", "f8", (4, 3, 3)),  # position, velocity, acceleration, cross slide; per leg: low, high, slack
+        ("pose", "f8", (3, 2)),  # x, y, phi: low, high
+        ("edge", "f8"),  # slack of the pose limits
+        ("step", "f8", 3),  # greatest travel of each slider in one cycle [m]
         ("slider_jerk", "f8", 3),
         ("platform", "f8", (3, 3)),  # velocity, acceleration and jerk of x, y, phi
         ("period", "f8"),
+        ("allowed", "u1"),  # an AllowedMotion
     ]
 )
-"""A robot's limits, as compiled code takes them [m, rad, s]."""
+"""Layout of a robot's limits for compiled code [m, rad, s]."""
 _CHECKS = (
     ("slider", "position", "m"),
     ("slider", "velocity", "m/s"),
@@ -50,33 +68,43 @@ _CHECKS = (
     ("platform", "acceleration", "/s²"),
     ("platform", "jerk", "/s³"),
 )
-"""What is checked, of what, and in which unit; of the platform, after that of the coordinate."""
-_POSE, _STEP, _JERK, _PLATFORM = 4, 5, 6, 7  # where in _CHECKS; the sliders' rows stand in front of them
+"""Subject, quantity and unit of each check; a unit of the platform is appended to that of the coordinate."""
+_PASSIVE, _POSE, _STEP, _JERK, _PLATFORM = 3, 4, 5, 6, 7  # indices of _CHECKS; 0 to 3 are the sliders' rows
 
 
 class Violation(NamedTuple):
-    """A bound that is exceeded."""
+    """Quantity that exceeds its limit."""
 
-    what: str
-    """The slider (A, B, C) or the platform's coordinate (x, y, phi)."""
+    axis: str
+    """Slider (A, B, C) or platform coordinate (x, y, phi)."""
     quantity: str
     value: float
     limit: float
     unit: str
     label: str = ""
-    """What people call the slider."""
+    """Label of the slider, from [geometry] labels."""
 
     def __str__(self) -> str:
         return beyond(f"{self.subject}: {self.quantity}", self.value, self.limit, self.unit)
 
     @property
     def subject(self) -> str:
-        """What is beyond its bound, in words."""
-        return f"slider {self.label or self.what}" if self.what in LEGS else f"platform {self.what}"
+        """Slider or platform coordinate, for messages."""
+        return f"{self.part} {self.name}"
+
+    @property
+    def part(self) -> str:
+        """Part of the robot that exceeds its limit: slider or platform."""
+        return "slider" if self.axis in LEGS else "platform"
+
+    @property
+    def name(self) -> str:
+        """Name of the slider or coordinate, for messages."""
+        return self.label or self.axis
 
     @property
     def bound(self) -> str:
-        """The bound alone, in words."""
+        """Quantity and its limit, for messages."""
         return f"{self.subject} ({self.quantity} {worded(self.limit, self.unit)})"
 
 
@@ -84,19 +112,19 @@ _BOUNDS, _ROWS, _ROW = from_dtype(BOUNDS)[::1], f8[:, ::1], f8[::1]
 
 
 @compiled()
-def _found(check: int, n: int, value: float, limit: float, found: Array) -> int:
-    """Note what is beyond its limit; return its code: 1 + 3 times the number of the check + the leg or coordinate."""
-    found[0], found[1] = value, limit
+def _store_violation(check: int, n: int, value: float, limit: float, violation: Array) -> int:
+    """Store value and limit; return the code of a violation: 1 + 3 * check + leg or coordinate."""
+    violation[0], violation[1] = value, limit
     return 1 + 3 * check + n
 
 
 @compiled()
-def _jerk(now: Array, before: Array, n: int, period: float) -> float:
-    """Return the least jerk that explains rows (position, velocity, acceleration) one cycle after others.
+def _least_jerk(now: Array, before: Array, n: int, period: float) -> float:
+    """Return the least jerk that explains two successive rows (position, velocity, acceleration).
 
-    A jerk j that may change at any moment, an acceleration that may begin or end anywhere in the cycle as large
-    as j makes it in a cycle T: between the two the acceleration changes by j T at most, the velocity differs by
-    j T² / 2 from what the mean acceleration gives, and the position by j T³ / 4 from what the mean velocity does.
+    The jerk may switch between ±j at any time within the cycle T. Then the acceleration changes by at most j T, the
+    velocity differs by at most j T² / 2 from the mean acceleration times T, and the position by at most j T³ / 4 from
+    the mean velocity times T.
     """
     half = period / 2.0
     p, v, a = now[0, n], now[1, n], now[2, n]
@@ -107,129 +135,226 @@ def _jerk(now: Array, before: Array, n: int, period: float) -> float:
     return max(by_acceleration, by_velocity, by_position)
 
 
-@compiled(i8(_BOUNDS, _ROWS, _ROW))
-def check_setpoint(bounds: NDArray[np.void], rows: Array, found: Array) -> int:
-    """Check solved sliders, as many of position, velocity, acceleration, cross slide as there are [m, s].
+@compiled()
+def _check_row(bounds: NDArray[np.void], rows: Array, row: int, violation: Array) -> int:
+    """Check one row of solved sliders."""
+    for n in range(3):
+        limits = bounds[0].rows[row, n]
+        low, high, slack = limits[0], limits[1], limits[2]
+        value = rows[row, n]
+        if not low - slack <= value <= high + slack:
+            return _store_violation(row, n, value, low if value < low else high, violation)
+    return 0
 
-    A value that is not a number is beyond every limit.
+
+@compiled(i8(_BOUNDS, _ROWS, _ROW))
+def check_setpoint(bounds: NDArray[np.void], rows: Array, violation: Array) -> int:
+    """Check rows of solved sliders: position, velocity, acceleration, cross slide, or the first of these [m, s].
+
+    NaN violates every limit. Returns 0, or a code for Bounds.violation.
     """
     for row in range(min(len(rows), 4)):
-        for n in range(3):
-            limits = bounds[0].rows[row, n]
-            low, high, slack = limits[0], limits[1], limits[2]
-            value = rows[row, n]
-            if not low - slack <= value <= high + slack:
-                return _found(row, n, value, low if value < low else high, found)
+        code = _check_row(bounds, rows, row, violation)
+        if code:
+            return code
+    return 0
+
+
+@compiled()
+def _check_rates(bounds: NDArray[np.void], rows: Array, violation: Array) -> int:
+    """Check velocities and accelerations of solved sliders."""
+    for row in (1, 2):
+        code = _check_row(bounds, rows, row, violation)
+        if code:
+            return code
     return 0
 
 
 @compiled(i8(_BOUNDS, _ROW, _ROW))
-def check_pose(bounds: NDArray[np.void], pose: Array, found: Array) -> int:
+def check_pose(bounds: NDArray[np.void], pose: Array, violation: Array) -> int:
     """Check a pose x, y [m], phi [rad] alone."""
     edge = bounds[0].edge
     for n in range(3):
         low, high = bounds[0].pose[n, 0], bounds[0].pose[n, 1]
         if not low - edge <= pose[n] <= high + edge:
-            return _found(_POSE, n, pose[n], low if pose[n] < low else high, found)
+            return _store_violation(_POSE, n, pose[n], low if pose[n] < low else high, violation)
     return 0
 
 
 @compiled()
-def _check_step(bounds: NDArray[np.void], rows: Array, before: Array, found: Array) -> int:
-    """Check solved sliders against those of the cycle before: how far they go, and with which jerk."""
+def _check_step(bounds: NDArray[np.void], rows: Array, before: Array, violation: Array) -> int:
+    """Check travel and jerk of the sliders since the previous cycle."""
     for n in range(3):
         step, most = rows[0, n] - before[0, n], bounds[0].step[n]
         if not abs(step) <= most:
-            return _found(_STEP, n, step, most, found)
+            return _store_violation(_STEP, n, step, most, violation)
     for n in range(3):
-        jerk, jerk_limit = _jerk(rows, before, n, bounds[0].period), bounds[0].slider_jerk[n]
-        if not jerk <= jerk_limit * (1.0 + EXCESS):
-            return _found(_JERK, n, jerk, jerk_limit, found)
+        jerk, jerk_limit = _least_jerk(rows, before, n, bounds[0].period), bounds[0].slider_jerk[n]
+        if not jerk <= jerk_limit * (1.0 + MAX_RELATIVE_EXCESS):
+            return _store_violation(_JERK, n, jerk, jerk_limit, violation)
     return 0
 
 
 @compiled()
-def _check_platform(bounds: NDArray[np.void], motion: Array, before: Array, found: Array) -> int:
-    """Check the platform's velocity and acceleration, and the jerk since the cycle before."""
+def _check_platform(bounds: NDArray[np.void], motion: Array, before: Array, violation: Array) -> int:
+    """Check the platform's velocity and acceleration, and its jerk since the previous cycle."""
     for n in range(3):
         limits = bounds[0].platform[n]
         for row in range(2):
             value = motion[1 + row, n]
-            if not abs(value) <= limits[row] * (1.0 + EXCESS):
-                return _found(_PLATFORM + row, n, value, math.copysign(limits[row], value), found)
-        jerk = _jerk(motion, before, n, bounds[0].period)
-        if not jerk <= limits[2] * (1.0 + EXCESS):
-            return _found(_PLATFORM + 2, n, jerk, limits[2], found)
+            if not abs(value) <= limits[row] * (1.0 + MAX_RELATIVE_EXCESS):
+                return _store_violation(_PLATFORM + row, n, value, math.copysign(limits[row], value), violation)
+        jerk = _least_jerk(motion, before, n, bounds[0].period)
+        if not jerk <= limits[2] * (1.0 + MAX_RELATIVE_EXCESS):
+            return _store_violation(_PLATFORM + 2, n, jerk, limits[2], violation)
+    return 0
+
+
+@compiled()
+def _check_positions(
+    bounds: NDArray[np.void], rows: Array, before: Array, pose: Array, pose_before: Array, violation: Array
+) -> int:
+    """Check that positions are within their limits, or no farther beyond them than in the previous cycle."""
+    for row in (0, 3):
+        for n in range(3):
+            limits = bounds[0].rows[row, n]
+            low, high, slack = limits[0], limits[1], limits[2]
+            value, last = rows[row, n], before[row, n]
+            if not min(low - slack, last - OUTWARD_ROUNDING) <= value <= max(high + slack, last + OUTWARD_ROUNDING):
+                return _store_violation(row, n, value, low if value < low else high, violation)
+    edge = bounds[0].edge
+    for n in range(3):
+        low, high = bounds[0].pose[n, 0], bounds[0].pose[n, 1]
+        if (
+            not min(low - edge, pose_before[n] - OUTWARD_ROUNDING)
+            <= pose[n]
+            <= max(high + edge, pose_before[n] + OUTWARD_ROUNDING)
+        ):
+            return _store_violation(_POSE, n, pose[n], low if pose[n] < low else high, violation)
     return 0
 
 
 @compiled(i8(_BOUNDS, _ROWS, _ROWS, _ROWS, _ROWS, _ROW))
 def gate(
-    bounds: NDArray[np.void], rows: Array, rows_before: Array, motion: Array, motion_before: Array, found: Array
+    bounds: NDArray[np.void], rows: Array, rows_before: Array, motion: Array, motion_before: Array, violation: Array
 ) -> int:
-    """Check solved sliders and the platform's motion against limits, and against those of the cycle before.
+    """Check sliders and platform against the limits and against the previous cycle.
 
-    `rows` as of check_setpoint, `motion` (3, 3) the rows pose, velocity, acceleration. Returns 0, or a code for
-    Bounds.violation; then `found` (2,) holds the value and its limit.
+    A position beyond its limit may return, but never move farther out.
+
+    Parameters
+    ----------
+    bounds : (1,) of BOUNDS
+        The robot's limits.
+    rows, rows_before : (4, 3)
+        Sliders, as of check_setpoint, now and in the previous cycle.
+    motion, motion_before : (3, 3)
+        Platform pose, velocity, acceleration, now and in the previous cycle.
+    violation : (2,)
+        Receives the value that violates its limit, and that limit.
+
+    Returns
+    -------
+    int
+        0, or a code for Bounds.violation.
     """
-    code = check_setpoint(bounds, rows, found)
+    code = _check_positions(bounds, rows, rows_before, motion[0], motion_before[0], violation)
     if code == 0:
-        code = check_pose(bounds, motion[0], found)
+        code = _check_rates(bounds, rows, violation)
     if code == 0:
-        code = _check_step(bounds, rows, rows_before, found)
+        code = _check_step(bounds, rows, rows_before, violation)
     if code == 0:
-        code = _check_platform(bounds, motion, motion_before, found)
+        code = _check_platform(bounds, motion, motion_before, violation)
     return code
 
 
-class Bounds:
-    """The limits of a robot, as bounds on the rows of a solved motion and on the pose.
+def standing_tolerance(limits: Limits, arm: float) -> Array:
+    """Return the distance beyond its limits at which a standing robot may be measured, (9,) [m, m, rad, m …].
 
-    `edge` [m, rad] is by how much a position may be beyond its limit, `labels` what people call the sliders.
+    These are the in-position windows of x, y, phi, the sliders and the cross slides; each is at least three counts of
+    its drive. `limits` are those of backlash_reserve.planned_limits, `arm` is Geometry.arm [m].
+    """
+    x, y, phi = limits.in_position.pose
+    sliders = limits.in_position.sliders
+    return np.array([x, y, phi, *sliders, *[max(sliders) + math.hypot(x, y) + arm * phi] * 3])
+
+
+class Bounds:
+    """Limits of one robot, packed for compiled checks, and violations for people.
+
+    `edge` is the tolerance of positions [m, rad]; `labels` names the sliders in messages.
     """
 
     def __init__(self, limits: Limits, period: float, edge: float = ROUNDING, labels: Labels = LEGS) -> None:
         slider, platform = limits.slider, limits.platform
         self.labels = labels
         self.packed = np.zeros(1, BOUNDS)
-        """As compiled code takes them, (1,) of BOUNDS."""
-        self.found = np.zeros(2)
-        """The value that was last found to be beyond its limit, and that limit."""
+        """The limits for compiled code, (1,) of BOUNDS."""
+        self.last_violation = np.zeros(2)
+        """Last value that violated its limit, and that limit."""
         bounds = self.packed[0]
         bounds["rows"] = (
             [(*ends, edge) for ends in slider.positions],
-            [(-velocity, velocity, velocity * EXCESS) for velocity in slider.velocities],
-            [(-acceleration, acceleration, acceleration * EXCESS) for acceleration in slider.accelerations],
+            [(-velocity, velocity, velocity * MAX_RELATIVE_EXCESS) for velocity in slider.velocities],
+            [
+                (-acceleration, acceleration, acceleration * MAX_RELATIVE_EXCESS)
+                for acceleration in slider.accelerations
+            ],
             [(*slider.passive, edge)] * 3,
         )
         bounds["pose"] = platform.x, platform.y, platform.phi
         bounds["edge"] = edge
-        bounds["step"] = [velocity * (1.0 + EXCESS) * period for velocity in slider.velocities]
+        bounds["step"] = [velocity * (1.0 + MAX_RELATIVE_EXCESS) * period for velocity in slider.velocities]
         bounds["slider_jerk"] = slider.jerks
         bounds["platform"] = np.transpose((platform.velocity, platform.acceleration, platform.jerk))
         bounds["period"] = period
 
     @property
     def box(self) -> Array:
-        """Low and high of x, y [m] and phi [rad], (2, 3)."""
+        """Low and high limits of x, y [m] and phi [rad], (2, 3)."""
         box: Array = self.packed[0]["pose"].T
         return box
 
-    def pose(self, pose: ArrayLike) -> Violation | None:
-        """Check a pose x, y [m], phi [rad] alone."""
-        return self.violation(check_pose(self.packed, np.array(pose, dtype=np.float64), self.found))
+    def pose_violation(self, pose: ArrayLike) -> Violation | None:
+        """Return the violation of the platform's position limits at a pose x, y [m], phi [rad], if any."""
+        return self.violation(check_pose(self.packed, np.array(pose, dtype=np.float64), self.last_violation))
 
-    def setpoint(self, rows: ArrayLike) -> Violation | None:
-        """Check solved sliders, as many of position, velocity, acceleration, cross slide as given [m, s]."""
-        return self.violation(check_setpoint(self.packed, np.array(rows, dtype=np.float64), self.found))
+    def pose_violation_from(self, pose: ArrayLike, start: Sequence[float]) -> Violation | None:
+        """Return the violation at a pose if it is also farther beyond the limit than the pose `start`."""
+        values = np.array(pose, dtype=np.float64)
+        low, high = self.box
+        edge = float(self.packed[0]["edge"])
+        outside = (
+            (values < np.minimum(low - edge, start)) | (values > np.maximum(high + edge, start)) | np.isnan(values)
+        )
+        return self.position_violation(int(np.argmax(outside)), float(values[outside][0])) if outside.any() else None
+
+    def standing_violation(self, positions: Array, tolerance: Array) -> Violation | None:
+        """Return the violation among the nine positions of a standing robot, each with its tolerance (9,)."""
+        low, high = np.vstack([self.packed[0]["pose"], *self.packed[0]["rows"][(0, 3), :, :2]]).T
+        outside = (positions < low - tolerance) | (positions > high + tolerance)
+        number = int(np.argmax(outside))
+        return self.position_violation(number, float(positions[number])) if outside.any() else None
+
+    def setpoint_violation(self, rows: ArrayLike) -> Violation | None:
+        """Return the violation of solved sliders, rows as of check_setpoint [m, s], if any."""
+        return self.violation(check_setpoint(self.packed, np.array(rows, dtype=np.float64), self.last_violation))
+
+    def position_violation(self, number: int, value: float) -> Violation | None:
+        """Return the violation of one of the nine positions: x, y, phi, sliders A to C, cross slides A to C."""
+        check, n = (_POSE, 0, _PASSIVE)[number // 3], number % 3
+        bounds = self.packed[0]
+        low, high = bounds["pose"][n] if check == _POSE else bounds["rows"][check, n, :2]
+        self.last_violation[:] = value, low if value < low else high
+        return self.violation(1 + 3 * check + n)
 
     def violation(self, code: int) -> Violation | None:
-        """Put into words what has just been found; None for 0."""
+        """Return the violation of a code, with the values in last_violation; None for 0."""
         if code == 0:
             return None
         check, n = divmod(code - 1, 3)
         subject, quantity, unit = _CHECKS[check]
-        value, limit = self.found.tolist()
+        value, limit = self.last_violation.tolist()
         if subject == "slider":
             return Violation(LEGS[n], quantity, value, limit, unit, self.labels[n])
         return Violation(COORDINATES[n], quantity, value, limit, UNITS[n] + unit)

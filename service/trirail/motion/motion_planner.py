@@ -1,12 +1,11 @@
-"""The planner: one function, from a goal and the motion under way to a motion that leads there, or why none does.
+"""The planner: a pure function from a goal and the motion under way to a new motion or a refusal.
 
-It keeps nothing between two requests: all that a plan depends on is in the request, and in the robot's geometry and
-limits, which have a revision. So it may be asked in a process of its own, in this one, or once more from a recording.
+It keeps no state between requests. A plan depends on the request and on the robot's geometry and limits, which have a
+revision; so the planner can run in its own process, in this one, or on a recorded request.
 """
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections import deque
 from collections.abc import Callable
@@ -24,14 +23,14 @@ from trirail.wire.plan_packets import Extended, NotPlanned, PackedRun, PlanAnswe
 
 
 def revision(config: Config) -> int:
-    """Return a number that stands for all of a configuration on which plans depend."""
+    """Return a checksum of everything in a configuration that plans depend on."""
     limits = config.limits.platform, config.limits.slider, config.limits.singularity_margin
     correction = config.correction.as_built, config.correction.backlash
     return zlib.crc32(msgspec.json.encode((config.geometry, correction, limits, config.loop.rate_hz)))
 
 
 class MotionPlanner:
-    """Plans the motions of one robot; `beat` is called between the parts of that work."""
+    """Planner of one robot; `beat` is called between the parts of a plan, as a sign of life."""
 
     def __init__(self, config: Config, beat: Callable[[], None] = lambda: None) -> None:
         robot = corrected_geometry(config)
@@ -41,32 +40,29 @@ class MotionPlanner:
         self._goals = GoalPlanner(robot, planned_limits(config.limits, config.correction.backlash), config.period, beat)
 
     def plan(self, request: PlanRequest) -> PlanAnswer:
-        """Return the motion to a goal, or why there is none. Whatever goes wrong is an answer."""
+        """Return the motion to a goal, or a refusal. An internal error is also answered by a refusal."""
         try:
             decided = self._decide(request)
         except RefusedError as refusal:
             return _refusal(request, refusal)
-        except Exception as error:  # noqa: BLE001 - who asked waits for an answer
+        except Exception as error:  # noqa: BLE001 - the loop waits for an answer
             words = f"internal error in planning, please report it: {error!r}"
             return _refusal(request, RefusedError(RefusalCode.INTERNAL, words))
         number, version = request.number, request.version
         if isinstance(decided, Extension):
-            return Extended(number, version, decided.s, pack_path(decided.path), decided.slowed)
+            return Extended(number, version, decided.s, pack_path(decided.path), decided.reply)
         return Planned(
             number,
             version,
             decided.first,
             pack_run(decided.run),
-            decided.duration if math.isfinite(decided.duration) else None,
-            decided.slowed,
-            decided.stops_first,
+            decided.reply,
             pack_path(decided.stop) if decided.stop is not None else None,
             decided.bound,
-            decided.lag,
         )
 
     def warm_up(self) -> None:
-        """Plan a motion of each kind: what runs for the first time is slow."""
+        """Plan a motion of each kind, because the first plan of a kind is slow."""
         start = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         runs: tuple[PackedRun, ...] = ()
         for goal in (goal for motion in MOTIONS.values() for goal in motion.examples):

@@ -1,27 +1,32 @@
-"""Paths and runs as they are sent between loop and planner, and written into recordings: bit for bit the same."""
+"""Packed paths and runs, for messages between loop and planner and for recordings; the numbers keep every bit."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from trirail.kinematics.arrays import Array
-from trirail.motion.paths import Path, falls, sound
+from trirail.motion.paths import Path, is_valid_path, law_falls
 from trirail.motion.runs import Run, Seam
 from trirail.wire.plan_packets import PackedPath, PackedRun
 
 POWERS = 6
-"""Coefficients of a piece."""
+"""Coefficients per piece and coordinate."""
 
 
 def pack_path(path: Path) -> PackedPath:
-    """Return a path as it is sent."""
+    """Return a path in packed form."""
     return PackedPath(path.knots.tobytes(), path.pieces.tobytes(), path.in_sliders, path.tools.tobytes())
 
 
 def unpack_path(packed: PackedPath, degrees: int) -> Path:
-    """Return a path of so many coordinates from how it was sent; compiled code may then rely on its shape.
+    """Return a path of `degrees` coordinates from its packed form.
 
-    Raises ValueError where it is none: of another shape, not ascending, not finite.
+    The checks here let compiled code rely on the shape.
+
+    Raises
+    ------
+    ValueError
+        The shape is wrong, a number is not finite, or the knots do not ascend.
     """
     knots = np.frombuffer(packed.knots).copy()
     pieces = np.frombuffer(packed.pieces).copy()
@@ -31,29 +36,29 @@ def unpack_path(packed: PackedPath, degrees: int) -> Path:
     tools = np.frombuffer(packed.tools).copy()
     if len(tools) not in (0, 2 * number):
         raise ValueError(f"a path of {number} pieces with {len(tools)} coordinates of tools")
-    if not sound(knots, pieces, tools):
+    if not is_valid_path(knots, pieces, tools):
         raise ValueError("a path whose numbers are not finite, or whose knots do not ascend")
     return Path(knots, pieces.reshape(number, degrees, POWERS), packed.in_sliders, tools.reshape(-1, 2))
 
 
 def unpack_law(packed: PackedPath) -> Path:
-    """Return a law from how it was sent. Raises ValueError where it is none: as a path, or where its time falls."""
+    """Return a law from its packed form. Raises ValueError as unpack_path, and if its time falls."""
     law = unpack_path(packed, 1)
-    if falls(law.knots, law.pieces):
-        raise ValueError("a law by which the time along its path falls")
+    if law_falls(law.knots, law.pieces):
+        raise ValueError("a law whose time along the path falls")
     return law
 
 
 def pack_run(run: Run) -> PackedRun:
-    """Return a run as it is sent."""
+    """Return a run in packed form."""
     seams = tuple(seam.s for seam in run.seams)
     return PackedRun(pack_path(run.path), pack_path(run.law), run.target, run.time, seams)
 
 
 def unpack_run(legs: Array, packed: PackedRun) -> Run:
-    """Return a run from how it was sent, of a robot with such packed legs. Raises ValueError where it is none.
+    """Return a run from its packed form, for a robot with these packed legs. Raises ValueError as unpack_path.
 
-    What the path was before its seams is not sent: nobody plans from there.
+    The paths before the seams are not packed, because no plan starts from them.
     """
     path = unpack_path(packed.path, 3)
     run = Run(legs, path, unpack_law(packed.law), packed.target)

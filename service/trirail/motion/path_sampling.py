@@ -1,4 +1,4 @@
-"""What a path, run by a law, asks of sliders and platform: looked at along its whole length, compiled."""
+"""Compiled sampling of a path under a law: positions against limits, greatest velocity, acceleration and jerk."""
 
 from __future__ import annotations
 
@@ -8,23 +8,26 @@ from typing import NamedTuple
 import numpy as np
 
 from trirail.kinematics.arrays import Array
-from trirail.kinematics.closed_forward import LEGS_TYPE
+from trirail.kinematics.closed_forward import LEGS_TYPE, sign_of_det_j2
 from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
-from trirail.motion.paths import HALVINGS, ROUNDING, law_at, platform_at, reached, tool_at, transfer
+from trirail.kinematics.recursion import ZERO
+from trirail.motion.paths import BISECTIONS, ROUNDING, law_at, passing_time, platform_at, tool_at, transfer_to_point
 
 __all__ = ["survey"]
 
-NEAR = 1e-3
-"""How near a limit a position may turn without being looked at [m, rad]."""
-EQUAL = (1.0, 1.0, 1.0)
-WITHIN = 4
-"""Parts of every piece of a path at whose ends it is looked at."""
+TURN_CLEARANCE = 1e-3
+"""Distance from its limit within which a turning position is located exactly [m, rad]."""
+UNIT_WEIGHTS = (1.0, 1.0, 1.0)
+RETURN_SLOWDOWN = 10.0
+"""Factor by which the robot returns more slowly from beyond its limits."""
+SAMPLES_PER_PIECE = 4
+"""Samples in every piece of a path."""
 
 
 @compiled()
-def _add(times: Array, n: int, time: float, first: float, until: float) -> int:
-    """Put a time behind the first n if it is between two others; return how many there are."""
+def _insert_time(times: Array, n: int, time: float, first: float, until: float) -> int:
+    """Append a time after the first n if it is between `first` and `until`; return the new number."""
     if first <= time <= until:
         times[n] = time
         n += 1
@@ -32,39 +35,39 @@ def _add(times: Array, n: int, time: float, first: float, until: float) -> int:
 
 
 @compiled()
-def _moments(
+def _sample_times(
     knots: Array, law_knots: Array, law_pieces: Array, first: float, until: float, even: int, step: float
 ) -> Array:
-    """Return when to look at a path, ascending: evenly, within every piece, and on both sides of every knot.
+    """Return the times of samples, ascending: evenly spaced, within every piece, and on both sides of every knot.
 
-    Jerk is greatest next to a knot, of the path or of the law, and may be so for a short time only. Its mean over
-    a step across a knot lies between the means over the steps that end and begin there.
+    Jerk peaks next to a knot of the path or of the law, possibly for a short time. Its mean over a step across a knot
+    is between the means over the steps that end and begin there.
     """
-    times = np.empty(even + (WITHIN + 1) * len(knots) + 2 * len(law_knots))
+    times = np.empty(even + (SAMPLES_PER_PIECE + 1) * len(knots) + 2 * len(law_knots))
     for k in range(even):
         times[k] = first + (until - first) * k / (even - 1)
     n = even
     begin = law_at(law_knots, law_pieces, first)[0]
     end = law_at(law_knots, law_pieces, until)[0]
     for k in range(len(knots)):
-        for part in range(WITHIN if k < len(knots) - 1 else 1):
+        for part in range(SAMPLES_PER_PIECE if k < len(knots) - 1 else 1):
             s = knots[k]
             if part:
-                s += (knots[k + 1] - knots[k]) * part / WITHIN
+                s += (knots[k + 1] - knots[k]) * part / SAMPLES_PER_PIECE
             if begin <= s <= end:
-                time = reached(law_knots, law_pieces, s, until)
-                n = _add(times, n, time, first, until)
+                time = passing_time(law_knots, law_pieces, s, until)
+                n = _insert_time(times, n, time, first, until)
                 if not part:
-                    n = _add(times, n, time - step, first, until)
+                    n = _insert_time(times, n, time - step, first, until)
     for knot in law_knots:
-        n = _add(times, n, knot, first, until)
-        n = _add(times, n, knot - step, first, until)
+        n = _insert_time(times, n, knot, first, until)
+        n = _insert_time(times, n, knot - step, first, until)
     return np.sort(times[:n])
 
 
 @compiled()
-def _quantity(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
-    """Return one of the nine limited positions, x, y, phi, of the sliders and of the cross slides, and its velocity."""
+def _limited_position(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
+    """Return one of the nine limited positions (x, y, phi, sliders, cross slides) and its velocity."""
     if i < 3:
         return motion[0, i], motion[1, i]
     if i < 6:
@@ -72,8 +75,12 @@ def _quantity(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
     return sliders[3, i - 6], sliders[4, i - 6]
 
 
-class Way(NamedTuple):
-    """A path, the law it is run by, the robot that takes it, and what limits that."""
+class PathProblem(NamedTuple):
+    """A path, its law, the robot, and the robot's limits.
+
+    `box` (2, 9) holds the position limits. `reach` (2, 9) is the same for a robot within them; beyond a limit it is the
+    position itself, and follows that inwards.
+    """
 
     legs: Array
     knots: Array
@@ -83,47 +90,85 @@ class Way(NamedTuple):
     law_knots: Array
     law_pieces: Array
     box: Array
+    reach: Array
     shares: Array
 
 
 @compiled()
-def _solve_at(way: Way, time: float, near: Array, motion: Array, sliders: Array) -> bool:
-    """Write platform and sliders at a time of the law; whether they are within reach."""
-    law = law_at(way.law_knots, way.law_pieces, time)
-    if platform_at(way.legs, way.knots, way.pieces, way.in_sliders, way.tools, law, near, motion) != 0:
-        return False
-    if way.in_sliders:
-        near[:] = motion[0]
-    if inverse_motion(way.legs, motion, sliders) != 0:
-        return False
+def _initialise_reach(problem: PathProblem, time: float, near: Array, tolerance: Array) -> int:
+    """Set the reach for a path that begins at a time of the law.
+
+    Returns 0, 1 if the path begins beyond a limit by more than `tolerance`, or -1 if the robot is singular there.
+    """
+    motion, sliders = np.empty((3, 3)), np.empty((6, 3))
+    problem.reach[0], problem.reach[1] = -math.inf, math.inf
+    if not _solve_at(problem, time, near, motion, sliders):
+        return -1
+    beyond = 0
     for i in range(9):
-        position, _ = _quantity(motion, sliders, i)
-        if not way.box[0, i] - ROUNDING <= position <= way.box[1, i] + ROUNDING:
-            return False
-    return True
+        position, _ = _limited_position(motion, sliders, i)
+        problem.reach[0, i], problem.reach[1, i] = min(problem.box[0, i], position), max(problem.box[1, i], position)
+        if max(problem.box[0, i] - position, position - problem.box[1, i]) > tolerance[i]:
+            beyond = 1
+    return beyond
 
 
 @compiled()
-def _turns(way: Way, last: float, time: float, near: Array, motion: Array, sliders: Array) -> float:
-    """Return when a position that turns near its limit between two looks is beyond it, else not a number.
+def _narrow_reach(problem: PathProblem, motion: Array, sliders: Array) -> None:
+    """Move the reach inwards with a position that returns from beyond a limit, so that it cannot move out again."""
+    for i in range(9):
+        position, _ = _limited_position(motion, sliders, i)
+        problem.reach[0, i] = min(problem.box[0, i], max(problem.reach[0, i], position))
+        problem.reach[1, i] = max(problem.box[1, i], min(problem.reach[1, i], position))
 
-    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the looks at `last` and at `time`, and have room for one more.
+
+@compiled()
+def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sliders: Array) -> bool:
+    """Write platform and sliders at a time of the law; return whether they are within reach."""
+    law = law_at(problem.law_knots, problem.law_pieces, time)
+    if (
+        platform_at(problem.legs, problem.knots, problem.pieces, problem.in_sliders, problem.tools, law, near, motion)
+        != 0
+    ):
+        return False
+    if problem.in_sliders:
+        near[:] = motion[0]
+    if inverse_motion(problem.legs, motion, sliders) != 0:
+        return False
+    for i in range(9):
+        position, _ = _limited_position(motion, sliders, i)
+        if not problem.reach[0, i] - ROUNDING <= position <= problem.reach[1, i] + ROUNDING:
+            return False
+    phi = motion[0, 2]
+    if problem.box[0, 2] - ROUNDING <= phi <= problem.box[1, 2] + ROUNDING:
+        return True
+    # J2 is regular within the limits of phi; beyond them a singular angle may be on the way back.
+    return sign_of_det_j2(problem.legs, (motion[0, 0], motion[0, 1], phi)) == sign_of_det_j2(problem.legs, ZERO)
+
+
+@compiled()
+def _find_turn_beyond_limit(
+    problem: PathProblem, last: float, time: float, near: Array, motion: Array, sliders: Array
+) -> float:
+    """Return the time at which a position that turns between two samples is beyond its limit; NaN if none is.
+
+    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for one more.
     """
     for i in range(9):
-        before, leaving = _quantity(motion[0], sliders[0], i)
-        _, coming = _quantity(motion[1], sliders[1], i)
+        before, leaving = _limited_position(motion[0], sliders[0], i)
+        _, coming = _limited_position(motion[1], sliders[1], i)
         if leaving * coming >= 0.0:
             continue
-        # It has turned about here, were the acceleration constant.
+        # Estimate of the turning point for constant acceleration.
         turn = before + leaving * leaving / (leaving - coming) * (time - last) / 2.0
-        if way.box[0, i] + NEAR <= turn <= way.box[1, i] - NEAR:
+        if problem.box[0, i] + TURN_CLEARANCE <= turn <= problem.box[1, i] - TURN_CLEARANCE:
             continue
         low, high = last, time
-        for _ in range(HALVINGS // 3):
+        for _ in range(BISECTIONS // 3):
             middle = (low + high) / 2.0
-            if not _solve_at(way, middle, near, motion[2], sliders[2]):
+            if not _solve_at(problem, middle, near, motion[2], sliders[2]):
                 return middle
-            _, velocity = _quantity(motion[2], sliders[2], i)
+            _, velocity = _limited_position(motion[2], sliders[2], i)
             if velocity * leaving > 0.0:
                 low = middle
             else:
@@ -133,37 +178,45 @@ def _turns(way: Way, last: float, time: float, near: Array, motion: Array, slide
 
 @compiled()
 def _measure_rates(
-    now: Array, then: Array, i: int, step: float, whole: bool, worst: Array, by: tuple[float, float, float] = EQUAL
+    now: Array,
+    then: Array,
+    i: int,
+    step: float,
+    whole: bool,
+    worst: Array,
+    weights: tuple[float, float, float] = UNIT_WEIGHTS,
 ) -> None:
-    """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of rows (position, velocity, acceleration).
+    """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of two rows one step apart.
 
-    `then` are the rows a step later. `whole` tells whether the motion goes on for the whole step. The
-    three count `by` so much.
+    `now` and `then` have the rows position, velocity, acceleration. `whole` is whether the platform moves during the
+    whole step. `weights` multiply the three.
     """
-    worst[0] = max(worst[0], by[0] * abs(now[1, i]))
-    worst[1] = max(worst[1], by[1] * abs(now[2, i]))
-    # The mean jerk of this step, and what the velocity says of its beginning and its end: a rate may change
-    # within a single step, where the accelerations before and after are the same.
+    worst[0] = max(worst[0], weights[0] * abs(now[1, i]))
+    worst[1] = max(worst[1], weights[1] * abs(now[2, i]))
+    # Jerk of the two halves from the change of velocity, in addition to the mean: a rate may rise and fall within one
+    # step, with the same acceleration before and after.
     change = then[1, i] - now[1, i]
     early = 2.0 * (change / step - now[2, i]) / step
     late = 2.0 * (then[2, i] - change / step) / step
-    worst[2] = max(worst[2], by[2] * (abs(early + late) / 2.0))
+    worst[2] = max(worst[2], weights[2] * (abs(early + late) / 2.0))
     if whole:
-        worst[2] = max(worst[2], by[2] * abs(early), by[2] * abs(late))
+        worst[2] = max(worst[2], weights[2] * abs(early), weights[2] * abs(late))
 
 
 @compiled()
-def _measure_tool(way: Way, time: float, motion: Array, arms: Array, step: float, whole: bool, worst: Array) -> None:
-    """Measure the rates of x, y, phi: of the path's tool, and of the centre in the two last rows where it is another.
+def _measure_tool(
+    problem: PathProblem, time: float, motion: Array, arms: Array, step: float, whole: bool, worst: Array
+) -> None:
+    """Raise `worst` to the rates of the path's tool, and of the centre in the last two rows if that is another point.
 
-    `motion` (3, 3, 3) holds the platform a step later and at a time; `arms` (2, 3, 3) is room for the tool's.
+    `motion` (3, 3, 3) holds the platform one step later and at `time`; `arms` (2, 3, 3) is space for the tool's motion.
     """
-    u, v = tool_at(way.knots, way.tools, law_at(way.law_knots, way.law_pieces, time)[0])
+    u, v = tool_at(problem.knots, problem.tools, law_at(problem.law_knots, problem.law_pieces, time)[0])
     arms[:] = motion[:2]
     if u != 0.0 or v != 0.0:
-        # Of the same point a step later, also where another one's piece begins in between.
-        transfer(arms[0], u, v)
-        transfer(arms[1], u, v)
+        # The same point one step later, even if a piece of another point begins in between.
+        transfer_to_point(arms[0], u, v)
+        transfer_to_point(arms[1], u, v)
         for i in range(2):
             _measure_rates(motion[1], motion[0], i, step, whole, worst[4 + i])
     for i in range(3):
@@ -171,34 +224,38 @@ def _measure_tool(way: Way, time: float, motion: Array, arms: Array, step: float
 
 
 @compiled()
-def _walk(way: Way, times: Array, until: float, step: float, near: Array, worst: Array) -> tuple[float, float]:
-    """Look at a path at ascending times and a step later; return the last time within reach, and one beyond it."""
+def _sample_path(
+    problem: PathProblem, times: Array, until: float, step: float, near: Array, worst: Array
+) -> tuple[float, float]:
+    """Sample a path at ascending times and one step after each; return the last time within reach, and one beyond."""
     motion, sliders, arms = np.empty((3, 3, 3)), np.empty((3, 6, 3)), np.empty((2, 3, 3))
     last = -math.inf
     for k in range(len(times)):
         time = times[k]
         if abs(time - last) < ROUNDING:
             motion[1], sliders[1] = motion[0], sliders[0]
-        elif not _solve_at(way, time, near, motion[1], sliders[1]):
+        elif not _solve_at(problem, time, near, motion[1], sliders[1]):
             return last, time
         elif time > last + step and k > 0:
-            leaves_at = _turns(way, last, time, near, motion, sliders)
+            leaves_at = _find_turn_beyond_limit(problem, last, time, near, motion, sliders)
             if not math.isnan(leaves_at):
                 return last, leaves_at
+        if time >= 0.0:
+            _narrow_reach(problem, motion[1], sliders[1])
         last = time + step
-        if not _solve_at(way, last, near, motion[0], sliders[0]):
+        if not _solve_at(problem, last, near, motion[0], sliders[0]):
             return time, last
-        whole = time >= 0.0 and last <= until  # else it is the step from or to a standstill, in which nothing else is
+        whole = time >= 0.0 and last <= until  # false for the step from or to a standstill
         for i in range(3):
-            by = way.shares[0, i], way.shares[1, i], way.shares[2, i]
-            _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0], by)
-        _measure_tool(way, time, motion, arms, step, whole, worst)
+            weights = problem.shares[0, i], problem.shares[1, i], problem.shares[2, i]
+            _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0], weights)
+        _measure_tool(problem, time, motion, arms, step, whole, worst)
     return last, math.nan
 
 
 @compiled(
     f"f8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[:, :, ::1], "
-    "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])"
+    "f8, f8, i8, f8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 def survey(
     legs: Array,
@@ -214,31 +271,58 @@ def survey(
     step: float,
     start: Array,
     box: Array,
+    tolerance: Array,
     shares: Array,
     worst: Array,
 ) -> float:
-    """Look at a path, run by a law, between two times; write the greatest velocities, accelerations and jerks.
+    """Sample a path under a law between two times.
 
-    It is looked at `even` times, at its knots and between them, and where a position turns near its limit. Jerk is
-    what the setpoints before and after a `step` [s] say of it, as the drives see it. `start` is the pose at the first
-    time. `box` (2, 9) holds the limits, low and high, of x, y, phi, of each slider and of each cross slide, `shares`
-    (3, 3) by what the velocity, acceleration and jerk of each slider count. Returns when it is first out of reach, else
-    not a number. `worst` (6, 3) has velocity, acceleration and jerk of the slider that has most, of x, y and phi of
-    the path's tool, and of x and y of the platform's centre where the tool is another point; nothing where the path is
-    out of reach.
+    Parameters
+    ----------
+    legs, knots, pieces, in_sliders, tools, law_knots, law_pieces
+        The robot's packed legs, the path and its law.
+    first, until : float
+        Times of the law between which the path is sampled [s].
+    even : int
+        Number of evenly spaced samples, in addition to those at and between knots and at turns near a limit.
+    step : float
+        Cycle time [s]. Jerk is measured between setpoints one step apart, as the drives see it.
+    start : (3,)
+        Pose at `first`, for the branch of the forward kinematics.
+    box : (2, 9)
+        Low and high limits of x, y, phi, of each slider and of each cross slide.
+    tolerance : (9,)
+        Distances beyond these limits at which a path may begin; beyond them its velocities count RETURN_SLOWDOWN
+        times.
+    shares : (3, 3)
+        Weights of velocity, acceleration and jerk for each slider.
+    worst : (6, 3)
+        Receives the greatest velocity, acceleration and jerk: over the sliders, of x, y and phi of the tool, and of
+        x and y of the centre if the tool is another point. Undefined if the path leaves the workspace.
+
+    Returns
+    -------
+    float
+        First time out of reach [s]; NaN if the path stays within reach.
     """
-    way = Way(legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, box, shares)
-    times = _moments(knots, law_knots, law_pieces, first, until, even, step)
-    near = start.copy()
+    problem = PathProblem(legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, box, np.empty((2, 9)), shares)
+    times = _sample_times(knots, law_knots, law_pieces, first, until, even, step)
     worst[:] = 0.0
-    inside, leaves_at = _walk(way, times, until, step, near, worst)
+    near = start.copy()
+    start_code = _initialise_reach(problem, max(first, 0.0), near, tolerance)
+    if start_code < 0:
+        return first
+    near[:] = start
+    inside, leaves_at = _sample_path(problem, times, until, step, near, worst)
     if not math.isnan(leaves_at):
         motion, sliders = np.empty((3, 3)), np.empty((6, 3))
         inside = max(inside, first)
-        for _ in range(HALVINGS // 3):
+        for _ in range(BISECTIONS // 3):
             middle = (inside + leaves_at) / 2.0
-            if _solve_at(way, middle, near, motion, sliders):
+            if _solve_at(problem, middle, near, motion, sliders):
                 inside = middle
             else:
                 leaves_at = middle
+    if start_code > 0:
+        worst[:, 0] *= RETURN_SLOWDOWN
     return leaves_at

@@ -1,12 +1,12 @@
-"""Paths in time as piecewise polynomials, and the law by which time runs along them.
+"""Paths as piecewise polynomials in time, and laws that map real time to time along a path.
 
 A path has knots (n + 1,) in seconds and pieces (n, d, 6): coefficients of ascending powers of the time since the
 piece's knot, for each of d coordinates. A law is a path of one coordinate: s, the time along the path, as a function
-of time. Compiled; errors are codes.
+of time. The functions are compiled and return error codes.
 
 In pose space the coordinates are those of a point of the platform, the tool: its place in the base frame [m], and phi.
-The platform is a rigid body, so that its centre follows: p = T - R(phi) t for a tool at t in the platform's frame. This
-is where a path becomes a platform pose; nobody else need know of tools.
+The platform is a rigid body, so that its centre is p = T - R(phi) t for a tool at t in the platform's frame. Only this
+module converts a path into platform poses.
 """
 
 from __future__ import annotations
@@ -21,41 +21,41 @@ from trirail.kinematics.closed_forward import LEGS_TYPE, forward_motion
 from trirail.kinematics.compiled import compiled
 
 __all__ = [
-    "CENTRE",
+    "CENTRE_TOOLS",
     "Path",
-    "advance",
-    "constant",
-    "falls",
+    "constant_law",
+    "evaluate",
+    "is_valid_path",
     "law_at",
+    "law_falls",
+    "passing_time",
     "path_motion",
     "platform_at",
-    "reached",
-    "sound",
+    "platform_at_law_time",
     "tool_at",
-    "transfer",
-    "value",
+    "transfer_to_point",
 ]
 
-FOR_EVER = 1e9
-"""How long the last piece of a law lasts [s]."""
-HALVINGS = 48
-"""Of an interval, until it is narrower than numbers of its size can tell."""
+LAST_PIECE_S = 1e9
+"""Duration of the last piece of a law: practically unlimited."""
+BISECTIONS = 48
+"""Bisection steps after which an interval is narrower than the resolution of a float."""
 ROUNDING = 1e-9
-"""By so much may a position be beyond its limit, or two times be the same [m, rad, s]."""
-FALL = 1e-12
-"""By so much may the time along a path be less than it has been, by rounding [s]."""
-CENTRE = np.zeros((0, 2))
-"""The tools of a path of the platform's centre."""
+"""Tolerance for rounding of positions beyond a limit and of equal times [m, rad, s]."""
+MAX_TIME_FALL_S = 1e-12
+"""Greatest fall of the time along a path that counts as rounding."""
+CENTRE_TOOLS = np.zeros((0, 2))
+"""Tools of a path of the platform's centre."""
 
 
 class Path(NamedTuple):
-    """A motion in time, in pose space or in slider space."""
+    """Motion in time, in pose space or in slider space."""
 
     knots: Array
     pieces: Array
     in_sliders: bool = False
-    tools: Array = CENTRE
-    """Of which point of the platform each piece is the motion, in the platform's frame (n, 2) [m]; CENTRE for none."""
+    tools: Array = CENTRE_TOOLS
+    """Point of the platform that each piece moves, (n, 2) in the platform's frame [m]; CENTRE_TOOLS for the centre."""
 
     @property
     def duration(self) -> float:
@@ -64,13 +64,13 @@ class Path(NamedTuple):
 
     @property
     def end(self) -> Array:
-        """Where it ends, (d,), in its own coordinates."""
+        """Last position, (d,), in the path's own coordinates."""
         end: Array = self.pieces[-1] @ (self.knots[-1] - self.knots[-2]) ** np.arange(6.0)
         return end
 
 
 @compiled()
-def _piece(knots: Array, time: float) -> int:
+def _find_piece(knots: Array, time: float) -> int:
     low, high = 0, len(knots) - 1
     while high - low > 1:
         middle = (low + high) // 2
@@ -81,8 +81,8 @@ def _piece(knots: Array, time: float) -> int:
     return low
 
 
-class Moment(NamedTuple):
-    """A time along a path: in which piece, how long after its knot, and whether the motion goes on there."""
+class PieceTime(NamedTuple):
+    """Piece of a path, time since its knot [s], and whether the time is within the path."""
 
     piece: int
     time: float
@@ -90,15 +90,15 @@ class Moment(NamedTuple):
 
 
 @compiled()
-def _moment(knots: Array, time: float) -> Moment:
+def _locate(knots: Array, time: float) -> PieceTime:
     at = min(max(time, knots[0]), knots[-1])
-    k = _piece(knots, at)
-    return Moment(k, at - knots[k], knots[0] <= time <= knots[-1])
+    k = _find_piece(knots, at)
+    return PieceTime(k, at - knots[k], knots[0] <= time <= knots[-1])
 
 
 @compiled()
-def _coordinate(p: Array, at: Moment) -> Vector:
-    """Return a polynomial's value and first two derivatives; before the start and after the end nothing moves."""
+def _evaluate_polynomial(p: Array, at: PieceTime) -> Vector:
+    """Return a polynomial's value and first two derivatives; these are zero before the start and after the end."""
     t = at.time
     position = p[0] + t * (p[1] + t * (p[2] + t * (p[3] + t * (p[4] + t * p[5]))))
     if not at.inside:
@@ -109,28 +109,28 @@ def _coordinate(p: Array, at: Moment) -> Vector:
 
 
 @compiled()
-def value_at(knots: Array, pieces: Array, time: float, out: Array) -> None:
-    """Do value, from compiled code."""
-    at = _moment(knots, time)
+def evaluate_path(knots: Array, pieces: Array, time: float, out: Array) -> None:
+    """Write value and first two derivatives (3, d): evaluate, for compiled code."""
+    at = _locate(knots, time)
     for i in range(pieces.shape[1]):
-        out[0, i], out[1, i], out[2, i] = _coordinate(pieces[at.piece, i], at)
+        out[0, i], out[1, i], out[2, i] = _evaluate_polynomial(pieces[at.piece, i], at)
 
 
 @compiled()
 def tool_at(knots: Array, tools: Array, time: float) -> tuple[float, float]:
-    """Return of which point of the platform a path is the motion at a time along it, in the platform's frame [m]."""
+    """Return the point of the platform that a path moves at a time along it, in the platform's frame [m]."""
     if len(tools) == 0:
         return 0.0, 0.0
-    piece = _moment(knots, time).piece
+    piece = _locate(knots, time).piece
     return tools[piece, 0], tools[piece, 1]
 
 
 @compiled("void(f8[:, ::1], f8, f8)")
-def transfer(motion: Array, u: float, v: float) -> None:
-    """Make of the motion of one point of the platform that of the point (u, v) beyond it, in the platform's frame [m].
+def transfer_to_point(motion: Array, u: float, v: float) -> None:
+    """Convert the motion of one point of the platform to that of the point (u, v) away from it, in place.
 
-    `motion` (3, 3) has the rows x, y, phi, and their first and second derivatives. With r = R(phi) (u, v), and r turned
-    by a right angle: p + r, p' + phi' r_, p'' + phi'' r_ - phi'^2 r.
+    `motion` (3, 3) has the rows x, y, phi, and their first and second derivatives; (u, v) is in the platform's frame
+    [m]. With r = R(phi) (u, v), and r_ as r turned by a right angle: p + r, p' + phi' r_, p'' + phi'' r_ - phi'^2 r.
     """
     if u == 0.0 and v == 0.0:
         return
@@ -147,32 +147,32 @@ def transfer(motion: Array, u: float, v: float) -> None:
 
 @compiled()
 def law_at(knots: Array, pieces: Array, time: float) -> Vector:
-    """Return where a law is: time along the path [s], its rate, and the rate's change [1/s]."""
-    at = _moment(knots, time)
-    return _coordinate(pieces[at.piece, 0], at)
+    """Return a law's state at a time [s]: time along the path [s], its rate, and the rate's change [1/s]."""
+    at = _locate(knots, time)
+    return _evaluate_polynomial(pieces[at.piece, 0], at)
 
 
 @compiled("void(f8[::1], f8[:, :, ::1], f8, f8[:, ::1])")
-def value(knots: Array, pieces: Array, time: float, out: Array) -> None:
+def evaluate(knots: Array, pieces: Array, time: float, out: Array) -> None:
     """Write a path's value and first two derivatives at a time [s] into `out` (3, d)."""
-    value_at(knots, pieces, time, out)
+    evaluate_path(knots, pieces, time, out)
 
 
 @compiled()
 def motion_at(knots: Array, pieces: Array, tools: Array, law: Vector, out: Array) -> None:
-    """Write the motion of sliders or of the platform's centre where a path's law is: value and two derivatives."""
+    """Write the motion (3, 3) of sliders or platform centre at a law's state: value and two derivatives."""
     s, rate, change = law
-    value_at(knots, pieces, s, out)
+    evaluate_path(knots, pieces, s, out)
     for i in range(3):
         out[2, i] = out[2, i] * rate * rate + out[1, i] * change
         out[1, i] *= rate
     u, v = tool_at(knots, tools, s)
-    transfer(out, -u, -v)
+    transfer_to_point(out, -u, -v)
 
 
 @compiled("void(f8[::1], f8[:, :, ::1], f8[:, ::1], f8, f8[:, ::1])")
 def path_motion(knots: Array, pieces: Array, tools: Array, time: float, out: Array) -> None:
-    """Write sliders or platform's centre at a time along a path [s], at full speed, into `out` (3, 3)."""
+    """Write the motion (3, 3) of sliders or platform centre at a time along a path [s], at full speed."""
     motion_at(knots, pieces, tools, (time, 1.0, 0.0), out)
 
 
@@ -180,10 +180,9 @@ def path_motion(knots: Array, pieces: Array, tools: Array, time: float, out: Arr
 def platform_at(
     legs: Array, knots: Array, pieces: Array, in_sliders: bool, tools: Array, law: Vector, near: Array, out: Array
 ) -> int:
-    """Write where the platform is, where a path's law is: pose, velocity and acceleration (3, 3).
+    """Write the platform's pose, velocity and acceleration (3, 3) at a law's state.
 
-    A path in slider space is turned into the platform's motion on the branch of the pose `near`. Returns 0, or a
-    code of forward_into.
+    A path in slider space is converted on the branch of the pose `near`. Returns 0, or a code of forward_into.
     """
     motion_at(knots, pieces, tools, law, out)
     if not in_sliders:
@@ -197,7 +196,7 @@ def platform_at(
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[::1], f8[:, :, ::1], b1, f8[:, ::1], f8[::1], f8[:, :, ::1], f8, f8[::1], f8[:, ::1])")
-def advance(
+def platform_at_law_time(
     legs: Array,
     knots: Array,
     pieces: Array,
@@ -214,8 +213,8 @@ def advance(
 
 
 @compiled("b1(f8[::1], f8[::1], f8[::1])")
-def sound(knots: Array, coefficients: Array, tools: Array) -> bool:
-    """Tell whether all numbers of a path are finite, and its knots ascend."""
+def is_valid_path(knots: Array, coefficients: Array, tools: Array) -> bool:
+    """Return whether all numbers of a path are finite and its knots ascend."""
     for numbers in (knots, coefficients, tools):
         for number in numbers:
             if not math.isfinite(number):
@@ -229,11 +228,11 @@ def sound(knots: Array, coefficients: Array, tools: Array) -> bool:
 
 
 @compiled("b1(f8[::1], f8[:, :, ::1])")
-def falls(law_knots: Array, law_pieces: Array) -> bool:
-    """Tell whether a law lets the time along a path fall anywhere, by more than FALL: then it is no law.
+def law_falls(law_knots: Array, law_pieces: Array) -> bool:
+    """Return whether the time along a path falls anywhere by more than MAX_TIME_FALL_S; then it is no valid law.
 
-    Pieces of a law are cubic, so that the time is least or greatest at a knot or where its rate, a parabola, is zero;
-    of a higher power it is not known, and no law either.
+    Pieces of a law are cubic, so that extrema of the time are at knots and at the zeros of its rate, a parabola. A
+    piece of higher degree counts as falling, because this method cannot check it.
     """
     highest = -math.inf
     for k in range(len(law_pieces)):
@@ -247,17 +246,17 @@ def falls(law_knots: Array, law_pieces: Array) -> bool:
         for t in (0.0, min(one, other), max(one, other), span):
             if 0.0 <= t <= span:
                 s = p[0] + t * (p[1] + t * (p[2] + t * p[3]))
-                if s < highest - FALL:
+                if s < highest - MAX_TIME_FALL_S:
                     return True
                 highest = max(highest, s)
     return False
 
 
 @compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")
-def reached(law_knots: Array, law_pieces: Array, s: float, last: float) -> float:
-    """Return when a law passes a time along the path [s], by halving: between its start and `last`."""
+def passing_time(law_knots: Array, law_pieces: Array, s: float, last: float) -> float:
+    """Return the time at which a law passes a time along the path [s], by bisection from its start to `last`."""
     low, high = law_knots[0], last
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2.0
         if law_at(law_knots, law_pieces, middle)[0] < s:
             low = middle
@@ -266,8 +265,8 @@ def reached(law_knots: Array, law_pieces: Array, s: float, last: float) -> float
     return float(high)
 
 
-def constant(rate: float, start: float = 0.0) -> Path:
-    """Return the law of a time that runs at a constant rate."""
+def constant_law(rate: float, start: float = 0.0) -> Path:
+    """Return a law with a constant rate, from the time `start` along the path."""
     pieces = np.zeros((1, 1, 6))
     pieces[0, 0, :2] = start, rate
-    return Path(np.array([0.0, FOR_EVER]), pieces)
+    return Path(np.array([0.0, LAST_PIECE_S]), pieces)

@@ -1,4 +1,4 @@
-"""Timed points joined by quintics: a path that meets position, velocity and acceleration at each of them."""
+"""Quintic paths through timed points, with given position, velocity and acceleration at each point."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
 from trirail.motion.limits import COORDINATES, UNITS
 from trirail.motion.paths import Path
-from trirail.motion.runs import STILL, MotionState
+from trirail.motion.runs import ZERO_RATES, MotionState
 from trirail.quantities import apart, worded
 
-START = 1e-4
-"""How far a trajectory may begin from where the robot stands [m, rad]."""
-GO_THERE = "trirail follow --go-there or in Python follow(…, go_there=True)"
-"""What does."""
-STANDS = 1e-6
-"""Velocity at the ends of a trajectory that counts as rounding, and is taken for none [m/s, rad/s]."""
+MAX_START_OFFSET = 1e-4
+"""Greatest distance between the start of a trajectory and the robot's pose [m, rad]."""
+GO_THERE_HINT = "trirail follow --go-there or in Python follow(…, go_there=True)"
+"""Remedy for a robot that stands elsewhere, for messages."""
+REST_VELOCITY = 1e-6
+"""Velocity at the ends of a trajectory that counts as rest [m/s, rad/s]."""
 
 
 class Point(NamedTuple):
-    """A point of a timed trajectory: when [s], and where, how fast and how accelerated the platform is."""
+    """Point of a timed trajectory: time [s], pose, velocity and acceleration of the platform."""
 
     t: float
     pose: Sequence[float]
@@ -32,26 +32,26 @@ class Point(NamedTuple):
 
 
 def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
-    """Join points into a path from standstill at the pose `start` to standstill.
+    """Return the path through points, from standstill at the pose `start` to standstill.
 
-    Velocities that are not given are those between the neighbours, accelerations likewise; these are zero at the ends.
+    Missing velocities and accelerations are central differences of the neighbours, and zero at the ends.
     """
     t = np.array([point.t for point in points])
     p = np.array([point.pose for point in points])
     p[0] = start
-    v = _filled([point.velocity for point in points], t, p)
+    v = _complete_derivatives([point.velocity for point in points], t, p)
     v[0] = v[-1] = 0.0
-    a = _filled([point.acceleration for point in points], t, v)
-    return _joined(t, p, v, a)
+    a = _complete_derivatives([point.acceleration for point in points], t, v)
+    return _hermite_path(t, p, v, a)
 
 
-def between(begin: Point, end: Point) -> Path:
-    """Return the quintic from one point to another, of which all is given: the way of least squared jerk."""
+def quintic_between(begin: Point, end: Point) -> Path:
+    """Return the quintic between two complete points: the path of least squared jerk."""
     t, p, v, a = (np.array(values) for values in zip(begin, end, strict=True))
-    return _joined(t, p, v, a)
+    return _hermite_path(t, p, v, a)
 
 
-def _joined(t: Array, p: Array, v: Array, a: Array) -> Path:
+def _hermite_path(t: Array, p: Array, v: Array, a: Array) -> Path:
     h = np.diff(t)[:, None]
     gap = p[1:] - p[:-1] - h * v[:-1] - h**2 / 2.0 * a[:-1]
     speed = v[1:] - v[:-1] - h * a[:-1]
@@ -64,36 +64,36 @@ def _joined(t: Array, p: Array, v: Array, a: Array) -> Path:
     return Path(t - t[0], pieces)
 
 
-def _filled(given: Sequence[Sequence[float] | None], t: Array, values: Array) -> Array:
-    """Return the derivatives at points, those between their neighbours where none are given, none at the ends."""
+def _complete_derivatives(specified: Sequence[Sequence[float] | None], t: Array, values: Array) -> Array:
+    """Return derivatives at points (n, 3): as specified, else central differences, and zero at the ends."""
     rates = np.zeros_like(values)
     if len(t) > 2:
         rates[1:-1] = (values[2:] - values[:-2]) / (t[2:] - t[:-2])[:, None]
-    for row, rate in enumerate(given):
+    for row, rate in enumerate(specified):
         if rate is not None:
             rates[row] = rate
     return rates
 
 
 def check_ends(points: Sequence[Point], start: MotionState) -> None:
-    """Raise RefusedError where points do not begin as the robot stands, or do not end at rest.
+    """Check that points begin at rest where the robot stands, and end at rest. Raises RefusedError.
 
-    What they begin or end with of an acceleration counts as the jerk over one cycle that it is (Checker.sample).
+    An acceleration at either end is allowed; Checker.sample counts it as jerk over one cycle.
     """
     if not start.at_rest:
         raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")
-    for name, unit, given, stands in zip(COORDINATES, UNITS, points[0].pose, start.pose, strict=True):
-        if abs(given - stands) > START:
+    for name, unit, begin, current in zip(COORDINATES, UNITS, points[0].pose, start.pose, strict=True):
+        if abs(begin - current) > MAX_START_OFFSET:
             text = "the trajectory begins at {} = {}, the robot is at {}: go there first, {}".format(
-                name, *apart(given, stands, unit), GO_THERE
+                name, *apart(begin, current, unit), GO_THERE_HINT
             )
-            raise RefusedError(RefusalCode.WRONG_START, text, value=given, limit=stands)
+            raise RefusedError(RefusalCode.WRONG_START, text, value=begin, limit=current)
     ends = (
         (RefusalCode.WRONG_START, "begins", "let it begin at rest, as the robot stands", points[0]),
         (RefusalCode.WRONG_END, "ends", "let it end at rest", points[-1]),
     )
     for code, does, remedy, point in ends:
-        for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or STILL, strict=True):
-            if abs(value) > STANDS:
+        for name, unit, value in zip(COORDINATES, ("m/s", "m/s", "rad/s"), point.velocity or ZERO_RATES, strict=True):
+            if abs(value) > REST_VELOCITY:
                 text = f"the trajectory {does} with {worded(value, unit)} in {name}: {remedy}"
                 raise RefusedError(code, text, value=value, limit=0.0)

@@ -1,7 +1,8 @@
-"""Ruckig, and what of its answers has to be dealt with."""
+"""Calls to Ruckig, with workarounds for its failures."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,26 +10,32 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 
 from trirail.errors import RefusalCode, RefusedError
+from trirail.kinematics.arrays import Array
 from trirail.motion.paths import Path
-from trirail.motion.runs import NO_TOOL, MotionState, from_ruckig, tools_of
+from trirail.motion.runs import NO_TOOL, MotionState, from_ruckig, repeat_tool
 
 JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
-"""Ruckig finds no solution just where one kind of profile gives way to another, as for a distance of 2 a³ / j²
-from rest to rest: there a hair less jerk has one."""
-FASTEST = 1e6
-"""A limit for where nothing moves [m/s, m/s², m/s³]."""
+"""Shares of the jerk limit that are tried in turn. Ruckig fails exactly at the border between two kinds of profile, for
+example for a distance of 2 a³ / j² from rest to rest; slightly less jerk has a solution there."""
+PARALLEL_TOLERANCE = 1e-9
+"""Motion across a line that counts as rounding [m/s, m/s², m/s³; relative to the greatest if that is above 1]."""
+UNBOUNDED_LIMIT = 1e6
+"""Limit in place of infinity, for motions that no limit bounds [m/s, m/s², m/s³]."""
 
 
 class Kinodynamic(NamedTuple):
-    """Greatest velocity, acceleration and jerk in each coordinate [m/s, rad/s, …]."""
+    """Velocity, acceleration and jerk limits of each coordinate [m/s, rad/s, …]."""
 
     velocity: Sequence[float]
     acceleration: Sequence[float]
     jerk: Sequence[float]
 
 
-def solved(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory) -> bool:
-    """Whether Ruckig has found a trajectory. Some of its failures raise, one (-101) by not being in its own enum."""
+def try_solve(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory) -> bool:
+    """Return whether Ruckig finds a trajectory.
+
+    Some of its failures raise; code -101 raises ValueError because it is missing in Ruckig's own enum.
+    """
     try:
         return ruckig.calculate(request, trajectory) in (Result.Working, Result.Finished)
     except (RuckigError, ValueError):
@@ -36,10 +43,10 @@ def solved(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory) -> b
 
 
 def solve_within(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory, jerk: Sequence[float]) -> None:
-    """Have Ruckig find a trajectory for a request that lacks its limits of jerk. Raises RefusedError."""
+    """Solve a request with these jerk limits, or slightly lower ones. Raises RefusedError."""
     for share in JERK_SHARES:
         request.max_jerk = [share * limit for limit in jerk]
-        if solved(ruckig, request, trajectory):
+        if try_solve(ruckig, request, trajectory):
             return
     raise RefusedError(
         RefusalCode.NO_PLAN, "no motion leads there from the present one: send the goal again when it holds"
@@ -47,10 +54,10 @@ def solve_within(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory
 
 
 class Solver:
-    """Asks Ruckig for paths; none of them is looked at."""
+    """Path solver over Ruckig; the paths are not checked against the workspace."""
 
     def __init__(self) -> None:
-        self._together, self._along_a_line = Ruckig(3), Ruckig(1)
+        self._three_axes, self._one_axis = Ruckig(3), Ruckig(1)
 
     def to_rest(
         self,
@@ -60,24 +67,56 @@ class Solver:
         in_sliders: bool = False,
         tool: Sequence[float] = NO_TOOL,
     ) -> Path:
-        """Return the way to rest at a target, straight from rest. Raises RefusedError.
+        """Return the path to rest at a target, straight if it starts at rest. Raises RefusedError.
 
-        It is one of the sliders with `in_sliders`, else one of a tool's pose, (u, v) in the platform's frame [m].
+        The target is slider positions with `in_sliders`, else the pose of a tool, (u, v) in the platform's frame [m].
         """
         if start.at_rest:
             return self._straight(start.pose, target, limits, in_sliders, tool)
         request = _request(start, limits)
         request.target_position = list(target)
-        return self._solved(self._together, request, limits.jerk, in_sliders, tool)
+        return self._solve(self._three_axes, request, limits.jerk, in_sliders, tool)
 
     def to_velocity(
         self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic, tool: Sequence[float] = NO_TOOL
     ) -> Path:
-        """Return the quickest way to a tool's velocity [m/s, rad/s]. Raises RefusedError."""
+        """Return the quickest path to a tool's velocity [m/s, rad/s]. Raises RefusedError."""
         request = _request(start, limits)
         request.control_interface = ControlInterface.Velocity
         request.target_velocity = list(velocity)
-        return self._solved(self._together, request, limits.jerk, tool=tool)
+        return self._solve(self._three_axes, request, limits.jerk, tool=tool)
+
+    def to_velocity_straight(
+        self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic, tool: Sequence[float] = NO_TOOL
+    ) -> Path:
+        """Return the path to a tool's velocity along one line if the motion begins on it; else as to_velocity.
+
+        Ruckig's phase synchronisation fails on some of these paths, as in `_straight`.
+        """
+        direction = np.array(velocity if any(velocity) else start.velocity)
+        farthest = float(np.abs(direction).max())
+        path = self.to_velocity(start, velocity, limits, tool)
+        moving = np.array((start.velocity, start.acceleration))
+        if (
+            farthest == 0.0
+            or not _is_parallel(moving, direction)
+            or _is_parallel(np.swapaxes(path.pieces[:, :, 1:4], 1, 2), direction)
+        ):
+            return path
+        shares, axis = direction / farthest, int(np.abs(direction).argmax())
+        sign = math.copysign(1.0, direction[axis])
+        with np.errstate(divide="ignore", over="ignore"):  # a coordinate at rest sets no bound
+            _, acceleration, jerk = (np.array(limits) / np.abs(shares)).min(axis=1)
+        request = InputParameter(1)
+        request.control_interface = ControlInterface.Velocity
+        request.current_velocity = [sign * start.velocity[axis]]
+        request.current_acceleration = [sign * start.acceleration[axis]]
+        request.target_velocity = [sign * velocity[axis]]
+        request.max_acceleration = [min(acceleration, UNBOUNDED_LIMIT)]
+        along = self._solve(self._one_axis, request, [min(jerk, UNBOUNDED_LIMIT)])
+        pieces = along.pieces * shares[:, None]
+        pieces[:, :, 0] += start.pose
+        return Path(along.knots, pieces, tools=repeat_tool(tool, len(pieces)))
 
     def _straight(
         self,
@@ -87,26 +126,29 @@ class Solver:
         in_sliders: bool,
         tool: Sequence[float],
     ) -> Path:
-        """Return the straight way from rest to rest, in the coordinate that goes farthest; the others share its time.
+        """Return the straight path from rest to rest: Ruckig's for the farthest coordinate, scaled for the others.
 
-        Ruckig's phase synchronisation gives up where one coordinate's velocity, acceleration or jerk would have to be
-        lower than it takes alone: three goals in a hundred then left their line.
+        Ruckig's phase synchronisation fails where one coordinate would have to use less velocity, acceleration or jerk
+        than it uses alone; with it, 3 % of the goals left their line.
         """
         length = np.subtract(target, begin)
         farthest = float(np.abs(length).max())
         shares = length / farthest if farthest else np.zeros(3)
-        with np.errstate(divide="ignore", over="ignore"):  # a coordinate that stays where it is bounds nothing
+        with np.errstate(divide="ignore", over="ignore"):  # a coordinate at rest sets no bound
             velocity, acceleration, jerk = (np.array(limits) / np.abs(shares)).min(axis=1)
         request = InputParameter(1)
         request.target_position = [farthest]
-        request.max_velocity, request.max_acceleration = [min(velocity, FASTEST)], [min(acceleration, FASTEST)]
-        along = self._solved(self._along_a_line, request, [min(jerk, FASTEST)])
+        request.max_velocity, request.max_acceleration = (
+            [min(velocity, UNBOUNDED_LIMIT)],
+            [min(acceleration, UNBOUNDED_LIMIT)],
+        )
+        along = self._solve(self._one_axis, request, [min(jerk, UNBOUNDED_LIMIT)])
         pieces = along.pieces * shares[:, None]
         pieces[:, :, 0] += begin
-        return Path(along.knots, pieces, in_sliders, tools_of(tool, len(pieces)))
+        return Path(along.knots, pieces, in_sliders, repeat_tool(tool, len(pieces)))
 
     @staticmethod
-    def _solved(
+    def _solve(
         ruckig: Ruckig,
         request: InputParameter,
         jerk: Sequence[float],
@@ -118,8 +160,14 @@ class Solver:
         return from_ruckig(trajectory, in_sliders, tool)
 
 
+def _is_parallel(rows: Array, direction: Array) -> bool:
+    """Return whether all rows (..., 3) are parallel to a direction (3,), except for rounding."""
+    across = rows - (rows @ direction)[..., None] * direction / (direction @ direction)
+    return bool(np.abs(across).max(initial=0.0) <= PARALLEL_TOLERANCE * max(1.0, float(np.abs(rows).max(initial=0.0))))
+
+
 def _request(start: MotionState, limits: Kinodynamic) -> InputParameter:
-    """Return what Ruckig is asked from a state of motion, but for where to, and for the limits of jerk."""
+    """Return Ruckig's input for a state of motion, without target and jerk limits."""
     request = InputParameter(3)
     request.current_position = list(start.pose)
     request.current_velocity = list(start.velocity)

@@ -1,4 +1,4 @@
-"""Straight paths, in pose space or in slider space, made as fast as platform and sliders allow."""
+"""Time-optimal straight paths in pose space or slider space."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from trirail.kinematics.closed_forward import LEGS_TYPE, forward_motion
 from trirail.kinematics.closure import inverse_motion
 from trirail.kinematics.compiled import compiled
 from trirail.kinematics.recursion import ZERO
-from trirail.motion.paths import ROUNDING, Path, law_at, transfer
-from trirail.motion.time_optimal import FIXED, minimise_time, spline_states, too_fast
+from trirail.motion.paths import ROUNDING, Path, law_at, transfer_to_point
+from trirail.motion.time_optimal import END_COEFFICIENTS, limit_excess, minimise_time, spline_states
 
 __all__ = ["time_optimal"]
 
 INTERVALS = 32
-"""In which jerk is constant: with ten times as many a way takes a quarter of a percent less."""
-CELLS = 64
-"""Of a line, between whose ends its derivatives are interpolated."""
-BETWEEN = 0.999
-"""Share of the limits that is made use of at the ends of intervals: the rest is for what lies between."""
-START = 1.01
-"""How many times slower than just within limits the search begins."""
+"""Intervals of constant jerk. Ten times as many would shorten a path by only 0.25 %."""
+SAMPLE_CELLS = 64
+"""Cells of a line, within which its derivatives are interpolated."""
+KNOT_LIMIT_SHARE = 0.999
+"""Share of the limits that is used at the ends of intervals; the rest covers peaks between them."""
+INITIAL_SLOWDOWN = 1.01
+"""Factor by which the first iterate is slower than just within the limits."""
 
 
 def time_optimal(
@@ -35,37 +35,48 @@ def time_optimal(
     centre: Array,
     near: Sequence[float],
 ) -> Path | None:
-    """Return the fastest straight way from rest where a path begins to rest where it ends; None where there is none.
+    """Return the fastest straight path from rest to rest between the ends of a path; None if the method fails.
 
-    Rows velocity, acceleration and jerk (3, 3) limit the coordinates in which the path is given, `own`, and those of
-    the other space, `others`: platform or sliders; `centre` (2, 3) those of the platform's centre in x and y, where
-    the path is that of another point. `near` is a pose on the branch of a path in slider space. The limits are held at
-    some moments only: the way is to be looked at, as every path is.
+    The limits hold at discrete times only; Checker samples the result like every other path.
+
+    Parameters
+    ----------
+    legs : Array
+        The robot's packed legs.
+    path : Path
+        Straight path that gives the line and the first iterate.
+    own, others : (3, 3)
+        Limits of the path's own coordinates, and of those of the other space (platform or sliders): rows velocity,
+        acceleration, jerk.
+    centre : (2, 3)
+        Limits of the platform's centre in x and y, for a path of another point.
+    near : (3,)
+        Pose on the branch of a path in slider space.
     """
     begin = path.pieces[0, :, 0].copy()
     length = path.end - begin
     square = float((length * length).sum())
     limits = np.empty((6 if len(path.tools) else 4, 3))
-    samples = np.empty((CELLS + 1, len(limits), 2))
+    samples = np.empty((SAMPLE_CELLS + 1, len(limits), 2))
     branch = np.array(near, dtype=np.float64)
     tool = path.tools[0] if len(path.tools) else np.zeros(2)
-    if math.sqrt(square) <= ROUNDING or _sample(legs, begin, length, path.in_sliders, tool, branch, samples):
+    if math.sqrt(square) <= ROUNDING or _sample_line(legs, begin, length, path.in_sliders, tool, branch, samples):
         return None
     limits[:3] = np.array(others).T
     limits[3] = 1.0 / (np.abs(length) / np.array(own)).max(axis=1)
     limits[4:] = centre[: len(limits) - 4]
-    limits *= BETWEEN
-    behind = (path.pieces * length[:, None]).sum(axis=1, keepdims=True) / square
-    behind[:, :, 0] -= float((begin * length).sum()) / square
-    coefficients, step = np.empty(INTERVALS + FIXED), path.duration / INTERVALS
-    _resample(path.knots, behind, step, coefficients)
-    step *= START * too_fast(samples, limits, coefficients, step)
+    limits *= KNOT_LIMIT_SHARE
+    progress = (path.pieces * length[:, None]).sum(axis=1, keepdims=True) / square
+    progress[:, :, 0] -= float((begin * length).sum()) / square
+    coefficients, step = np.empty(INTERVALS + END_COEFFICIENTS), path.duration / INTERVALS
+    _resample(path.knots, progress, step, coefficients)
+    step *= INITIAL_SLOWDOWN * limit_excess(samples, limits, coefficients, step)
     step = minimise_time(samples, limits, coefficients, step)
     if not math.isfinite(step):
         return None
     states = np.empty((INTERVALS, 4))
     spline_states(coefficients, step, states)
-    slower = max(1.0, _fastest(states, step) / limits[3, 0])
+    slower = max(1.0, _peak_velocity(states, step) / limits[3, 0])
     states /= slower ** np.arange(4.0)
     pieces = np.zeros((INTERVALS, 3, 6))
     pieces[:, :, :4] = (states / (1.0, 1.0, 2.0, 6.0))[:, None] * length[:, None]
@@ -74,10 +85,10 @@ def time_optimal(
     return Path(knots, pieces, path.in_sliders, np.tile(path.tools[:1], (INTERVALS, 1)))
 
 
-def _fastest(states: Array, step: float) -> float:
-    """Return the greatest velocity of a law from its states, v, a, j after sigma, at the beginning of intervals.
+def _peak_velocity(states: Array, step: float) -> float:
+    """Return the greatest velocity of a law, from its states sigma, v, a, j at the start of intervals (n, 4).
 
-    It may be within an interval, and a goal's own limits are known to nobody who looks at the path later.
+    The peak may be within an interval. A later check cannot find it, because it does not know a goal's own limits.
     """
     _, v, a, j = states.T
     turn = np.clip(np.divide(-a, j, out=np.zeros_like(a), where=j != 0.0), 0.0, step)
@@ -85,8 +96,10 @@ def _fastest(states: Array, step: float) -> float:
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], b1, f8[::1], f8[::1], f8[:, :, ::1])")
-def _sample(legs: Array, begin: Array, length: Array, in_sliders: bool, tool: Array, near: Array, out: Array) -> int:
-    """Write how the other space's coordinates, sigma itself and a tool path's centre change with sigma.
+def _sample_line(
+    legs: Array, begin: Array, length: Array, in_sliders: bool, tool: Array, near: Array, out: Array
+) -> int:
+    """Write first and second derivatives by sigma of the other space's coordinates, sigma, and a tool path's centre.
 
     Returns 0, or a code of forward_into.
     """
@@ -103,7 +116,7 @@ def _sample(legs: Array, begin: Array, length: Array, in_sliders: bool, tool: Ar
             motion[0, 0], motion[0, 1], motion[0, 2] = at
             motion[1] = length
             motion[2] = 0.0
-            transfer(motion, -tool[0], -tool[1])
+            transfer_to_point(motion, -tool[0], -tool[1])
             code = inverse_motion(legs, motion, other)
         if code:
             return code
@@ -117,8 +130,8 @@ def _sample(legs: Array, begin: Array, length: Array, in_sliders: bool, tool: Ar
 
 @compiled("void(f8[::1], f8[:, :, ::1], f8, f8[::1])")
 def _resample(knots: Array, pieces: Array, step: float, coefficients: Array) -> None:
-    """Write the coefficients of a spline like a law: the same where the law is one cubic for as long as two steps."""
+    """Write the coefficients of a spline that approximates a law; exact where the law is one cubic for two steps."""
     for k in range(len(coefficients)):
         sigma, _, change = law_at(knots, pieces, (k - 1) * step)
         coefficients[k] = sigma - step**2 * change / 6.0
-    coefficients[:FIXED], coefficients[-FIXED:] = 0.0, 1.0
+    coefficients[:END_COEFFICIENTS], coefficients[-END_COEFFICIENTS:] = 0.0, 1.0

@@ -1,17 +1,17 @@
-"""The shortest time from rest to rest along a line, within limits of velocity, acceleration and jerk.
+"""Interior-point method for the shortest time from rest to rest along a line, within limits up to jerk.
 
-An interior-point method. sigma(t), the share of the line that is behind, is a cubic B-spline with n intervals of h
-seconds: its jerk is constant in each of them. Of its n + 3 coefficients the first three are zero and the last three
-one; the others, and ln h, are unknown. Each coordinate of platform and sliders is a function q(sigma), and with v, a, j
+sigma(t), the completed share of the line, is a cubic B-spline with n intervals of h seconds; its jerk is constant in
+each of them. Of its n + 3 coefficients the first three are zero and the last three one; the others, and ln h, are
+unknown. Each coordinate of platform and sliders is a function q(sigma), and with v, a, j
 for the derivatives of sigma in time
 
     velocity q' v    acceleration q' a + q'' v²    jerk q' j + 3 q'' v a + q''' v³
 
 are, as shares f of their limits, kept between -1 and 1 at moments of every interval by a barrier:
 ln h / mu - sum ln (1 - f²) is minimised for ever smaller mu (Boyd and Vandenberghe, Convex Optimization, chapter 11).
-Newton's steps leave the second derivatives of f out, as Gauss and Newton do: a banded system, bordered by ln h.
+Newton's steps omit the second derivatives of f (Gauss-Newton), which leaves a banded system, bordered by ln h.
 
-Compiled. What is found is proven by motion/feasibility.py, as every path is.
+The functions are compiled. motion/feasibility.py checks the result, like every other path.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ import numpy as np
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 
-__all__ = ["FIXED", "minimise_time", "spline_states", "too_fast"]
+__all__ = ["END_COEFFICIENTS", "limit_excess", "minimise_time", "spline_states"]
 
-SPAN = 4
+COEFFICIENTS_PER_INTERVAL = 4
 """Coefficients that a cubic B-spline depends on within an interval."""
-FIXED = 3
-"""Coefficients that rest at an end gives."""
-PARTS = 2
-"""Of an interval, at whose ends the limits are held."""
-FIRST_MU, LAST_MU, SHRINK = 1e-2, 1e-5, 0.1
-"""The weight of the barrier against ln h: what the last one costs is less than a thousandth of the time."""
-DECREMENT = 0.5
-"""Gain that Newton's step promises below which mu becomes smaller."""
-SUFFICIENT = 1e-4
-"""Share of that gain with which a step is content (Armijo)."""
-SMALLEST = 1e-9
-"""Share of a step below which none is tried."""
-MOST_STEPS = 100
-"""Of Newton's method; it takes about thirty."""
-HAIR = 1.0 + 1e-12
-"""More of the diagonal, so that rounding leaves the system positive definite."""
+END_COEFFICIENTS = 3
+"""Coefficients at each end that rest determines."""
+CHECKS_PER_INTERVAL = 2
+"""Parts of an interval; the limits hold at the ends of each."""
+FIRST_MU, LAST_MU, MU_FACTOR = 1e-2, 1e-5, 0.1
+"""Weights of the barrier against ln h; the last one costs less than a thousandth of the time."""
+CENTRED_GAIN = 0.5
+"""Predicted gain of a Newton step below which mu is reduced."""
+ARMIJO_SHARE = 1e-4
+"""Share of the predicted gain that a step must reach (Armijo condition)."""
+MIN_STEP_SHARE = 1e-9
+"""Share of a step below which the line search ends."""
+MAX_NEWTON_STEPS = 100
+"""Bound on Newton steps; about thirty are usual."""
+DIAGONAL_FACTOR = 1.0 + 1e-12
+"""Growth of the diagonal that keeps the system positive definite despite rounding."""
 
 
 class Derivatives(NamedTuple):
-    """Of the barrier, by the n - 3 free coefficients and by ln h."""
+    """Derivatives of the barrier by the n - 3 free coefficients and by ln h."""
 
     band: Array
     """Hessian by the coefficients, (n - 3, 4): column d holds the d-th entry to the left of the diagonal."""
@@ -59,8 +59,8 @@ class Derivatives(NamedTuple):
 
 
 @compiled()
-def _along(samples: Array, sigma: float, q: Array) -> None:
-    """Write the first four derivatives of the coordinates by sigma, (m, 4). Between samples the first is a cubic."""
+def _coordinate_derivatives(samples: Array, sigma: float, q: Array) -> None:
+    """Write the first four derivatives of the coordinates by sigma, (m, 4); between samples the first is a cubic."""
     cells = len(samples) - 1
     k = min(max(int(sigma * cells), 0), cells - 1)
     u = sigma * cells - k
@@ -75,25 +75,25 @@ def _along(samples: Array, sigma: float, q: Array) -> None:
 
 
 @compiled()
-def _weights(u: float, h: float, out: Array) -> None:
-    """Write by what a spline's sigma, v, a, j, (4, 4), multiply the coefficients of an interval, at a share u of it."""
+def _spline_weights(u: float, h: float, out: Array) -> None:
+    """Write the weights (4, 4) of an interval's coefficients in sigma, v, a, j, at a share u of the interval."""
     w = 1.0 - u
     out[0, 0], out[0, 3] = w**3 / 6.0, u**3 / 6.0
     out[0, 1], out[0, 2] = (4.0 - 3.0 * u**2 * (2.0 - u)) / 6.0, (4.0 - 3.0 * w**2 * (2.0 - w)) / 6.0
     out[1, 0], out[1, 1], out[1, 2], out[1, 3] = -(w**2), u * (3.0 * u - 4.0), w * (4.0 - 3.0 * w), u**2
     out[2, 0], out[2, 1], out[2, 2], out[2, 3] = w, 1.0 - 3.0 * w, 1.0 - 3.0 * u, u
     out[3, 0], out[3, 1], out[3, 2], out[3, 3] = -1.0, 3.0, -3.0, 1.0
-    for x in range(SPAN):
+    for x in range(COEFFICIENTS_PER_INTERVAL):
         out[1, x] /= 2.0 * h
         out[2, x] /= h**2
         out[3, x] /= h**3
 
 
 @compiled()
-def _state(c: Array, k: int, weights: Array) -> tuple[float, float, float, float]:
+def _spline_state(c: Array, k: int, weights: Array) -> tuple[float, float, float, float]:
     """Return sigma, v, a, j within interval k."""
     sigma = v = a = j = 0.0
-    for x in range(SPAN):
+    for x in range(COEFFICIENTS_PER_INTERVAL):
         sigma += weights[0, x] * c[k + x]
         v += weights[1, x] * c[k + x]
         a += weights[2, x] * c[k + x]
@@ -102,7 +102,7 @@ def _state(c: Array, k: int, weights: Array) -> tuple[float, float, float, float
 
 
 @compiled()
-def _quantity(q: Array, order: int, v: float, a: float, j: float, by: Array) -> float:
+def _rate_of_coordinate(q: Array, order: int, v: float, a: float, j: float, by: Array) -> float:
     """Return velocity, acceleration or jerk (order 0, 1, 2) of a coordinate; write its gradient by sigma, v, a, j."""
     value: float
     if order == 0:
@@ -119,12 +119,12 @@ def _quantity(q: Array, order: int, v: float, a: float, j: float, by: Array) -> 
 
 
 @compiled()
-def _add(out: Derivatives, k: int, chain: Array, slope: Array, curvature: Array) -> None:
-    """Add derivatives by sigma, v, a, j, (4,) and (4, 4), of which `chain` (4, 5) are those by what is unknown."""
+def _add_derivatives(out: Derivatives, k: int, chain: Array, slope: Array, curvature: Array) -> None:
+    """Add derivatives by sigma, v, a, j, (4,) and (4, 4); `chain` (4, 5) holds their derivatives by the unknowns."""
     free = len(out.gradient)
     of_x = np.empty(4)
-    for x in range(SPAN + 1):
-        row, in_time = k + x - FIXED, x == SPAN
+    for x in range(COEFFICIENTS_PER_INTERVAL + 1):
+        row, in_time = k + x - END_COEFFICIENTS, x == COEFFICIENTS_PER_INTERVAL
         if not (in_time or 0 <= row < free):
             continue
         first = 0.0
@@ -138,15 +138,15 @@ def _add(out: Derivatives, k: int, chain: Array, slope: Array, curvature: Array)
         else:
             out.gradient[row] += first
         for y in range(x + 1):
-            column = k + y - FIXED
-            if not (y == SPAN or 0 <= column < free):
+            column = k + y - END_COEFFICIENTS
+            if not (y == COEFFICIENTS_PER_INTERVAL or 0 <= column < free):
                 continue
             second = 0.0
             for e in range(4):
                 second += of_x[e] * chain[e, y]
             if not in_time:
                 out.band[row, x - y] += second
-            elif y < SPAN:
+            elif y < COEFFICIENTS_PER_INTERVAL:
                 out.border[column] += second
             else:
                 out.by_time[1] += second
@@ -154,28 +154,28 @@ def _add(out: Derivatives, k: int, chain: Array, slope: Array, curvature: Array)
 
 @compiled()
 def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives) -> float:
-    """Return the barrier and write its derivatives; infinite, and without derivatives, where a limit is reached."""
+    """Return the barrier and write its derivatives; infinite, without derivatives, if a limit is reached."""
     q, by = np.empty((len(limits), 4)), np.empty(4)
-    weights, chain = np.empty((4, SPAN)), np.empty((4, SPAN + 1))
+    weights, chain = np.empty((4, COEFFICIENTS_PER_INTERVAL)), np.empty((4, COEFFICIENTS_PER_INTERVAL + 1))
     slope, curvature = np.empty(4), np.empty((4, 4))
     out.band[:] = 0.0
     out.gradient[:] = out.border[:] = out.by_time[:] = 0.0
     total = 0.0
-    for part in range(PARTS + 1):
-        _weights(part / PARTS, h, weights)
-        chain[:, :SPAN] = weights
-        # At the end of an interval only jerk is another than at the beginning of the next.
-        lowest = 2 if part == PARTS else 0
-        for k in range(len(c) - FIXED):
-            sigma, v, a, j = _state(c, k, weights)
-            _along(samples, sigma, q)
+    for part in range(CHECKS_PER_INTERVAL + 1):
+        _spline_weights(part / CHECKS_PER_INTERVAL, h, weights)
+        chain[:, :COEFFICIENTS_PER_INTERVAL] = weights
+        # At the end of an interval only jerk differs from the start of the next one.
+        lowest = 2 if part == CHECKS_PER_INTERVAL else 0
+        for k in range(len(c) - END_COEFFICIENTS):
+            sigma, v, a, j = _spline_state(c, k, weights)
+            _coordinate_derivatives(samples, sigma, q)
             slope[:] = 0.0
             curvature[:] = 0.0
             slack = 1.0
             for i in range(len(limits)):
                 for order in range(lowest, 3):
                     limit = limits[i, order]
-                    share = _quantity(q[i], order, v, a, j, by) / limit
+                    share = _rate_of_coordinate(q[i], order, v, a, j, by) / limit
                     if not abs(share) < 1.0:
                         return math.inf
                     slack *= 1.0 - share * share
@@ -185,18 +185,23 @@ def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives
                         for f in range(e + 1):
                             curvature[e, f] += (up * up + down * down) * by[e] * by[f]
             total -= math.log(slack)
-            chain[0, SPAN], chain[1, SPAN], chain[2, SPAN], chain[3, SPAN] = 0.0, -v, -2.0 * a, -3.0 * j
-            _add(out, k, chain, slope, curvature)
+            (
+                chain[0, COEFFICIENTS_PER_INTERVAL],
+                chain[1, COEFFICIENTS_PER_INTERVAL],
+                chain[2, COEFFICIENTS_PER_INTERVAL],
+                chain[3, COEFFICIENTS_PER_INTERVAL],
+            ) = 0.0, -v, -2.0 * a, -3.0 * j
+            _add_derivatives(out, k, chain, slope, curvature)
     return total
 
 
 @compiled()
 def _factorise(band: Array) -> bool:
-    """Replace a banded matrix by its Cholesky factor; whether it is positive definite."""
+    """Replace a banded matrix by its Cholesky factor; return whether it is positive definite."""
     for row in range(len(band)):
-        for d in range(min(SPAN - 1, row), -1, -1):
+        for d in range(min(COEFFICIENTS_PER_INTERVAL - 1, row), -1, -1):
             rest = band[row, d]
-            for e in range(d + 1, min(SPAN - 1, row) + 1):
+            for e in range(d + 1, min(COEFFICIENTS_PER_INTERVAL - 1, row) + 1):
                 rest -= band[row, e] * band[row - d, e - d]
             if d:
                 band[row, d] = rest / band[row - d, 0]
@@ -209,22 +214,22 @@ def _factorise(band: Array) -> bool:
 
 @compiled()
 def _substitute(band: Array, x: Array) -> None:
-    """Solve for a right side in place, with the factor."""
+    """Solve for the right-hand side `x` in place, with the Cholesky factor `band`."""
     n = len(band)
     for row in range(n):
-        for d in range(1, min(SPAN - 1, row) + 1):
+        for d in range(1, min(COEFFICIENTS_PER_INTERVAL - 1, row) + 1):
             x[row] -= band[row, d] * x[row - d]
         x[row] /= band[row, 0]
     for row in range(n - 1, -1, -1):
-        for d in range(1, min(SPAN - 1, n - 1 - row) + 1):
+        for d in range(1, min(COEFFICIENTS_PER_INTERVAL - 1, n - 1 - row) + 1):
             x[row] -= band[row + d, d] * x[row + d]
         x[row] /= band[row, 0]
 
 
 @compiled()
-def _newton(at: Derivatives, mu: float, step: Array) -> tuple[float, float]:
-    """Write Newton's step of the coefficients; return that of ln h and the gain that both promise, NaN without."""
-    at.band[:, 0] *= HAIR
+def _newton_step(at: Derivatives, mu: float, step: Array) -> tuple[float, float]:
+    """Write the Newton step of the coefficients; return the step of ln h and the predicted gain, NaN if singular."""
+    at.band[:, 0] *= DIAGONAL_FACTOR
     if not _factorise(at.band):
         return 0.0, math.nan
     by_border, by_gradient = at.border.copy(), at.gradient.copy()
@@ -244,59 +249,72 @@ def _newton(at: Derivatives, mu: float, step: Array) -> tuple[float, float]:
 
 @compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)")
 def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
-    """Improve the coefficients (n + 3,) of a law within limits, in place; return its new h [s], NaN without one.
+    """Minimise the time of a law within limits.
 
-    `samples` (k + 1, m, 2) are the first and second derivatives by sigma of m coordinates, even over sigma from 0 to 1.
-    `limits` (m, 3) are those of their velocity, acceleration and jerk.
+    Parameters
+    ----------
+    samples : (k + 1, m, 2)
+        First and second derivatives by sigma of m coordinates, evenly spaced from sigma = 0 to 1.
+    limits : (m, 3)
+        Velocity, acceleration and jerk limits of the coordinates.
+    c : (n + 3,)
+        Coefficients of a law within the limits; improved in place.
+    h : float
+        Duration of its intervals [s].
+
+    Returns
+    -------
+    float
+        New duration of the intervals [s]; NaN if the method fails.
     """
-    free = len(c) - 2 * FIXED
-    derivatives = Derivatives(np.empty((free, SPAN)), np.empty(free), np.empty(free), np.empty(2))
+    free = len(c) - 2 * END_COEFFICIENTS
+    derivatives = Derivatives(np.empty((free, COEFFICIENTS_PER_INTERVAL)), np.empty(free), np.empty(free), np.empty(2))
     step, trial = np.empty(free), c.copy()
     log_h, mu = math.log(h), FIRST_MU
     now = _barrier(samples, limits, c, h, derivatives)
-    for _ in range(MOST_STEPS):
-        of_time, gain = _newton(derivatives, mu, step)
+    for _ in range(MAX_NEWTON_STEPS):
+        of_time, gain = _newton_step(derivatives, mu, step)
         if not (math.isfinite(now) and math.isfinite(gain)):
             return math.nan
         share, moved = 1.0, False
-        while not moved and share > SMALLEST:
+        while not moved and share > MIN_STEP_SHARE:
             for k in range(free):
-                trial[FIXED + k] = c[FIXED + k] + share * step[k]
+                trial[END_COEFFICIENTS + k] = c[END_COEFFICIENTS + k] + share * step[k]
             then = _barrier(samples, limits, trial, math.exp(log_h + share * of_time), derivatives)
-            moved = then - now + share * of_time / mu <= -SUFFICIENT * share * gain
+            moved = then - now + share * of_time / mu <= -ARMIJO_SHARE * share * gain
             share /= 2.0
-        if not moved:  # rounding leaves no more to gain
+        if not moved:  # the remaining gain is below rounding
             break
         c[:] = trial
         log_h += 2.0 * share * of_time
         now = then
-        if gain < DECREMENT:
+        if gain < CENTRED_GAIN:
             if mu <= LAST_MU:
                 break
-            mu *= SHRINK
+            mu *= MU_FACTOR
     return math.exp(log_h)
 
 
 @compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)")
-def too_fast(samples: Array, limits: Array, c: Array, h: float) -> float:
-    """Return how many times too fast a law is, by samples and limits as of minimise_time."""
-    q, by, weights, most = np.empty((len(limits), 4)), np.empty(4), np.empty((4, SPAN)), 0.0
-    for part in range(PARTS + 1):
-        _weights(part / PARTS, h, weights)
-        for k in range(len(c) - FIXED):
-            sigma, v, a, j = _state(c, k, weights)
-            _along(samples, sigma, q)
+def limit_excess(samples: Array, limits: Array, c: Array, h: float) -> float:
+    """Return the factor by which a law must be slowed to fit; parameters as of minimise_time."""
+    q, by, weights, most = np.empty((len(limits), 4)), np.empty(4), np.empty((4, COEFFICIENTS_PER_INTERVAL)), 0.0
+    for part in range(CHECKS_PER_INTERVAL + 1):
+        _spline_weights(part / CHECKS_PER_INTERVAL, h, weights)
+        for k in range(len(c) - END_COEFFICIENTS):
+            sigma, v, a, j = _spline_state(c, k, weights)
+            _coordinate_derivatives(samples, sigma, q)
             for i in range(len(limits)):
                 for order in range(3):
-                    share = abs(_quantity(q[i], order, v, a, j, by)) / limits[i, order]
+                    share = abs(_rate_of_coordinate(q[i], order, v, a, j, by)) / limits[i, order]
                     most = max(most, share ** (1.0 / (order + 1)))
     return most
 
 
 @compiled("void(f8[::1], f8, f8[:, ::1])")
 def spline_states(c: Array, h: float, out: Array) -> None:
-    """Write sigma, v, a, j of a law at the beginning of each interval, (n, 4)."""
-    weights = np.empty((4, SPAN))
-    _weights(0.0, h, weights)
+    """Write sigma, v, a, j of a law at the start of each interval, (n, 4)."""
+    weights = np.empty((4, COEFFICIENTS_PER_INTERVAL))
+    _spline_weights(0.0, h, weights)
     for k in range(len(out)):
-        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = _state(c, k, weights)
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = _spline_state(c, k, weights)

@@ -1,4 +1,4 @@
-"""How time runs along a path: at a rate, and from one rate to another within the limits of sliders and platform."""
+"""Laws of time along a path: constant rates, and changes of rate within the limits of sliders and platform."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from collections.abc import Sequence
 from ruckig import ControlInterface, InputParameter, Ruckig, Trajectory
 
 from trirail.kinematics.geometry import Geometry
-from trirail.motion.feasibility import Checker, Sampled
-from trirail.motion.paths import Path, constant, falls
-from trirail.motion.ruckig_call import solved
-from trirail.motion.runs import Rate, Run, arrival, law_from_ruckig
+from trirail.motion.feasibility import Checker, SampleResult
+from trirail.motion.paths import Path, constant_law, law_falls
+from trirail.motion.ruckig_call import try_solve
+from trirail.motion.runs import LawState, Run, arrival_time, law_from_ruckig
 
-FINE, COARSE = 0.88, 0.6
-SHARES = (*(FINE**k for k in range(12)), *(FINE**11 * COARSE**k for k in range(1, 9)))
-"""Of the quickest change of rate, tried one after the other. To brake takes as long as its share is small: so they are
-close together where a stop is quick, and far apart where a robot with weak sliders needs any at all."""
+FINE_RATIO, COARSE_RATIO = 0.88, 0.6
+CHANGE_SHARES = (*(FINE_RATIO**k for k in range(12)), *(FINE_RATIO**11 * COARSE_RATIO**k for k in range(1, 9)))
+"""Shares of the quickest change of rate, tried in turn. The smaller the share, the longer the stop; so the steps are
+fine for quick stops, and coarse where a robot with weak sliders needs any stop at all."""
 
 
 class TimeScaling:
-    """Makes the laws of time for the paths of one robot."""
+    """Laws of time for the paths of one robot."""
 
     def __init__(self, geometry: Geometry, checker: Checker, period: float) -> None:
         self._legs = geometry.packed()
@@ -28,39 +28,44 @@ class TimeScaling:
         self._period = period
         self._ruckig = Ruckig(1)
         velocity, acceleration, jerk = checker.law_limits.T
-        # The change of rate [1/s], and its change [1/s²], at which a motion at full speed meets the platform's limits.
+        # Derivatives of the rate [1/s, 1/s²] at which a motion at full speed reaches the platform's limits.
         self._change = float((acceleration / velocity).min())
         self._change_jerk = float((jerk / velocity).min())
 
-    def begin(self, path: Path, rate: float, pose: Sequence[float]) -> Run:
-        """Start a path at a rate, or as near to it as the limits allow."""
-        rate = self.possible(path, rate, pose)
-        return Run(self._legs, path, constant(rate), rate)
+    def start_run(self, path: Path, rate: float, pose: Sequence[float]) -> Run:
+        """Return the run of a path at a rate, or at the greatest rate that the limits allow."""
+        rate = self.possible_rate(path, rate, pose)
+        return Run(self._legs, path, constant_law(rate), rate)
 
-    def possible(self, path: Path, rate: float, pose: Sequence[float]) -> float:
-        """Return the rate, or the greatest at which sliders and platform can take a whole path."""
-        return rate if rate <= 1.0 else greatest(rate, self.sample(path, constant(1.0), 0.0, path.duration, pose))
+    def possible_rate(self, path: Path, rate: float, pose: Sequence[float]) -> float:
+        """Return the rate, lowered to the greatest at which a whole path fits the limits."""
+        return (
+            rate if rate <= 1.0 else greatest_rate(rate, self.sample(path, constant_law(1.0), 0.0, path.duration, pose))
+        )
 
     def stop(self, run: Run, pose: Sequence[float], shares: Sequence[float]) -> Path | None:
-        """Return the law of a stop, from where a run is: the first of some shares of the quickest that fits, if any."""
+        """Return the law of a stop from a run's present state: the first of these shares that fits, or None."""
         for share in shares:
-            law = self.ramp(run.at, 0.0, share)
-            if law is not None and self.sample(run.path, law, 0.0, self.until(run, law, 0.0), pose).within_limits:
+            law = self.ramp(run.law_state, 0.0, share)
+            if (
+                law is not None
+                and self.sample(run.path, law, 0.0, self.last_new_time(run, law, 0.0), pose).within_limits
+            ):
                 return law
         return None
 
-    def until(self, run: Run, law: Path, rate: float) -> float:
-        """Return until when a law is to be looked at that leads a run to a rate [s]: after that nothing is new."""
-        return min(arrival(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
+    def last_new_time(self, run: Run, law: Path, rate: float) -> float:
+        """Return the time up to which a law to a rate must be sampled [s]; the motion does not change after it."""
+        return min(arrival_time(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
 
-    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> Sampled:
+    def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
         """Sample a path under a law: Checker.sample."""
         return self._checker.sample(path, law, first, until, pose)
 
-    def ramp(self, at: Rate, rate: float, share: float) -> Path | None:
-        """Return the law from one rate to another, at a share of the quickest change; None without one.
+    def ramp(self, at: LawState, rate: float, share: float) -> Path | None:
+        """Return the law from a state to a rate, at a share of the quickest change; None if there is none.
 
-        A rate that falls needs jerk enough to stop falling before it is zero: at too small a share there is no law.
+        A falling rate needs enough jerk to level out before it is negative, so a small share may have no law.
         """
         request = InputParameter(1)
         request.control_interface = ControlInterface.Velocity
@@ -69,15 +74,19 @@ class TimeScaling:
         request.max_acceleration = [max(share * self._change, abs(at.change))]
         request.max_jerk = [share * self._change_jerk]
         trajectory = Trajectory(1)
-        if not solved(self._ruckig, request, trajectory):
+        if not try_solve(self._ruckig, request, trajectory):
             return None
         law = law_from_ruckig(trajectory, rate)
-        return None if falls(law.knots, law.pieces) else law
+        return None if law_falls(law.knots, law.pieces) else law
 
 
-def greatest(rate: float, found: Sampled) -> float:
-    """Return the rate, or the greatest one that a path bears that has been looked at at its nominal rate.
+def greatest_rate(rate: float, result: SampleResult) -> float:
+    """Return the rate, lowered to the greatest that a path allows, from its samples at the nominal rate.
 
-    Every path fits at one: above that there is only what makes it slower than its limits.
+    Every path fits at rate 1; a higher rate uses the part of the limits that the path leaves free.
     """
-    return min(rate, max(1.0, 1.0 / found.excess)) if math.isnan(found.leaves_at) and found.excess > 0.0 else 1.0
+    return (
+        min(rate, max(1.0, 1.0 / result.slowdown_factor))
+        if math.isnan(result.leaves_at) and result.slowdown_factor > 0.0
+        else 1.0
+    )

@@ -1,4 +1,4 @@
-"""What the names of tools and frames mean."""
+"""Named tools and work frames."""
 
 from __future__ import annotations
 
@@ -14,46 +14,52 @@ from trirail.wire.goals import Tool
 
 
 class NamedFrames:
-    """The tools and work frames of one robot."""
+    """Tools and work frames of one robot."""
 
     def __init__(self, table: FramesTable) -> None:
         self._table = table
 
     def frame(self, name: str) -> Triple:
-        """Return a frame, x, y [m] and angle [rad] in the base frame."""
+        """Return a frame: x, y [m] and angle [rad] in the base frame. Raises RefusedError for an unknown name."""
         if name == BASE:
             return 0.0, 0.0, 0.0
-        found = self._table.work.get(name)
-        if found is None:
-            raise unknown("frame", name, (BASE, *self._table.work))
-        return found
+        entry = self._table.work.get(name)
+        if entry is None:
+            raise unknown_name("frame", name, (BASE, *self._table.work))
+        return entry
 
     def tool(self, tool: Tool | None) -> tuple[float, float]:
-        """Return a point of the platform in its own frame [m]."""
+        """Return a tool: a point of the platform in its own frame [m]. Raises RefusedError for an unknown name."""
         if not isinstance(tool, str):
             return tool or NO_TOOL
-        found = self._table.tool.get(tool)
-        if found is None:
-            raise unknown("tool", tool, tuple(self._table.tool))
-        return found
+        entry = self._table.tool.get(tool)
+        if entry is None:
+            raise unknown_name("tool", tool, tuple(self._table.tool))
+        return entry
 
 
-def point(tool: Tool | None) -> tuple[float, float]:
-    """Return the point of the platform that a planned goal is of: its name is known where the goal came in."""
+def tool_point(tool: Tool | None) -> tuple[float, float]:
+    """Return the tool of a resolved goal, as a point of the platform [m].
+
+    Raises
+    ------
+    TypeError
+        The tool is still a name.
+    """
     if isinstance(tool, str):
-        raise TypeError(f"tool {tool!r} of a planned goal is no point")
+        raise TypeError(f"tool {tool!r} of a resolved goal is a name, not a point")
     return tool or NO_TOOL
 
 
 def rotated(x: float, y: float, angle: float) -> tuple[float, float]:
-    """Return a vector, turned counterclockwise [rad]."""
+    """Return a vector rotated counterclockwise by an angle [rad]."""
     if angle == 0.0:
         return x, y
     c, s = math.cos(angle), math.sin(angle)
     return c * x - s * y, s * x + c * y
 
 
-def unknown(what: str, name: str, known: Sequence[str]) -> RefusedError:
-    """Say that there is no such tool or frame, and which ones there are."""
+def unknown_name(kind: str, name: str, known: Sequence[str]) -> RefusedError:
+    """Return the refusal of an unknown tool or frame, with the known names."""
     there_are = f"there is {', '.join(known)}" if known else "there is none in [frames.tool]: give a point, [u, v]"
-    return RefusedError(RefusalCode.UNKNOWN_FRAME, f"no {what} {name!r}: {there_are}")
+    return RefusedError(RefusalCode.UNKNOWN_FRAME, f"no {kind} {name!r}: {there_are}")

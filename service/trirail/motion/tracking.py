@@ -1,8 +1,8 @@
-"""A moving target met and gone with: smoothly where it is near, as fast as the limits allow where it is far.
+"""Planning of motion after a moving target: smooth if the target is near, as fast as the limits allow if it is far.
 
-A target is taken to keep its velocity. In the frame that goes with it, meeting it is coming to rest at the origin:
-accelerations and jerks are the same there, and the limits of velocity are shifted by the target's. Whatever is planned
-ends at rest: who hears no more of the target brakes, by the path itself.
+The planner assumes that the target keeps its velocity. In the target's moving frame, a meeting ends at rest at the
+origin; accelerations and jerks are the same there, and velocity limits are shifted by the target's velocity. Every path
+ends at rest, so that the robot brakes if no further targets arrive.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from ruckig import InputParameter, Ruckig, Synchronization, Trajectory
 
 from trirail.errors import RefusedError
 from trirail.kinematics.arrays import Array
-from trirail.motion.feasibility import Sampled
-from trirail.motion.path_planner import GENTLEST, ROOM, TOO_FAST_IN_MOTION, PathPlanner, Plan
-from trirail.motion.paths import Path, constant
-from trirail.motion.quintic import Point, between
+from trirail.motion.feasibility import SampleResult
+from trirail.motion.path_planner import LIMIT_UTILISATION, MIN_LIMIT_SHARE, TOO_FAST_IN_MOTION, PathPlanner, Plan
+from trirail.motion.paths import Path, constant_law
+from trirail.motion.quintic import Point, quintic_between
 from trirail.motion.ruckig_call import Kinodynamic, solve_within
-from trirail.motion.runs import STILL, MotionState, cut, from_ruckig, joined, nominal
+from trirail.motion.runs import ZERO_RATES, MotionState, cut, from_ruckig, joined, nominal_motion
 
-CATCH_UP = 0.05
-"""Time in which the platform comes to where its target is, smoothly, at least [s]. Behind a target whose acceleration
-is a it stays by 0.15 a CATCH_UP²; a shorter one follows closer, and passes more of a target's noise on."""
-EASE = 1.25
-"""How many times longer than the quickest way a smooth one takes at least: it fits the same limits of acceleration and
-jerk from rest to rest with a fifth to spare."""
-TRIES = 3
-"""How often a way is tried, with lower limits each time."""
-SHORTER = 2
-"""How often a path that leads out of the workspace is made to end before."""
-HALVINGS = 12
-"""Of the way to a target out of reach, until its last pose within reach is found."""
+CATCH_UP_S = 0.05
+"""Least duration of a smooth meeting. The platform lags 0.15 a CATCH_UP_S² behind a target with acceleration a; a
+shorter duration follows more closely, but passes on more of the target's noise."""
+SMOOTH_DURATION_FACTOR = 1.25
+"""Least duration of a smooth meeting relative to the quickest one; from rest to rest it then keeps the same
+acceleration and jerk limits with a margin of a fifth."""
+MAX_REPLANS = 3
+"""Plans of a meeting, each with lower limits."""
+MAX_SHORTENINGS = 2
+"""Shortenings of a path that leaves the workspace."""
+BORDER_BISECTIONS = 12
+"""Bisection steps on the line to a target out of reach, for its last pose within reach."""
 
 
-class _Aim(NamedTuple):
-    """Where the platform is to go: a pose when the path begins, and a velocity that it keeps; and what keeps it there.
+class _TrackTarget(NamedTuple):
+    """Target within reach: its pose at the start of the path, and its constant velocity.
 
-    `bound` names the limit beyond which the target itself is.
+    `bound` names the limit beyond which the requested target is.
     """
 
     pose: Sequence[float]
@@ -49,7 +49,7 @@ class _Aim(NamedTuple):
 
 
 class Tracker:
-    """Plans to follow moving targets, within the limits of platform and sliders."""
+    """Planner of motion after moving targets, within the limits of platform and sliders."""
 
     def __init__(self, planner: PathPlanner) -> None:
         self._planner, self._platform = planner, planner.platform
@@ -57,96 +57,115 @@ class Tracker:
         self._ruckig = Ruckig(3)
 
     def follow(self, start: MotionState, pose: Sequence[float], velocity: Sequence[float], hold: float) -> Plan:
-        """Plan to meet a target, that is at a pose when the path begins, and to keep its velocity; then to rest.
+        """Plan to meet a target, keep its velocity, and stop.
 
-        After `hold` [s] it brakes at the latest, whether or not it has met the target. A target that is too fast is
-        followed as fast as the limits allow, one out of reach as far as the border, straight on from where the platform
-        is. Raises RefusedError where not even braking stays inside.
+        A target that is too fast is followed as fast as the limits allow. A target out of reach is followed as far as
+        the border, on a straight line from the platform.
+
+        Parameters
+        ----------
+        start : MotionState
+            State of the platform's centre.
+        pose, velocity : (3,)
+            The target at the start of the path [m, rad, m/s, rad/s].
+        hold : float
+            Time after which the path brakes at the latest, even before it meets the target [s].
+
+        Raises
+        ------
+        RefusedError
+            Even a brake would leave the workspace.
         """
-        for aim in self._aims(start, pose, velocity):
-            plan = self._toward(start, aim, hold)
+        for target in self._reachable_targets(start, pose, velocity):
+            plan = self._plan_meeting(start, target, hold)
             if plan is not None:
                 return plan
-        path = self._planner.to_velocity(start, STILL)
-        if not self._checker.bears(self._checker.whole(path, start.pose)):
+        path = self._planner.path_to_velocity(start, ZERO_RATES)
+        if not self._checker.keeps_limits(self._checker.worst_shares(path, start.pose)):
             raise TOO_FAST_IN_MOTION
         return Plan(path)
 
     # ------------------------------------------------------------------ inside
 
-    def _aims(self, start: MotionState, pose: Sequence[float], velocity: Sequence[float]) -> Iterator[_Aim]:
-        """Yield the target, brought inside the platform's box, and the last pose within reach on the way to it."""
+    def _reachable_targets(
+        self, start: MotionState, pose: Sequence[float], velocity: Sequence[float]
+    ) -> Iterator[_TrackTarget]:
+        """Yield the target, clipped to the platform's limits, then the last pose within reach on the line to it."""
         low, high = self._bounds.box
-        met = np.add(pose, CATCH_UP * np.array(velocity))
+        met = np.add(pose, CATCH_UP_S * np.array(velocity))
         inside = np.clip(met, low, high)
         waits = inside != met
-        violation = self._bounds.pose(met) if waits.any() else None
-        aim = np.where(waits, inside, pose)
-        yield _Aim(aim.tolist(), np.where(waits, 0.0, velocity).tolist(), violation and violation.bound)
-        border, bound = self._border(start.pose, aim)
-        yield _Aim(border, STILL, bound)
+        violation = self._bounds.pose_violation(met) if waits.any() else None
+        target = np.where(waits, inside, pose)
+        yield _TrackTarget(target.tolist(), np.where(waits, 0.0, velocity).tolist(), violation and violation.bound)
+        border, bound = self._border(start.pose, target)
+        yield _TrackTarget(border, ZERO_RATES, bound)
 
-    def _border(self, pose: Sequence[float], aim: Array) -> tuple[Sequence[float], str | None]:
-        """Return the last pose within reach on the straight way to another one, and what bounds it."""
-        begin, way = np.array(pose), aim - pose
+    def _border(self, pose: Sequence[float], target: Array) -> tuple[Sequence[float], str | None]:
+        """Return the last pose within reach on the line to another pose, and the name of the limit there."""
+        begin, way = np.array(pose), target - pose
         low, high = 0.0, 1.0
-        bound = self._checker.stands_beyond(aim.tolist())
+        bound = self._checker.exceeded_bound(target.tolist())
         if bound is None:
-            return aim.tolist(), None
-        for _ in range(HALVINGS):
+            return target.tolist(), None
+        for _ in range(BORDER_BISECTIONS):
             middle = (low + high) / 2.0
-            found = self._checker.stands_beyond((begin + middle * way).tolist())
-            if found is None:
+            exceeded = self._checker.exceeded_bound((begin + middle * way).tolist())
+            if exceeded is None:
                 low = middle
             else:
-                high, bound = middle, found
+                high, bound = middle, exceeded
         border: list[float] = (begin + low * way).tolist()
         return border, bound
 
-    def _toward(self, start: MotionState, aim: _Aim, hold: float) -> Plan | None:
-        """Plan with lower and lower limits until sliders and platform can take it; None where they never can."""
+    def _plan_meeting(self, start: MotionState, target: _TrackTarget, hold: float) -> Plan | None:
+        """Plan a meeting with ever lower limits until it fits; None if it never does."""
         shares = np.ones(3)
-        for _ in range(TRIES):
+        for _ in range(MAX_REPLANS):
             limits = Kinodynamic(*(np.array(self._platform) * shares[:, None]).tolist())
-            bounds = [ROOM * most / abs(v) for v, most in zip(aim.velocity, limits.velocity, strict=True) if v]
+            bounds = [
+                LIMIT_UTILISATION * most / abs(v) for v, most in zip(target.velocity, limits.velocity, strict=True) if v
+            ]
             share = min([1.0, *bounds])
-            velocity = [share * v for v in aim.velocity]
+            velocity = [share * v for v in target.velocity]
             try:
-                quickest = self._quickest(start, aim.pose, velocity, limits)
+                quickest = self._quickest_meeting(start, target.pose, velocity, limits)
             except RefusedError:
                 return None
-            smooth = _smooth(start, aim.pose, velocity, max(CATCH_UP, EASE * quickest.duration))
+            smooth = _smooth_meeting(
+                start, target.pose, velocity, max(CATCH_UP_S, SMOOTH_DURATION_FACTOR * quickest.duration)
+            )
             for meeting in (smooth, quickest):
-                path, found, bound = self._until(start, meeting, velocity, hold)
-                if found.fits or (found.within_limits and not start.at_rest):
-                    return Plan(path, bound=bound or aim.bound)
-            if not math.isnan(found.leaves_at):
+                path, result, bound = self._follow_and_brake(start, meeting, velocity, hold)
+                if result.fits or (result.within_limits and not start.at_rest):
+                    return Plan(path, bound=bound or target.bound)
+            if not math.isnan(result.leaves_at):
                 return None
-            shares = shares * np.clip(ROOM / found.worst.max(axis=0), GENTLEST, 1.0)
+            shares = shares * np.clip(LIMIT_UTILISATION / result.worst.max(axis=0), MIN_LIMIT_SHARE, 1.0)
         return None
 
-    def _until(
+    def _follow_and_brake(
         self, start: MotionState, meeting: Path, velocity: Sequence[float], hold: float
-    ) -> tuple[Path, Sampled, str | None]:
-        """Return the way to a target and on with it up to a time, then to rest, and what was found along it.
+    ) -> tuple[Path, SampleResult, str | None]:
+        """Return the path along a meeting, with the target until `hold` [s], then to rest; its samples; and a bound.
 
-        Where it would lead out of the workspace behind the target it brakes before that; then the bound is named.
+        A path that would leave the workspace after the meeting brakes before that; only then the bound is named.
         """
-        way, until, bound = _gone_on_with(meeting, velocity, hold), hold, None
-        for _ in range(SHORTER + 1):
-            brake = self._planner.to_velocity(nominal(way, until), STILL)
+        way, until, bound = _extend_meeting(meeting, velocity, hold), hold, None
+        for _ in range(MAX_SHORTENINGS + 1):
+            brake = self._planner.path_to_velocity(nominal_motion(way, until), ZERO_RATES)
             path = joined([cut(way, until), brake])
-            found = self._checker.sample(path, constant(1.0), 0.0, path.duration, start.pose)
-            if math.isnan(found.leaves_at) or found.leaves_at <= max(meeting.duration, brake.duration):
+            result = self._checker.sample(path, constant_law(1.0), 0.0, path.duration, start.pose)
+            if math.isnan(result.leaves_at) or result.leaves_at <= max(meeting.duration, brake.duration):
                 break
-            bound = self._checker.bound(path, found.leaves_at, start.pose)
-            until = min(until, found.leaves_at) - brake.duration
-        return path, found, bound
+            bound = self._checker.bound(path, result.leaves_at, start.pose)
+            until = min(until, result.leaves_at) - brake.duration
+        return path, result, bound
 
-    def _quickest(
+    def _quickest_meeting(
         self, start: MotionState, pose: Sequence[float], velocity: Sequence[float], limits: Kinodynamic
     ) -> Path:
-        """Return the quickest way to a target, in the frame of the target and back. Raises RefusedError."""
+        """Return the quickest path to a target, solved in the frame of the target. Raises RefusedError."""
         request, trajectory = InputParameter(3), Trajectory(3)
         request.current_position = np.subtract(start.pose, pose).tolist()
         request.current_velocity = np.subtract(start.velocity, velocity).tolist()
@@ -163,14 +182,14 @@ class Tracker:
         return relative._replace(pieces=pieces)
 
 
-def _smooth(start: MotionState, pose: Sequence[float], velocity: Sequence[float], duration: float) -> Path:
-    """Return the way to a target in a time [s] with the least jerk, in the mean of its square."""
+def _smooth_meeting(start: MotionState, pose: Sequence[float], velocity: Sequence[float], duration: float) -> Path:
+    """Return the path to a target in a duration [s] with the least mean square of jerk."""
     met = np.add(pose, duration * np.array(velocity))
-    return between(Point(0.0, *start), Point(duration, met.tolist(), velocity, STILL))
+    return quintic_between(Point(0.0, *start), Point(duration, met.tolist(), velocity, ZERO_RATES))
 
 
-def _gone_on_with(meeting: Path, velocity: Sequence[float], hold: float) -> Path:
-    """Return a way to a target, and on with it until `hold` is over [s]."""
+def _extend_meeting(meeting: Path, velocity: Sequence[float], hold: float) -> Path:
+    """Return a path to a target, extended at the target's velocity until `hold` [s]."""
     if meeting.duration >= hold:
         return meeting
     going = np.zeros((1, 3, 6))

@@ -1,4 +1,4 @@
-"""Connections to the panel's server: whoever holds some, the next one gets through, and the end waits for none."""
+"""Connections to the panel's server: idle ones block neither new connections nor the shutdown."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from collections.abc import Callable
 from typing import Any
 
 ASKING = 32
-"""So many connections that are no tabs may be open: browsers hold none. The next one takes the place of the eldest."""
+"""Maximum number of open connections that are not tabs (browsers hold none); a new one replaces the oldest."""
 TABS = 16
-"""So many tabs, and no more than half of all connections."""
+"""Maximum number of tabs, which are also at most half of all connections."""
 EACH = 4
-"""Descriptors of a connection: its own, three of websockets."""
+"""Descriptors per connection: its own, and three of websockets."""
 SPARE = 24
-"""Descriptors that are left for the rest of the process, beside those that it has at first."""
+"""Descriptors reserved for the rest of the process, in addition to those open at the start."""
 PAUSE = 0.1
-"""Where the system has no descriptor or no memory for a connection, it is asked again after so long [s]."""
+"""Delay before the next attempt to accept, after the system had no descriptor or memory for a connection [s]."""
 ENDING = 1.0
-"""So long may connections take to end that are closed [s]."""
+"""Time limit for the end of a closed connection [s]."""
 
 
 class Connections:
-    """Accepts on a socket, and has each connection handled in a thread of its own, until it is closed.
+    """Acceptor on a socket, which handles each connection in a thread of its own, until it is closed.
 
-    `handle` is given socket and address, and closes the socket; `refusal` is sent, if that does not wait, to who has to
-    go. What holds a connection open that says nothing, or all of the process's descriptors, keeps nobody else away.
+    `handle` receives socket and address, and closes the socket; a refused or displaced client receives `refusal` if
+    that does not block. A client that holds silent connections, or all descriptors, does not lock out others.
     """
 
     def __init__(self, listening: socket.socket, handle: Callable[[socket.socket, Any], None], refusal: bytes) -> None:
@@ -39,15 +39,15 @@ class Connections:
         self._changed = threading.Condition()
         self._closed = False
         limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        left = limit - listening.fileno() - SPARE  # descriptors are numbered from below
+        left = limit - listening.fileno() - SPARE  # the system assigns the lowest free descriptor
         self._most = max(2, min(ASKING + TABS, left // EACH))
 
     def accept(self) -> None:
-        """Accept until it is closed."""
+        """Accept connections until closed."""
         while True:
             try:
                 connection, address = self._listening.accept()
-            except OSError:  # accept(2): no descriptor, no memory, or whoever asked has gone
+            except OSError:  # accept(2): no descriptor, no memory, or the client has gone
                 if self._closed:
                     return
                 self._make_room()
@@ -60,7 +60,7 @@ class Connections:
                 connection.close()
 
     def keep(self, connection: socket.socket) -> bool:
-        """Whether a connection may become a tab, which is never asked to go; it is one until it ends."""
+        """Make a connection a tab until it ends, which is never displaced; return whether there is room for it."""
         with self._changed:
             if len(self._tabs) >= min(TABS, self._most // 2) or connection not in self._asking:
                 return False
@@ -69,7 +69,7 @@ class Connections:
             return True
 
     def close(self) -> None:
-        """Accept no more, end all there are, and wait for them a while."""
+        """Stop accepting, end all connections, and wait for them up to ENDING seconds."""
         with self._changed:
             self._closed = True
             for ended in (self._listening, *self._asking, *self._tabs):
@@ -79,7 +79,7 @@ class Connections:
         self._listening.close()
 
     def _begin(self, connection: socket.socket, address: object) -> bool:
-        """Have a connection handled; return whether that could begin."""
+        """Start to handle a connection; return whether that succeeded."""
         with self._changed:
             if self._closed:
                 return False
@@ -104,7 +104,7 @@ class Connections:
             self._changed.notify_all()
 
     def _make_room(self) -> bool:
-        """Have the eldest go that is no tab, and wait until it has gone; return whether there was one."""
+        """Refuse the oldest connection that is not a tab, and wait for its end; return whether there was one."""
         with self._changed:
             eldest = next(iter(self._asking), None)
             if eldest is None:

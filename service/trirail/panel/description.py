@@ -1,4 +1,4 @@
-"""What a tab must know of a robot to draw it and to name its buttons: from what the service tells of itself."""
+"""Description of a robot for a tab, to draw it and to label its buttons, from the service's own information."""
 
 from __future__ import annotations
 
@@ -12,19 +12,34 @@ from trirail.errors import ConfigError, ServiceError
 from trirail.panel.permissions import permissions
 from trirail.telemetry import palette
 from trirail.telemetry.shown_robot import ShownRobot
-from trirail.wire.sizes import MAX_MESSAGE
+from trirail.wire.sizes import MAX_FILE
 from trirail.wire.state import Info
-from trirail.wire.vocabulary import Role
+from trirail.wire.vocabulary import Command, Role
 from trirail.workspace.part_positions import RobotParts
 
 STAGE = 0.05
-"""Whose platform goes no further along x [m] is a stage, of which tenths of a micrometre matter."""
-FINE, COARSE = 4, 2
-"""Decimals of millimetres; of degrees there is one more."""
+"""Maximum travel along x of a platform whose lengths are shown in micrometres, as for a stage [m]."""
+MICROMETRES: dict[str, Any] = {
+    "unit": "µm",
+    "scale": 1e6,
+    "decimals": 1,
+    "angle_decimals": 5,
+    "steps": (1e-6, 1e-5, 1e-4, 1e-3),
+    "angle_steps": (1e-4, 1e-3, 1e-2, 0.1),
+}
+MILLIMETRES: dict[str, Any] = {
+    "unit": "mm",
+    "scale": 1e3,
+    "decimals": 2,
+    "angle_decimals": 3,
+    "steps": (1e-5, 1e-4, 1e-3, 1e-2),
+    "angle_steps": (1e-2, 0.1, 1.0, 1.0),
+}
+"""Unit of lengths on the page, units per metre, and decimals of lengths and degrees; jog steps [m] and [°]."""
 
 
 def shown(info: Info) -> ShownRobot:
-    """Return the robot that a service tells of. Raises ServiceError where the service is of another version."""
+    """Return the robot that a service describes. Raises ServiceError if the service has another version."""
     try:
         return ShownRobot.of_info(info)
     except (msgspec.ValidationError, ConfigError) as error:
@@ -32,8 +47,8 @@ def shown(info: Info) -> ShownRobot:
 
 
 def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dict[str, Any]:
-    """Return what a tab must know, ready to be encoded, whose user has a role."""
-    parts = RobotParts.of(robot.geometry, robot.limits.slider)
+    """Return the description, ready to encode, for a tab whose user has a role."""
+    parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {
         "tell": "robot",
@@ -41,7 +56,7 @@ def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dic
         "user": user,
         "role": role,
         "permissions": sorted(permissions(role, Role(info.takeover))),
-        "largest_file": MAX_MESSAGE,
+        "largest_file": MAX_FILE,
         "version": info.version,
         "lease": info.lease,
         "tools": robot.frames.tool,
@@ -50,7 +65,8 @@ def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dic
         "speeds": SPEEDS,
         "homes": info.homes,
         "sliders": robot.geometry.labels,
-        "decimals": FINE if platform.x[1] - platform.x[0] <= STAGE else COARSE,
+        "resolution": MICROMETRES if platform.x[1] - platform.x[0] <= STAGE else MILLIMETRES,
+        "everybodys": [each.value for each in Command if each.everybodys],
         "legs": [
             {
                 "anchor": leg.anchor,

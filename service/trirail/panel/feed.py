@@ -1,153 +1,164 @@
-"""What the service publishes, gathered once for all tabs: the newest state, the last events, the robot itself."""
+"""Published data of the service, collected once for all tabs: newest state, latest events, description of the robot."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import threading
 import time
 from collections import deque
+from concurrent.futures import Future
+from contextlib import aclosing
 
 import msgspec
 from trirail_drivers.interface import Triple
 
-from trirail.client.client import Robot
+from trirail.client.async_client import AsyncRobot
+from trirail.client.blocking import LoopThread
 from trirail.errors import TrirailError
 from trirail.panel import path_check
 from trirail.panel.description import describe, shown
-from trirail.panel.path_check import CheckedPath
+from trirail.panel.path_check import CheckedPath, Obstacle
 from trirail.panel.permissions import permissions
+from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
-from trirail.wire.state import Info
 from trirail.wire.vocabulary import Role
 
 SILENT = 1.0
-"""After so long without a state the service is taken for gone [s]."""
+"""Time without a state after which the service counts as silent [s]."""
 USERS_EVERY = 2.0
-"""How often it is looked who is connected [s]."""
+"""Interval between queries of the connected users [s]."""
 EVENTS = 200
-"""So many events are kept for tabs that come later."""
+"""Number of events kept for tabs that open later."""
 LOOKS = 50
-"""And so many of the last alignment's."""
+"""Number of events of the last alignment kept."""
 
 
 class Feed:
-    """Hears one robot from its start until it is closed. Raises ServiceError where that does not answer at first.
+    """Subscription to one robot from `start` to `close`. Raises ServiceError if it does not answer initially.
 
-    What a tab has not sent yet is read under `changed`, which is notified whenever there is something new.
+    Tabs read data to send while holding `changed`, which is notified of anything new.
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: AsyncRobot, loop: LoopThread) -> None:
         self._robot = robot
+        self._loop = loop
         self.changed = threading.Condition()
         self._pose: Triple | None = None
         self.told: dict[str, bytes] = {}
-        """What a tab is told once, and again where it changes, as JSON: the robot, before anything can be drawn, and
-        the names of its poses; who is connected."""
-        self._learn_robot(robot.info())
-        self.told["poses"] = self._ask_poses()
+        """Messages for a tab, sent once and after each change, as JSON: the robot, first because nothing can be drawn
+        without it, the names of its poses, and the connected users."""
+        loop.call(self._learn_robot())
+        self.told["poses"] = loop.call(self._fetch_poses())
         self.state: bytes | None = None
-        """The newest state, as JSON with its stamp; None where the service is silent."""
+        """Newest state, as JSON with its stamp; None while the service is silent."""
         self.stamp = 0
-        """When that came: milliseconds of this process's monotonic clock."""
-        self._over = threading.Event()
+        """Arrival time of that state: milliseconds of this process's monotonic clock."""
         self._events: deque[tuple[int, bytes]] = deque(maxlen=EVENTS)
         self._aligned: list[tuple[int, bytes]] = []
-        """Those of the last alignment, however many have come since."""
+        """Events of the last alignment, regardless of the number of later ones."""
         self._alignment = ("", "")
+        self._hearing: list[Future[object]] = []
 
     def start(self) -> None:
-        """Begin to hear."""
-        for hear in (self._hear_states, self._hear_events, self._look_for_users):
-            threading.Thread(target=hear, name=hear.__name__.strip("_"), daemon=True).start()
+        """Start the subscriptions."""
+        self._hearing = [self._loop.start(hear()) for hear in (self._states, self._hear_events, self._look_for_users)]
 
     def close(self) -> None:
-        """Gather no more states; what hears events ends with the robot's connection."""
-        self._over.set()
+        """Stop the subscriptions."""
+        for hearing in self._hearing:
+            hearing.cancel()
 
     def events(self, after: int) -> list[tuple[int, bytes]]:
-        """Return the events that came after that number, numbered as they came, as JSON."""
+        """Return the events after a number, numbered in order of arrival, as JSON."""
         return [event for event in sorted({*self._aligned, *self._events}) if event[0] > after]
 
-    def problem(self, pose: Triple, tool: str | None, frame: str) -> tuple[str, bool]:
-        """Return what keeps the robot from going from where it is measured to a pose, as path_check.problem."""
+    def problem(self, goal: PoseGoal) -> Obstacle | None:
+        """Return the obstacle between the measured pose and a goal, like path_check.problem."""
         if self._pose is None:
-            return "nobody knows where the robot is", False
-        return path_check.problem(self._shown, self._pose, pose, tool, frame)
+            return Obstacle("nobody knows where the robot is", code="unknown")
+        end = (goal.x, goal.y, goal.phi)
+        return path_check.problem(self._shown, self._pose, end, goal.tool, goal.frame)
 
     def checked_path(self, name: str, text: str, stretch: bool) -> CheckedPath:
-        """Return what a file's path comes to."""
+        """Return the result of checking a file's path."""
         return path_check.checked_path(self._shown, name, text, stretch)
 
-    def _hear_states(self) -> None:
-        while not self._over.is_set():
-            for state in self._robot.states(SILENT):
-                if self._over.is_set():
-                    return
-                if self.state is None:
-                    self._describe()
-                stamp = now()
-                content = msgspec.json.encode({"tell": "state", "stamp": stamp, "state": state})
-                with self.changed:
-                    self.state, self.stamp, self._pose = content, stamp, state.pose
-                    self.changed.notify_all()
+    async def _states(self) -> None:
+        while True:
+            async with aclosing(self._robot.states(SILENT)) as states:
+                async for state in states:
+                    if self.state is None:
+                        await self._describe()
+                    stamp = now()
+                    content = msgspec.json.encode({"tell": "state", "stamp": stamp, "state": state})
+                    with self.changed:
+                        self.state, self.stamp, self._pose = content, stamp, state.pose
+                        self.changed.notify_all()
             with self.changed:
                 self.state = self._pose = None
                 self.changed.notify_all()
 
-    def _look_for_users(self) -> None:
-        while not self._over.wait(USERS_EVERY):
+    async def _look_for_users(self) -> None:
+        while True:
+            await asyncio.sleep(USERS_EVERY)
             with contextlib.suppress(TrirailError):
-                users = msgspec.json.encode({"tell": "users", "names": self._robot.users()})
-                with self.changed:
-                    self.told["users"] = users
-                    self.changed.notify_all()
+                self._tell("users", msgspec.json.encode({"tell": "users", "names": await self._robot.users()}))
 
-    def _describe(self) -> None:
-        """Ask again what robot it is: a service that was silent may have been started anew."""
-        poses = self._ask_poses()
-        with contextlib.suppress(TrirailError):  # the old description stands until it answers
-            told = self._robot.info()
-            with self.changed:
-                self._learn_robot(told)
-                self.told["poses"] = poses
+    async def _describe(self) -> None:
+        """Query the robot again, because a service that was silent may have restarted."""
+        poses = await self._fetch_poses()
+        with contextlib.suppress(TrirailError):  # the old description remains until it answers
+            await self._learn_robot()
+            self._tell("poses", poses)
 
-    def _learn_robot(self, told: Info) -> None:
-        """Take in what robot it is, and what may be done. Raises ServiceError where it is of another version."""
-        self._shown = shown(told)
+    async def _learn_robot(self) -> None:
+        """Query the robot and the user's permissions. Raises ServiceError if the service has another version."""
+        told, role = await self._robot.info(), await self._robot.role()
+        robot = shown(told)
+        about = msgspec.json.encode(describe(told, robot, self._robot.user, role))
+        self._shown = robot
         self.recordings = told.recordings
-        """The folder of the service's recordings, on its machine."""
-        role = self._robot.role()
+        """Folder of the service's recordings, on its machine."""
         self.permissions = permissions(role, Role(told.takeover))
-        """What the panel's user may."""
-        self.told["robot"] = msgspec.json.encode(describe(told, self._shown, self._robot.user, role))
+        """Permissions of the panel's user."""
+        self._tell("robot", about)
 
-    def _ask_poses(self) -> bytes:
+    async def _fetch_poses(self) -> bytes:
         try:
-            poses = self._robot.poses()
+            poses = await self._robot.poses()
         except TrirailError:
-            poses = {}  # a service that knows none
+            poses = {}  # a service without poses
         taught = [name for name, pose in poses.items() if pose.taught]
         return msgspec.json.encode({"tell": "poses", "names": list(poses), "taught": taught})
 
-    def _hear_events(self) -> None:
-        for number, event in zip(itertools.count(1), self._robot.events(history=True), strict=False):
-            content = msgspec.json.encode({"tell": "event", "event": event})
-            poses = self._ask_poses() if event.kind == "pose" else self.told["poses"]
-            with self.changed:
-                self.told["poses"] = poses
-                self._events.append((number, content))
-                if event.alignment is not None:
-                    self._keep(event.alignment, (number, content))
-                self.changed.notify_all()
+    async def _hear_events(self) -> None:
+        numbers = itertools.count(1)
+        async with aclosing(self._robot.events(history=True)) as events:
+            async for event in events:
+                content = msgspec.json.encode({"tell": "event", "event": event})
+                if event.kind == "pose":
+                    self._tell("poses", await self._fetch_poses())
+                with self.changed:
+                    numbered = next(numbers), content
+                    self._events.append(numbered)
+                    if event.alignment is not None:
+                        self._keep(event.alignment, numbered)
+                    self.changed.notify_all()
+
+    def _tell(self, name: str, content: bytes) -> None:
+        with self.changed:
+            self.told[name] = content
+            self.changed.notify_all()
 
     def _keep(self, look: AlignmentLook, event: tuple[int, bytes]) -> None:
-        """Keep a look beside those of the same alignment."""
+        """Keep an event with the others of the same alignment."""
         name = look.id, look.purpose
         self._aligned = [*(self._aligned if name == self._alignment else ()), event][-LOOKS:]
         self._alignment = name
 
 
 def now() -> int:
-    """Return the time of stamps: milliseconds of the monotonic clock."""
+    """Return the time for stamps: milliseconds of the monotonic clock."""
     return time.monotonic_ns() // 1_000_000

@@ -1,178 +1,144 @@
-"""What the page says to its server. What the server says is State, Event and the like, each beside what it `tell`s."""
+"""Messages of the page to its server: goals and contents of commands in the service's format, and the page's own.
+
+The server sends State, Event and others, each with its kind in `tell`.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Raw, Struct
 
 from trirail.panel.permissions import GOAL, POSES, TAKEOVER
 from trirail.wire.goal_kind import FrameName
-from trirail.wire.goals import Coordinates
-from trirail.wire.sizes import MAX_MESSAGE
+from trirail.wire.goals import Coordinates, MoveGoal, NamedGoal, PoseGoal
+from trirail.wire.sizes import MAX_FILE
 from trirail.wire.vocabulary import Command
 
-Content = Annotated[str, Meta(max_length=MAX_MESSAGE)]
-"""A file's."""
+Content = Annotated[str, Meta(max_length=MAX_FILE)]
+"""Content of a file."""
 
 
 class _Said(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
-    """Any of these."""
+    """Any message of the page."""
 
     wants: ClassVar[str | None] = None
-    """Which permission it takes; None where it takes none."""
+    """Required permission; None for none."""
 
     @property
     def needs(self) -> str | None:
-        """Which permission this one takes."""
+        """Return the required permission."""
         return self.wants
 
 
 class Seen(_Said, frozen=True, tag="seen"):
-    """The page has drawn a state."""
+    """Notice that the page has drawn a state."""
 
     stamp: int
-    """That state's."""
+    """Stamp of that state."""
 
 
 class Hold(_Said, frozen=True, tag="hold"):
-    """A jog button is held down, now."""
+    """Notice that a jog button is held down now."""
 
     wants = GOAL
 
     velocity: Coordinates
-    """Of x, y [m/s] and phi [rad/s], in the base frame."""
+    """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
     seen: int
-    """The stamp of the newest state that the page has drawn: who sees an old picture must not move the robot."""
+    """Stamp of the newest state that the page has drawn: a user of an outdated picture must not move the robot."""
     tool: FrameName | None = None
-    """One of [frames.tool], about which it turns; the centre where there is none."""
+    """Tool of [frames.tool] about which it turns; the centre if None."""
 
 
 class Release(_Said, frozen=True, tag="release"):
-    """No jog button is held down any more."""
+    """Notice that no jog button is held down any more."""
 
 
 class Tell(_Said, frozen=True, tag="command"):
-    """A command's button has been pressed."""
+    """Command whose button has been pressed or whose slider has been moved."""
 
     name: Command
-    """The command, one without content."""
+    """The command."""
+    content: Raw = Raw()
+    """Content of the command, forwarded as it is."""
 
     @property
     def needs(self) -> str:
-        """The command's own permission."""
+        """Return the permission of the command itself."""
         return self.name
 
 
 class TakeOver(_Said, frozen=True, tag="takeover"):
-    """The lease is to be taken over from who holds it."""
+    """Request to take the lease over from its holder."""
 
     wants = TAKEOVER
 
 
-class SetOverride(_Said, frozen=True, tag="override"):
-    """The override's slider has been moved."""
-
-    wants = Command.OVERRIDE
-
-    percent: float
-    """Share of full speed [%]."""
-
-
-class GoTo(_Said, frozen=True, tag="goto"):
-    """A named pose's button has been pressed."""
+class SendGoal(_Said, frozen=True, tag="goal"):
+    """Goal to forward: the button of a named pose, of a typed one, or of a step has been pressed."""
 
     wants = GOAL
 
-    name: str
-    """The pose's."""
-
-
-class GoToPose(_Said, frozen=True, tag="pose"):
-    """A pose that was typed, or dragged on the drawing, is to be gone to."""
-
-    wants = GOAL
-
-    pose: Coordinates
-    """x, y [m] and phi [rad] of the tool, in the frame."""
-    tool: FrameName | None = None
-    """One of [frames.tool]; the centre where there is none."""
-    frame: FrameName = "base"
-    """Base, or one of [frames.work]."""
+    goal: PoseGoal | NamedGoal | MoveGoal
+    """Goal, forwarded as it is."""
+    seen: int | None = None
+    """Stamp of the newest state that the page has drawn, if the goal is relative to it."""
 
 
 class CheckPose(_Said, frozen=True, tag="check"):
-    """Whether such a pose can be gone to is to be said, without moving."""
+    """Request to check whether a pose is reachable, without motion."""
 
-    pose: Coordinates
-    """Likewise."""
+    goal: PoseGoal
+    """Goal that would be sent."""
     number: int
-    """By which the page knows the answer."""
-    tool: FrameName | None = None
-    """Likewise."""
-    frame: FrameName = "base"
-    """Likewise."""
-
-
-class JogStep(_Said, frozen=True, tag="step"):
-    """A jog button has been pressed where it is for steps."""
-
-    wants = GOAL
-
-    by: Coordinates
-    """Along x, y [m] of the frame, and about phi [rad], of the tool."""
-    seen: int
-    """As of Hold."""
-    tool: FrameName | None = None
-    """As of GoToPose."""
-    frame: FrameName = "base"
-    """Base, platform, or one of [frames.work]."""
+    """Number that the answer repeats."""
 
 
 class CheckPath(_Said, frozen=True, tag="check path"):
-    """Whether the path in a file can be followed is to be said, without moving."""
+    """Request to check whether the path in a file can be followed, without motion."""
 
     name: str
-    """The file's: .json has JSON in it, any other CSV."""
+    """Name of the file: .json contains JSON, any other CSV."""
     text: Content
-    """What is in it."""
+    """Content of the file."""
     number: int
-    """By which the page knows the answer."""
+    """Number that the answer repeats."""
     stretch: bool = False
-    """Whether one that is too fast is slowed."""
+    """Whether to slow a path that is too fast."""
 
 
 class Follow(_Said, frozen=True, tag="follow"):
-    """Such a path is to be followed, from where it begins."""
+    """Request to follow the path in a file from its first point."""
 
     wants = GOAL
 
     name: str
-    """Likewise."""
+    """Name of the file, as in CheckPath."""
     text: Content
-    """Likewise."""
+    """Content of the file."""
     stretch: bool = False
-    """Likewise."""
+    """Whether to slow a path that is too fast."""
 
 
 class Teach(_Said, frozen=True, tag="teach"):
-    """Where the robot stands is to be kept as a pose."""
+    """Request to save the robot's current position as a pose."""
 
     wants = POSES
 
     name: str
-    """The pose's."""
+    """Name of the pose."""
 
 
 class Forget(_Said, frozen=True, tag="forget"):
-    """A taught pose is to be removed."""
+    """Request to remove a taught pose."""
 
     wants = POSES
 
     name: str
-    """The pose's."""
+    """Name of the pose."""
 
 
-Asked = TakeOver | SetOverride | GoTo | GoToPose | JogStep | Follow | Teach | Forget
-"""What is asked of the service, beside commands and held jogs."""
-FromPage = Seen | Hold | Release | Tell | CheckPose | CheckPath | Asked
+Asked = Tell | TakeOver | SendGoal | Follow | Teach | Forget
+"""Requests to the service, except held jogs."""
+FromPage = Seen | Hold | Release | CheckPose | CheckPath | Asked

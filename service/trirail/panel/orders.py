@@ -1,134 +1,131 @@
-"""What a tab asks of the service: each command in a thread of its own, so that STOP waits for nothing."""
+"""Requests of a tab to the service, each in a task of its own, so that STOP never waits."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
+import asyncio
+import contextlib
+from collections import Counter
+from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
 from trirail.client import trajectory
-from trirail.client.client import GoalHandle, Robot
-from trirail.client.lease import Lease
-from trirail.errors import TrirailError
+from trirail.client.async_client import AsyncRobot
+from trirail.client.blocking import LoopThread
+from trirail.client.goal import AsyncGoalHandle
+from trirail.client.lease import AsyncLease
+from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.panel.feed import now
-from trirail.panel.messages import (
-    Asked,
-    Follow,
-    Forget,
-    GoTo,
-    GoToPose,
-    JogStep,
-    SetOverride,
-    TakeOver,
-    Teach,
-)
+from trirail.panel.messages import Asked, Follow, Forget, SendGoal, TakeOver, Teach, Tell
+from trirail.wire.goals import kind_name
+from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
 
 FRESH = 500
-"""A jog from a page whose newest state is older than that is none: it, or what leads to it, stands still [ms]."""
+"""Maximum age of the page's newest state for a jog; if it is older, the page or its connection has stalled [ms]."""
 UNDER_WAY = 8
-"""So many commands of a tab may wait for their answers, and as many that stop the robot."""
+"""Maximum number of unanswered commands of a tab; commands that stop the robot have the same limit of their own."""
 
 
 class Say(Protocol):
-    """Tells the page something; what it is about is a word of the page's languages, `name` what has one."""
+    """Sender of messages to the page; `to` is a word of the page's languages, `name` that of its object, if any."""
 
     def __call__(self, tell: str, /, **content: Any) -> None:
-        """Send it."""
+        """Send a message of kind `tell`."""
 
 
 class Orders:
-    """Those of one tab, answered by `say`; and the lease, while the tab holds it."""
+    """Requests of one tab, answered by `say`, and the lease while the tab holds it."""
 
-    def __init__(self, robot: Robot, say: Say) -> None:
+    def __init__(self, robot: AsyncRobot, loop: LoopThread, say: Say) -> None:
         self._robot = robot
+        self._loop = loop
         self._say = say
-        self._under_way: set[Command] = set()
-        self._stops, self._others = (threading.BoundedSemaphore(UNDER_WAY) for _ in range(2))
-        self._lease: Lease | None = None
+        self._under_way: Counter[str] = Counter()
+        self._lease: AsyncLease | None = None
         self._open = True
 
     def close(self) -> None:
-        """Give the lease back, whoever still acquires it."""
+        """Release the lease, even if an acquisition is still in progress."""
         self._open = False
-        self._give_back()
+        with contextlib.suppress(ServiceError):  # the connection is closed: the lease ends by its time-out
+            self._loop.call(self._give_back())
 
-    def request(self, said: Asked) -> None:
-        """Ask the service for what is answered there, and is under way beside all else."""
-        robot = self._robot
+    def begin(self, said: Asked) -> None:
+        """Send a request in parallel with pending ones; drop a command that is pending already."""
         match said:
+            case Tell(name, content):
+                asked = lambda: self._command(name, bytes(content) or None)  # noqa: E731
+                self._loop.start(self._answer(asked, name))
             case TakeOver():
-                self._begin(lambda: self._acquire(force=True), "takeover")
-            case SetOverride(percent):
-                self._begin(lambda: robot.override(percent), Command.OVERRIDE)
-            case GoTo(name):
-                self._begin(lambda: robot.move_to_named(name), "goto", name)
-            case GoToPose((x, y, phi), tool, frame):
-                self._begin(lambda: robot.move_to(x, y, phi, tool=tool, frame=frame), "pose")
-            case JogStep((x, y, phi), seen, tool, frame):
-                if now() - seen <= FRESH:
-                    self._begin(lambda: robot.move(x, y, phi, tool=tool, frame=frame), "step")
-            case Follow(name, text, stretch):
-                self._begin(lambda: robot.follow(trajectory.parse(name, text), stretch=stretch), "follow", name)
+                self._loop.start(self._answer(lambda: self._acquire(force=True), "takeover"))
+            case SendGoal(goal, seen):
+                if seen is None or now() - seen <= FRESH:
+                    name = str(getattr(goal, "name", ""))
+                    self._loop.start(self._answer(lambda: self._robot.send(goal), kind_name(goal), name))
+            case Follow(name):
+                self._loop.start(self._answer(lambda: self._follow(said), "follow", name))
             case Teach(name):
-                self._begin(lambda: robot.teach(name), "teach", name)
+                self._loop.start(self._answer(lambda: self._robot.teach(name), "teach", name))
             case Forget(name):
-                self._begin(lambda: robot.forget(name), "forget", name)
+                self._loop.start(self._answer(lambda: self._robot.forget(name), "forget", name))
 
-    def command(self, name: Command) -> None:
-        """Send a command, unless it is under way already; what stops the robot waits for no other."""
-        if name in self._under_way and not name.stops:
+    async def _answer(self, ask: Callable[[], Awaitable[object]], what: str, name: str = "") -> None:
+        """Send a request and report its result; commands that stop the robot never wait and have their own places."""
+        stops = isinstance(what, Command) and what.stops
+        if isinstance(what, Command) and not stops and self._under_way[what]:
             return
-        self._under_way.add(name)
+        place = "stops" if stops else "others"
+        if self._under_way[place] >= UNDER_WAY:
+            message = f"{UNDER_WAY} commands of this page wait for their answers already"
+            self._say("refused", to=what, name=name, message=message, code=RefusalCode.BUSY)
+            return
+        self._under_way.update((place, what))
+        try:
+            done = await ask()
+        except TrirailError as error:
+            self._say("refused", to=what, name=name, **refusal(error))
+        else:
+            if isinstance(done, AsyncGoalHandle):
+                self._say("accepted", to=what, name=name, id=done.id)
+            else:
+                seq = done.seq if isinstance(done, CommandReply) else 0
+                self._say("done", to=what, name=name, seq=seq)
+        finally:
+            self._under_way.subtract((place, what))
 
-        def send_command() -> None:
-            try:
-                if name is Command.ACQUIRE:
-                    self._acquire()
-                elif name is Command.RELEASE and self._lease is not None:
-                    self._give_back()
-                else:
-                    self._robot.command(name)
-            finally:
-                self._under_way.discard(name)
+    async def _command(self, name: Command, content: bytes | None) -> CommandReply | None:
+        if name is Command.ACQUIRE:
+            await self._acquire()
+        elif name is Command.RELEASE and self._lease is not None:
+            await self._give_back()
+        else:
+            return await self._robot.command(name, content)
+        return None
 
-        if not self._begin(send_command, name):
-            self._under_way.discard(name)
+    async def _follow(self, said: Follow) -> AsyncGoalHandle:
+        points = await asyncio.to_thread(trajectory.parse, said.name, said.text)
+        return await self._robot.follow(points, stretch=said.stretch)
 
-    def _acquire(self, *, force: bool = False) -> None:
-        """Hold the lease for as long as this tab is open: with it go its signs of life."""
+    async def _acquire(self, *, force: bool = False) -> None:
+        """Acquire the lease and hold it while this tab is open: its keep-alives end with the tab."""
         if self._lease is None or self._lease.lost is not None:
             lease = self._robot.lease(force=force)
-            lease.__enter__()
+            await lease.__aenter__()
             self._lease = lease
         if not self._open:
-            self._give_back()
+            await self._give_back()
 
-    def _give_back(self) -> None:
+    async def _give_back(self) -> None:
         lease, self._lease = self._lease, None
         if lease is not None:
-            lease.__exit__()
+            await lease.__aexit__()
 
-    def _begin(self, do: Callable[[], object], what: str, name: str = "") -> bool:
-        """Have it done beside what is under way, and answered; return whether there is a place for it."""
-        places = self._stops if isinstance(what, Command) and what.stops else self._others
-        if not places.acquire(blocking=False):
-            message = f"{UNDER_WAY} commands of this page wait for their answers already"
-            self._say("refused", to=what, name=name, message=message)
-            return False
 
-        def run() -> None:
-            try:
-                done = do()
-            except TrirailError as error:
-                self._say("refused", to=what, name=name, message=str(error))
-            else:
-                if isinstance(done, GoalHandle):
-                    self._say("accepted", to=what, name=name, id=done.id)
-                else:
-                    self._say("done", to=what, name=name)
-            finally:
-                places.release()
-
-        threading.Thread(target=run, name=what, daemon=True).start()
-        return True
+def refusal(error: TrirailError) -> dict[str, Any]:
+    """Return an error's message, and the code and values that let the page translate it."""
+    fields: dict[str, Any] = {"message": str(error)}
+    if isinstance(error, RefusedError):
+        fields |= {"code": error.code, "slider": error.slider, "value": error.value, "limit": error.limit}
+    elif isinstance(error, ServiceError):
+        fields["code"] = "service"
+    return fields

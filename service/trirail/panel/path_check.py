@@ -1,4 +1,4 @@
-"""Whether a pose can be gone to, or a file followed, said before anything moves; the service decides."""
+"""Check before motion whether a pose is reachable or a file can be followed; the service makes the final decision."""
 
 from __future__ import annotations
 
@@ -9,71 +9,94 @@ from msgspec import Struct
 from trirail_drivers.interface import Triple
 
 from trirail.client import trajectory
-from trirail.client.outgoing import goal_message
+from trirail.client.outgoing import goal_messages
 from trirail.errors import KinematicsError, RefusedError, TrirailError
 from trirail.motion.goal_planner import GoalPlanner
-from trirail.motion.runs import nominal, of_centre, of_tool, rest
+from trirail.motion.runs import centre_motion, nominal_motion, rest, tool_motion
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames, rotated
 from trirail.telemetry.shown_robot import ShownRobot
-from trirail.wire.goals import TrajectoryGoal
+from trirail.wire.goals import Tool, TrajectoryGoal
+from trirail.wire.packed_trajectory import packed
 from trirail.workspace.violations import violations
 
 LOOKS = 40
-"""Poses on the way, straight in pose space, that are looked at, its end first."""
+"""Number of poses checked on the line in pose space, from its end."""
 DRAWN = 200
-"""Places of a path, evenly in time, that are drawn."""
+"""Number of points drawn of a path, evenly spaced in time."""
 
 
-def problem(robot: ShownRobot, start: Triple, end: Triple, tool: str | None, frame: str) -> tuple[str, bool]:
-    """Return what is in the way from a pose to another, straight in pose space, and whether it is before the end.
+class Obstacle(Struct, frozen=True, omit_defaults=True):
+    """Reason why a pose cannot be reached, as text, and as code and values for the page's languages."""
 
-    `start` is the centre's in the base frame, `end` the tool's in a frame of the robot's, x, y [m] and phi [rad]; the
-    tool goes straight. Empty where nothing is known to be in the way: positions, passive travel and the singular
-    margin are looked at, at LOOKS places; speeds and what the planner finds between them are the service's to judge.
+    message: str
+    on_way: bool = False
+    """Whether it is on the way, before the end."""
+    code: str = ""
+    """Name of the exceeded limit, "unreachable", or a RefusalCode."""
+    what: str = ""
+    """Label of the slider."""
+    value: float = 0.0
+    limit: float = 0.0
+    unit: str = ""
+
+
+def problem(robot: ShownRobot, start: Triple, end: Triple, tool: Tool | None, frame: str) -> Obstacle | None:
+    """Return an obstacle on the line in pose space from one pose to another; None if none is known.
+
+    `start` is the pose of the centre in the base frame, `end` that of the tool in a frame of the robot, x, y [m] and
+    phi [rad]; the tool moves in a straight line. Checked are positions, passive travel and the singular margin, at
+    LOOKS places; the service judges speeds and the planner's findings between them.
     """
     names = NamedFrames(robot.frames)
     try:
         point, (x, y, angle) = names.tool(tool), names.frame(frame)
     except RefusedError as error:
-        return str(error), False
+        return Obstacle(str(error), code=error.code)
     u, v = rotated(end[0], end[1], angle)
-    first, last = np.array(of_tool(rest(start), point).pose), np.array((x + u, y + v, angle + end[2]))
+    first, last = np.array(tool_motion(rest(start), point).pose), np.array((x + u, y + v, angle + end[2]))
     for share in np.linspace(1.0, 0.0, LOOKS, endpoint=False):
-        pose = of_centre(rest((share * last + (1.0 - share) * first).tolist()), point).pose
+        pose = centre_motion(rest((share * last + (1.0 - share) * first).tolist()), point).pose
         try:
             found = violations(robot.geometry, robot.limits, np.asarray(pose))
         except KinematicsError as error:
-            return str(error), bool(share < 1.0)
+            return Obstacle(str(error), bool(share < 1.0), "unreachable", error.leg)
         if found:
-            return str(found[0]), bool(share < 1.0)
-    return "", False
+            least = found[0]
+            code = least.quantity.replace(" ", "_")
+            return Obstacle(str(least), bool(share < 1.0), code, least.label, least.value, least.limit, least.unit)
+    return None
 
 
 class CheckedPath(Struct, frozen=True, omit_defaults=True):
-    """What a file's path comes to."""
+    """Result of checking a file's path."""
 
     why: str = ""
-    """Why it cannot be followed; empty where it can."""
+    """Reason why it cannot be followed; empty if it can."""
+    code: str = ""
+    """RefusalCode or "unreadable"; empty if it can be followed."""
     line: Sequence[Triple] = ()
-    """Poses along it, in the base frame [m, rad]; its points alone where it cannot be followed."""
+    """Poses along it, in the base frame [m, rad]; only its points if it cannot be followed."""
     duration: float = 0.0
-    """How long it takes at full speed [s]."""
+    """Duration at full speed [s]."""
     slowed: float = 1.0
-    """How many times slower that is than was asked for."""
+    """Ratio of that duration to the requested one."""
 
 
 def checked_path(robot: ShownRobot, name: str, text: str, stretch: bool) -> CheckedPath:
-    """Read a trajectory and plan it as the service would from its first point: its whole path is checked."""
+    """Parse a trajectory and plan it from its first point as the service would, which checks the whole path."""
     line: list[Triple] = []
     try:
         points = tuple(trajectory.parse(name, text))
         line = [(point.x, point.y, point.phi) for point in points]
         goal, period = TrajectoryGoal(points, stretch=stretch), 1.0 / robot.rate_hz
-        goal_message(goal, "checked")  # as the client does
-        planned = GoalPlanner(robot.geometry, robot.limits, period).plan(goal, Schedule(rest(line[0]), period), 1.0, 0)
+        goal_messages(goal, "checked")  # as the client does
+        planner, schedule = GoalPlanner(robot.geometry, robot.limits, period), Schedule(rest(line[0]), period)
+        planned = planner.plan(packed(goal), schedule, 1.0, 0)
     except (TrirailError, ValueError) as error:
-        return CheckedPath(str(error), line)
+        code = error.code if isinstance(error, RefusedError) else "unreadable"
+        return CheckedPath(str(error), code, line)
     path = planned.run.path
-    poses = [nominal(path, float(s)).pose for s in np.linspace(0.0, path.duration, DRAWN)]
-    return CheckedPath("", [(float(x), float(y), float(phi)) for x, y, phi in poses], planned.duration, planned.slowed)
+    poses = [nominal_motion(path, float(s)).pose for s in np.linspace(0.0, path.duration, DRAWN)]
+    drawn = [(float(x), float(y), float(phi)) for x, y, phi in poses]
+    return CheckedPath(line=drawn, duration=planned.duration, slowed=planned.reply.slowed)

@@ -1,11 +1,11 @@
-"""The service's recordings, where its folder is on the panel's machine too: a list, files to download, reports."""
+"""Recordings of the service, if their folder is on the panel's machine: a list, files to download, reports."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import re
-import sqlite3
+import stat
 import subprocess
 import sys
 import threading
@@ -13,30 +13,46 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 from websockets.sync.server import ServerConnection
 
-from trirail.telemetry.session_index import FILE, RecordedSession, SessionIndex, Wanted
+from trirail.telemetry.sessions import RecordedSession
+from trirail.wire.decoding import decoded, prepare
 
 LISTED = 100
-"""Sessions, the newest."""
+"""Maximum number of sessions listed, the newest ones."""
 SHOWABLE = re.compile(r"[\w.-]+\.rrd", re.ASCII)
-"""Names of recordings that a header can hold."""
+"""Names of recordings that fit into a header."""
 REPORTED_WITHIN = 300.0
-"""How long a report may take [s]."""
+"""Time limit of a report, and of reading recordings for the list [s]."""
+
+
+def _open_here(path: str, flags: int) -> int:
+    """Open a file without following links out of its folder and without blocking."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 class Sent(Response):
-    """An answer that has been sent already."""
+    """Response that has been sent already."""
 
     def serialize(self) -> bytes:
-        """Return nothing: the connection is then ended."""
+        """Return no bytes, which ends the connection."""
         return b""
 
 
+class _Listed(msgspec.Struct):
+    """Output of `trirail sessions --json`, limited to the fields used here."""
+
+    sessions: list[RecordedSession]
+
+
+prepare(_Listed)
+
+
 class Recordings:
-    """Those of one robot."""
+    """Recordings of one robot."""
 
     def __init__(self, robot: str, folder: str) -> None:
         self._robot = robot
@@ -44,18 +60,20 @@ class Recordings:
         self._one_report = threading.Lock()
 
     def listed(self) -> dict[str, Any]:
-        """Return the folder, whether it is here, and its sessions, the newest first, ready to be encoded."""
+        """Return the folder, whether it is on this machine, and its sessions, newest first, ready to encode."""
         return {"folder": str(self._folder), "here": self._here, "sessions": self._sessions()[: -LISTED - 1 : -1]}
 
     def send_file(self, opened: ServerConnection, name: str, headers: dict[str, str]) -> Response | None:
-        """Send a recording, however large, as a file to be kept; None where there is no such one."""
+        """Send a recording of any size as a download; return None if it is not a regular file of the folder."""
         if not self._here or SHOWABLE.fullmatch(name) is None:
             return None
         try:
-            file = (self._folder / name).open("rb")
+            file = open(self._folder / name, "rb", opener=_open_here)  # noqa: SIM115
         except OSError:
             return None
         with file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return None
             size = os.fstat(file.fileno()).st_size
             own = {"Content-Type": "application/octet-stream", "Content-Length": str(size), "Connection": "close",
                    "Content-Disposition": f'attachment; filename="{name}"'}  # fmt: skip
@@ -63,30 +81,31 @@ class Recordings:
             with contextlib.suppress(OSError):  # the browser has gone
                 opened.socket.sendall(Response(status.value, status.phrase, Headers(own | headers)).serialize())
                 if size:
-                    opened.socket.sendfile(file, count=size)  # of one that is being written: so far
+                    opened.socket.sendfile(file, count=size)  # a file still being written: its current part
         return Sent(status.value, status.phrase, Headers())
 
     def report(self, session: str) -> str | None:
-        """Return what `trirail report` says of a session, by a process of its own; None where there is no such one."""
+        """Return the output of `trirail report` for a session, from a separate process; None if it does not exist."""
         files = next((each.files for each in self._sessions() if each.session == session), None)
-        if files is None:
+        if files is None or not all(stat.S_ISREG((self._folder / name).lstat().st_mode) for name in files):
             return None
-        command = [sys.executable, "-m", "trirail", "report", *files]
-        with self._one_report:  # beside a page that is used to move a robot
-            done = subprocess.run(
-                ["nice", *command], cwd=self._folder, capture_output=True, timeout=REPORTED_WITHIN, check=False,
-                env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
-            )  # fmt: skip
+        with self._one_report:
+            done = self._run("report", *files)
         return (done.stdout or done.stderr).decode(errors="replace")
 
     @property
     def _here(self) -> bool:
-        return (self._folder / FILE).is_file()
+        return any(self._folder.glob("*.rrd"))
 
     def _sessions(self) -> list[RecordedSession]:
         if not self._here:
             return []
-        try:
-            return SessionIndex(self._folder).find(Wanted(robot=self._robot))
-        except (sqlite3.Error, OSError):
-            return []
+        done = self._run("sessions", ".", "--robot", self._robot, "--last", "0", "--json")
+        return decoded(done.stdout, _Listed).sessions if done.returncode == 0 else []
+
+    def _run(self, *command: str) -> subprocess.CompletedProcess[bytes]:
+        """Run a `trirail` command in the folder, niced, because the page moves a robot while it reads recordings."""
+        return subprocess.run(
+            ["nice", sys.executable, "-m", "trirail", *command], cwd=self._folder, capture_output=True,
+            timeout=REPORTED_WITHIN, check=False, env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
+        )  # fmt: skip

@@ -1,43 +1,69 @@
-"""The panel's server: the page's files and a WebSocket for each tab, on the loopback, for who has the token."""
+"""Server of the panel: the page's files and a WebSocket per tab, on the loopback, for holders of the token."""
 
 from __future__ import annotations
 
 import contextlib
+import hmac
 import secrets
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from http import HTTPStatus
 from importlib import resources
-from urllib.parse import unquote
+from urllib.parse import unquote, urlsplit
 
 import msgspec
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
-from trirail.client.client import Robot
+from trirail.client.async_client import AsyncRobot
+from trirail.client.blocking import LoopThread
 from trirail.errors import ServiceError
 from trirail.panel.connections import Connections
 from trirail.panel.feed import Feed
-from trirail.panel.guard import refused
 from trirail.panel.recordings import Recordings
 from trirail.panel.tab import Tab
-from trirail.wire.sizes import MAX_MESSAGE
+from trirail.wire.sizes import MAX_FILE
+
+HOSTS = frozenset({"127.0.0.1", "localhost", "::1"})
+"""Names of the loopback. A foreign page whose name resolves to this machine (DNS rebinding) sends another."""
+
+
+def refused(token: str, path: str, hosts: Sequence[str], origins: Sequence[str]) -> str | None:
+    """Return the reason for refusing a request; None if it is accepted.
+
+    `path` is the requested /TOKEN/FILE; `hosts` and `origins` are the values of all headers with these names. A
+    browser sends the origin with every request of a script: it must be the page's own.
+    """
+    try:
+        (host,) = hosts
+        hostname = urlsplit(f"http://{host}").hostname
+    except ValueError:
+        hostname = None
+    if hostname not in HOSTS:
+        return "this page is for this machine alone: open it as 127.0.0.1 or localhost, from afar through ssh -L"
+    if any(origin != f"http://{host}" for origin in origins):
+        return "asked by a page of another origin"
+    given = path.removeprefix("/").partition("/")[0]
+    if not hmac.compare_digest(given.encode(), token.encode()):
+        return "no such page: open the address that trirail panel has printed, with its token"
+    return None
+
 
 HOST = "127.0.0.1"
 PORT = 9880
-"""The page's port, where it is free and no other is asked for."""
+"""Port of the page, if it is free and no other is requested."""
 SOCKET = "socket"
-"""The name below the token under which the page's WebSocket is."""
-LONGEST = 3 * MAX_MESSAGE
-"""Messages of the page are shorter than that: a file that is to be followed, as a text of JSON [bytes]."""
+"""Name of the page's WebSocket below the token."""
+LONGEST = 3 * MAX_FILE
+"""Maximum size of a message of the page: a file to follow, as a JSON string [bytes]."""
 LANGUAGES = "languages.json"
-"""The page's languages: code, and what those call it who speak it."""
+"""File with the page's languages: code, and name in the language itself."""
 SESSIONS, RECORDING, REPORT = "sessions", "recording", "report"
-"""What of the recordings can be asked for."""
+"""Names of the requests for recordings."""
 OPENING = 5.0
-"""So long may a request take: it comes from this machine [s]."""
+"""Time limit for receiving a request, which comes from this machine [s]."""
 TYPES = {
     "html": "text/html",
     "css": "text/css",
@@ -46,7 +72,7 @@ TYPES = {
     "json": "application/json",
 }
 HEADERS = {
-    # Nothing from elsewhere, in no frame of elsewhere (clickjacking), and the token is told to nobody.
+    # No content from other origins, no foreign frame around the page (clickjacking), and no leak of the token.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -57,22 +83,29 @@ HEADERS = {
 
 
 class Panel:
-    """The page of one robot while the context lasts. Raises ServiceError where the port is taken or nobody answers."""
+    """Page of one robot, served inside the context. Raises ServiceError if the port is taken or no service answers."""
 
-    def __init__(self, robot: Robot, port: int | None = None) -> None:
+    def __init__(self, robot: AsyncRobot, port: int | None = None, token: str | None = None) -> None:
+        """Serve on a port of the loopback, by default 9880 or any; `token` is the secret part of the address."""
         self._robot = robot
-        self._feed = Feed(robot)
-        self._token = secrets.token_urlsafe(16)
+        self._loop = LoopThread()
+        with contextlib.ExitStack() as opened:
+            opened.callback(self._loop.close)
+            self._loop.call(robot.__aenter__())
+            opened.callback(lambda: self._loop.call(robot.close()))
+            self._feed = Feed(robot, self._loop)
+            listening = _listen(port)
+            self._opened = opened.pop_all()
+        self._token = token or secrets.token_urlsafe(16)
         self._files = dict(_files())
         self._recordings = Recordings(robot.name, self._feed.recordings)
-        listening = _listen(port)
         self.url = f"http://{HOST}:{listening.getsockname()[1]}/{self._token}/"
-        """The address to open; whoever has it can move the robot."""
+        """Address to open; anyone with it can move the robot."""
         self._server: Server = serve(
             self._serve,
             sock=listening,
             process_request=self._answer,
-            compression=None,  # a small message at once, not a smaller one later
+            compression=None,  # latency matters more than size
             server_header=None,
             max_size=LONGEST,
             open_timeout=OPENING,
@@ -93,12 +126,13 @@ class Panel:
         self._thread.join()
         self._server.shutdown_watcher.close()
         self._server.shutdown_notifier.close()
+        self._opened.close()
 
     def _serve(self, opened: ServerConnection) -> None:
-        Tab(opened, self._robot, self._feed).serve()
+        Tab(opened, self._robot, self._loop, self._feed).serve()
 
     def _answer(self, opened: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a file, refuse what may not ask; None lets the WebSocket open."""
+        """Answer a request for a file or refuse it; None opens the WebSocket."""
         headers = request.headers
         path = request.path.partition("?")[0]
         if why := refused(self._token, path, headers.get_all("Host"), headers.get_all("Origin")):
@@ -136,7 +170,7 @@ def _response(status: HTTPStatus, body: bytes, suffix: str) -> Response:
 
 
 def _listen(port: int | None) -> socket.socket:
-    """Listen on a port of the loopback: the one that is asked for, or the usual one, or where that is taken any."""
+    """Listen on a port of the loopback: the requested one, or the default, or any if that is taken."""
     wanted = PORT if port is None else port
     if 0 <= wanted <= 65535:
         with contextlib.suppress(OSError):

@@ -1,1 +1,1 @@
-"""The service's processes and what they need of the system: supervisor, loop, gateway, recording."""
+"""The service's processes and their use of the system: supervisor, loop, gateway, recording."""

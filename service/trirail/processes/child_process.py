@@ -1,6 +1,6 @@
-"""What each child process of the service does, and what it says to the supervisor, in lines of JSON.
+"""Work of each child process of the service, and its messages to the supervisor, in lines of JSON.
 
-It says what it compiles, once that it is up, what is to be in the log, and what it has measured.
+It reports functions being compiled, once that it is up, events for the log, and measurements.
 """
 
 from __future__ import annotations
@@ -19,39 +19,30 @@ from typing import Final
 import msgspec
 from trirail_drivers.config import Can
 
-from trirail.config import Config
 from trirail.errors import ServiceError, TrirailError
 from trirail.processes import realtime
 from trirail.processes.heartbeats import BEAT_EVERY, PROCESSES, Heartbeats
+from trirail.processes.order import Order
 from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.links import Closed
 from trirail.wire.messages import Event
-from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
-
-
-class Order(msgspec.Struct, frozen=True):
-    """What a child process is told to do."""
-
-    config: Config
-    record: str | None
-    """Recording file to write, None for one named by the time."""
-
+from trirail.wire.plan_packets import Overtaken, decode_plan_request, encode
 
 COMPILING = "compiling"
-"""The key of what is said of a function that is being compiled."""
+"""Key of a function that is being compiled."""
 HAPPENED = "happened"
-"""The key of an event, for the service's log."""
+"""Key of an event, for the service's log."""
 MEASURED = "measured"
-"""The key of what a process has measured, for the metrics."""
+"""Key of a process's measurements, for the metrics."""
 LOG_WITHIN = 0.05
-"""How long a line for the log waits for a supervisor whose own output is held up, before it is left out [s]."""
+"""Longest wait of a log line for a supervisor whose own output is held up, before it is left out [s]."""
 DRIVES: Final = "drives"
-"""The process of the simulated drives, and its socket in the service's folder of sockets."""
+"""Name of the simulated drives' process, and of its socket in the service's folder of sockets."""
 DRIVES_WITHIN: Final = 60.0
-"""How long the drives may take to be there [s]."""
+"""Longest time for the drives to be there [s]."""
 LOOK_EVERY: Final = 0.005
-"""How often it is seen whether they are [s]."""
+"""Interval of the checks that they are [s]."""
 
 
 class Child:
@@ -65,12 +56,12 @@ class Child:
         self.runtime = runtime
         self.heartbeats = heartbeats
         self.sockets = sockets
-        """Those that the loop listens on."""
-        # It stays open: its end is how the supervisor learns of this process's end.
+        """Sockets that the loop listens on."""
+        # It stays open: by its end the supervisor learns of this process's end.
         self._voice = voice
 
     def ready(self, content: object) -> None:
-        """Say that it is up. Its first sign of life comes before that: one that hangs from then on is found."""
+        """Report that it is up. Its first sign of life comes before that: a hang from then on is found."""
         if self.name in PROCESSES:
             self.heartbeats.of(self.name).beat()
         self._say(content)
@@ -80,16 +71,16 @@ class Child:
             os.write(self._voice, msgspec.json.encode(content) + b"\n")
 
     def compiling(self, function: str) -> None:
-        """Say which function is being compiled."""
+        """Report the function that is being compiled."""
         self._say({COMPILING: function})
 
     def log(self, event: Event) -> None:
-        """Say what has happened."""
+        """Report an event."""
         if select.select([], [self._voice], [], LOG_WITHIN)[1]:
             self._say({HAPPENED: event})
 
     def measured(self, content: msgspec.Struct) -> None:
-        """Say what has been measured: no more than a pipe takes at once, for in a second it comes again."""
+        """Report measurements, unless the pipe is full: new ones follow in a second."""
         line = msgspec.json.encode({MEASURED: content}) + b"\n"
         if len(line) <= select.PIPE_BUF and select.select([], [self._voice], [], 0.0)[1]:
             with suppress(BrokenPipeError):
@@ -97,7 +88,7 @@ class Child:
 
 
 def run(child: Child) -> int:
-    """Do what a child of that name does; return its exit code."""
+    """Run the child of that name; return its exit code."""
     try:
         return _run(child)
     except TrirailError as error:
@@ -109,16 +100,16 @@ def _run(child: Child) -> int:
     # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun, the gateway no mathematics.
     name, config = child.name, child.order.config
     if name in ("loop", "planner"):
-        from trirail.kinematics.compiled import tell_of_compiling
+        from trirail.kinematics.compiled import on_compile
 
-        tell_of_compiling(child.compiling)
+        on_compile(child.compiling)
     if name == DRIVES:
         return _serve_drives(child)
     if name == "loop":
         from trirail.processes import loop_process
 
         gateway, recorder, planner = (socket.socket(fileno=number) for number in child.sockets)
-        ports = Ports(links.Port(gateway), links.Port(recorder), links.Port(planner, MAX_PLANNING))
+        ports = Ports(links.Port(gateway), links.Port(recorder), links.Port(planner))
         bus = partial(_bus, config.can, child.runtime / DRIVES)
         return loop_process.main(config, bus, ports, child.heartbeats, child.ready)
     if name == "planner":
@@ -128,14 +119,15 @@ def _run(child: Child) -> int:
     if name == "gateway":
         from trirail.processes import gateway as gate
 
-        return gate.main(config, link, heart.beat, child.ready, child.log, child.measured, child.heartbeats.hurrying)
+        order, hurrying = child.order, child.heartbeats.hurrying
+        return gate.main(order, link, heart.beat, child.ready, child.log, child.measured, hurrying)
     from trirail.processes import recording
 
     return recording.main(config, child.order.record, link, heart, child.ready, child.measured)
 
 
 def _plan(child: Child) -> int:
-    """Be the planner: answer what the loop asks, one request at a time, until the loop has gone.
+    """Run the planner: answer the loop's requests, one at a time, until the loop has gone.
 
     It runs beside the loop and never on its processor; it keeps nothing, so it may be killed at any time.
     """
@@ -144,35 +136,38 @@ def _plan(child: Child) -> int:
     def beat() -> None:
         if serving:  # the first start compiles in its warm-up
             heart.beat()
+            if poll.poll(0):
+                raise Overtaken
 
     serving = False
+    poll = select.poll()
     config, heart = child.order.config, child.heartbeats.of(child.name)
     planner = MotionPlanner(config, beat)
     planner.warm_up()
     lacking = realtime.stay_beside(config.loop, realtime.PLANNER_BELOW)
-    link = links.connect(child.runtime / child.name, MAX_PLANNING)
+    link = links.connect(child.runtime / child.name)
     child.ready({"lacking": lacking})
-    poll = select.poll()
     poll.register(link.fileno(), select.POLLIN)
     serving = True
     try:
         while True:
             heart.beat()
             poll.poll(BEAT_EVERY * 1e3)
-            newest = None  # nobody waits any more for what was asked before
+            newest = None  # nobody waits for earlier requests any more
             while (packet := link.receive()) is not None:
                 newest = packet
             if newest is not None:
-                link.send(encode(planner.plan(decode_plan_request(newest))))
+                with suppress(Overtaken):
+                    link.send(encode(planner.plan(decode_plan_request(newest))))
     except Closed:
         heart.rest()
     return 0
 
 
 def _serve_drives(child: Child) -> int:
-    """Be the simulated drives until the loop has gone: it has them on a bus between processes, as real ones on theirs.
+    """Run the simulated drives until the loop has gone: it has them on a bus between processes, as real ones on theirs.
 
-    They keep nothing, so they may be killed when it has.
+    They keep nothing, so they may be killed after it.
     """
     from trirail_drivers.connection.serving import serve
 
@@ -183,7 +178,7 @@ def _serve_drives(child: Child) -> int:
         child.ready({"lacking": lacking})
 
     def connected() -> None:
-        # The loop stops the robot first, whoever is told to end; its end is the end of this process.
+        # The loop stops the robot first, on any signal to end; its end is the end of this process.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     serve(child.runtime / DRIVES, config.can, config.drives, begin, connected)
@@ -191,7 +186,7 @@ def _serve_drives(child: Child) -> int:
 
 
 def _bus(can: Can, drives: Path) -> Can:
-    """Section [can] of the bus that the loop is on; where the drives are simulated, once their process serves them."""
+    """Return [can] of the bus that the loop is on; with simulated drives, once their process serves them."""
     if can.interface != "simulated":
         return can
     deadline = time.monotonic() + DRIVES_WITHIN

@@ -1,6 +1,6 @@
-"""Fixed-rate ticks on absolute deadlines of the monotonic clock, and who calls meanwhile is heard.
+"""Fixed-rate ticks on absolute deadlines of the monotonic clock, with calls served meanwhile.
 
-The wait is compiled, for both ways of the loop. Who calls with time left before the deadline is heard at once, not a
+The wait is compiled, for both ways of the loop. A call with time left before the deadline is served immediately, not a
 cycle later.
 """
 
@@ -25,10 +25,10 @@ _ppoll: Any = types.ExternalFunction("ppoll", i4(types.intp, u8, types.intp, typ
 
 DOORS = i4[:, ::1]
 SPARE_NS: Final = 500_000
-"""What comes later before a deadline is heard behind that cycle's setpoints: so long Python may take for it [ns]."""
+"""Time allowed to Python for a call [ns]; one that comes later before a deadline waits behind its setpoints."""
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
-"""Of clock_nanosleep: to a deadline."""
+"""TIMER_ABSTIME of clock_nanosleep: to a deadline."""
 _INTERRUPTED: Final = 4
 """EINTR of errno.h."""
 _POLLIN: Final = 1
@@ -44,7 +44,7 @@ def now_ns(moment: NDArray[np.int64]) -> int:
 
 @compiled()
 def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
-    """Sleep until the deadline, whatever interrupts that; `moment` as of `now_ns`."""
+    """Sleep until the deadline, through interruptions; `moment` as in `now_ns`."""
     moment[0], moment[1] = deadline_ns // _SECOND, deadline_ns % _SECOND
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, moment.ctypes.data, 0) == _INTERRUPTED:
         pass
@@ -52,15 +52,15 @@ def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
 
 @compiled(b1(DOORS))
 def called(doors: NDArray[np.int32]) -> bool:
-    """Return whether somebody is at a door, or has gone from one; `doors` (n, 2) are as poll takes them."""
+    """Return whether a peer is at a door, or has gone from one; `doors` (n, 2) is an array for poll."""
     return bool(_poll(doors.ctypes.data, np.uint64(len(doors)), 0) != 0)
 
 
 @compiled(b1(i8, DOORS, i8[::1]), releases=True)
 def wait(deadline_ns: int, doors: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
-    """Wait until the deadline or, more than SPARE_NS before it, until somebody is at a door; return whether he is.
+    """Wait until the deadline or, more than SPARE_NS before it, until a peer is at a door; return whether one is.
 
-    `doors` and `moment` as of `called` and `now_ns`. Each of the two waits for itself: where one call watches the doors
+    `doors` and `moment` as in `called` and `now_ns`. The two waits are separate: with one call that watches the doors
     until the deadline, ticks come later.
     """
     left = deadline_ns - SPARE_NS - now_ns(moment)
@@ -74,21 +74,21 @@ def wait(deadline_ns: int, doors: NDArray[np.int32], moment: NDArray[np.int64]) 
 
 
 class Doors:
-    """The neighbours' doors, as compiled code looks at them."""
+    """Neighbours' doors, for compiled code."""
 
     def __init__(self, ports: Sequence[Port]) -> None:
         self._ports = ports
         self.room = np.zeros((len(ports), 2), np.int32)
-        """As poll takes them."""
+        """Array for poll."""
         self._moment = np.zeros(2, np.int64)
 
     def refresh(self) -> None:
-        """Write those who are connected now into the room."""
+        """Write the peers that are connected now into the room."""
         for door, port in zip(self.room, self._ports, strict=True):
             door[:] = port.fileno(), _POLLIN
 
     def called(self) -> bool:
-        """Whether somebody is at a door."""
+        """Return whether a peer is at a door."""
         self.refresh()
         return bool(called(self.room))
 
@@ -99,28 +99,28 @@ class Doors:
 
 
 class Tick(NamedTuple):
-    """One tick, as it came."""
+    """One tick."""
 
     deadline_ns: int
-    """When it was due."""
+    """Time at which it was due."""
     lateness_ns: int
-    """How much later it came."""
+    """Delay of the tick after that."""
     missed: int
     """Ticks skipped since the one before."""
 
 
 class Overruns:
-    """Ticks that were missed, of which so many are `allowed` in a row."""
+    """Counts of missed ticks, of which `allowed` may be in a row."""
 
     def __init__(self, allowed: int) -> None:
         self.allowed = allowed
         self.all = 0
-        """Since the start."""
+        """Number since the start."""
         self.in_a_row = 0
-        """Before the newest tick and, where ticks were missed before that as well, before those."""
+        """Number before the newest tick and, if ticks were missed before that as well, before those."""
 
     def too_many(self, missed: int) -> int:
-        """Count those that were missed before a tick; return how many that are in a row, if more than are allowed."""
+        """Count the ticks missed before one; return how many are in a row, if that is more than allowed."""
         self.all += missed
         in_a_row = self.in_a_row + missed if missed else 0
         self.in_a_row = in_a_row if in_a_row <= self.allowed else 0
@@ -147,12 +147,12 @@ class Ticker:
         self._now = now
         self._sleep = sleep
         self.deadline_ns = now()
-        """When the newest tick was due."""
+        """Time at which the newest tick was due."""
 
     def come(self) -> int:
-        """Sleep to the next deadline by a clock that is not the machine's, and return the time by it [ns].
+        """Sleep to the next deadline by an injected clock, and return its time [ns].
 
-        By the machine's -1, at once: who asks can wait for that one by himself.
+        With the machine's clock, return -1 immediately: the caller can wait for that one by itself.
         """
         if self._now is time.monotonic_ns:
             return -1
@@ -160,7 +160,7 @@ class Ticker:
         return self._now()
 
     def listen(self, doors: Doors) -> bool:
-        """Wait for the next deadline or, with time left before it, for somebody at a door; whether somebody is."""
+        """Wait for the next deadline or, with time left before it, for a peer at a door; return whether one is."""
         if self._now is time.monotonic_ns:
             return doors.wait(self.deadline_ns + self._period_ns)
         self._sleep_on()
@@ -178,7 +178,7 @@ class Ticker:
             self._sleep(self.deadline_ns + self._period_ns)
 
     def tick(self) -> Tick:
-        """Return the tick whose deadline has come; somebody else has waited for it."""
+        """Return the tick whose deadline has come, after a wait by the caller."""
         lateness_ns = self._now() - self.deadline_ns
         missed = max(0, lateness_ns // self._period_ns)
         self.deadline_ns += missed * self._period_ns

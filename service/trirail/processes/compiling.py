@@ -1,4 +1,4 @@
-"""The first start compiles the mathematics, once: what is said of it, and doing it ahead of the first start.
+"""Compilation of the mathematics, once, at the first start: reports about it, and doing it ahead of the first start.
 
 `python -m trirail.processes.compiling` compiles all that a service needs.
 """
@@ -12,13 +12,13 @@ from trirail.processes.operating_system import notify
 from trirail.processes.realtime import give_back
 
 LOADED = "trirail.processes.loop_process"
-"""The module that is imported last, once all compiled rooms are."""
+"""Module that is imported last, once all compiled rooms are."""
 QUARTERS = 4
-"""So many parts of the work are told of."""
+"""Number of progress reports."""
 
 
 class Progress:
-    """Says that the mathematics is being compiled, and how far that is; tells systemd to wait as long as it goes on."""
+    """Progress of the compilation, reported to users, and to systemd, which waits meanwhile."""
 
     def __init__(self, say: Callable[[str], None], patience: float) -> None:
         self._say = say
@@ -27,15 +27,15 @@ class Progress:
 
     @property
     def interrupted(self) -> str:
-        """What it means that the start is interrupted now, for people."""
+        """Consequence of interrupting the start now, for people."""
         if not self._begun:
             return "the start is interrupted, nothing has moved"
         place = len(self._begun)
         return f"compiling is interrupted at function {place}: those before it are kept, the next start goes on there"
 
     def begin(self, name: str) -> None:
-        """Take in that a function is being compiled; `patience` seconds may pass until the next one [s]."""
-        from trirail.kinematics.compiled import FUNCTIONS  # with numba, which a start without compiling goes without
+        """Report that a function is being compiled; the next one may follow after the patience [s]."""
+        from trirail.kinematics.compiled import FUNCTIONS  # with numba, which a start without compiling does not need
 
         before = len(self._begun)
         self._begun.add(name)
@@ -53,17 +53,17 @@ class NotKeptError(Exception):
 
 
 def load() -> bool:
-    """Import the compiled rooms for good, which takes a second; False where something would have to be compiled."""
+    """Import the compiled rooms for good, which takes a second; return False if something would have to be compiled."""
     if LOADED in sys.modules:
         return True
     # numba imports it where it is installed, 0.15 s and 10 MB, for linear algebra that nothing compiled here asks for.
     sys.modules.setdefault("scipy", None)  # type: ignore[arg-type]
-    from trirail.kinematics.compiled import compile_no_more, tell_of_compiling
+    from trirail.kinematics.compiled import compile_no_more, on_compile
 
     def refuse(function: str) -> None:
         raise NotKeptError(function)
 
-    tell_of_compiling(refuse)
+    on_compile(refuse)
     try:
         _import_rooms()
     except NotKeptError:
@@ -74,10 +74,10 @@ def load() -> bool:
 
 
 def compile_all(begin: Callable[[str], None]) -> None:
-    """Compile what is not kept yet; `begin` is called with the name of each function before it is compiled."""
-    from trirail.kinematics.compiled import tell_of_compiling
+    """Compile functions that are not cached yet; call `begin` with the name of each before it."""
+    from trirail.kinematics.compiled import on_compile
 
-    tell_of_compiling(begin)
+    on_compile(begin)
     _import_rooms()
 
 
@@ -86,7 +86,7 @@ def _import_rooms() -> None:
 
 
 def main() -> int:
-    """Compile what is not kept yet."""
+    """Compile functions that are not cached yet."""
     progress = Progress(lambda words: print(f"trirail: {words}", flush=True), 0.0)  # noqa: T201
     try:
         compile_all(progress.begin)

@@ -1,8 +1,8 @@
-"""Frames of a cycle, for compiled code: how they come and go, which of them say nothing new, what setpoints look like.
+"""Frames of a cycle, for compiled code: sending, receiving, detecting anything new, and encoding setpoints.
 
 It knows no protocol, only the tables of trirail_drivers.driver.cyclic: `axes` (3,) of AXIS, `expected` (n,) of
-EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. What a driver does with them is in its axes.
-They come and go by libc on the bus' socket, or by functions of Python's where it has none.
+EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. A driver's use of them is in its axes.
+Frames are exchanged by libc on the bus' socket, or by Python functions if the bus has none.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from trirail_drivers.driver.scaling import INT32_MAX
 
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
+from trirail.processes.clock import now_ns, sleep
 
 AXES, EXPECTATIONS, TIMINGS = from_dtype(AXIS)[::1], from_dtype(EXPECTED)[::1], from_dtype(TIMES)[::1]
 FRAMES = u1[:, ::1]
 LENGTH_AT = 4
-"""Where in a frame the length of its data stands."""
+"""Offset of the data length in a frame."""
 
 
 # Of libc, by name: sys/socket.h, errno.h, string.h.
@@ -39,7 +40,7 @@ memcpy: Any = types.ExternalFunction("memcpy", types.intp(types.intp, types.intp
 _NOTHING_THERE: Final = 11
 """EAGAIN of errno.h."""
 _KEPT: Final = -1
-"""An error that whoever receives next finds again: the other end has gone, or Python has met one and keeps it."""
+"""Error that the next receiver meets again: the other end has gone, or Python has caught one and keeps it."""
 _FLAGS: Final = 0x40 | 0x4000
 """MSG_DONTWAIT, MSG_NOSIGNAL."""
 _FRAME: Final = CAN_FRAME.size
@@ -63,10 +64,10 @@ _called: Any = intrinsic(_call)
 def receive_frames(
     bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], room: NDArray[np.int64]
 ) -> tuple[int, int]:
-    """Take what has arrived; return how many frames that are, and the error with which it has failed after them.
+    """Receive the frames that have arrived; return their number, and the error that followed them.
 
     `bus` (3,) is a BusAccess; `headers` and `frames` are of PackedFrames, with room for
-    MOST_FRAMES. An error is a number of errno.h; 0 for none, below 0 where whoever receives next finds it again.
+    MOST_FRAMES. An error is a number of errno.h; 0 for none, below 0 if the next receiver meets it again.
     """
     if bus[0] < 0:
         number = _called(bus[1], frames.ctypes.data, MOST_FRAMES)
@@ -86,9 +87,9 @@ def receive_frames(
 def send_frames(
     bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], times: NDArray[np.void]
 ) -> int:
-    """Send frames, of PackedFrames, and count what they take of the bus.
+    """Send frames, of PackedFrames, and count the bits that they take of the bus.
 
-    Return how many it has taken, before the first that it has refused.
+    Return how many it has accepted, before the first that it has refused.
     """
     if len(headers) == 0:
         return 0
@@ -103,7 +104,7 @@ def send_frames(
 
 @compiled()
 def _number(frame: NDArray[np.uint8], at: int, size: int) -> int:
-    """Return the little-endian number of so many bytes, without sign."""
+    """Return the unsigned little-endian number of `size` bytes."""
     number = np.int64(0)
     for i in range(size):
         number |= np.int64(frame[at + i]) << (8 * i)
@@ -112,26 +113,29 @@ def _number(frame: NDArray[np.uint8], at: int, size: int) -> int:
 
 @compiled()
 def _signed(number: int) -> int:
-    """Return what 32 bits stand for."""
+    """Return 32 bits as a signed number."""
     return number - (1 << 32) if number >> 31 else number
 
 
 @compiled()
-def _come(axis: Any) -> bool:
-    """Take in that a position has come, as trirail_drivers.driver.answers.Answers.answer; False where that is late."""
+def _answers_in_time(axis: Any) -> bool:
+    """Count a position as the answer to a SYNC, as trirail_drivers.driver.axis.Answers.answer does.
+
+    Return False, and count nothing, for the second answer to a SYNC, and where one has been late or lost.
+    """
     to_the_one_before = not axis.between and not axis.prompt and axis.sampled < axis.syncs - 1
     sampled = axis.syncs - to_the_one_before
-    if sampled - axis.sampled > 1 or (axis.prompt and axis.between and sampled > axis.sampled):
+    late = axis.prompt and axis.between and sampled > axis.sampled
+    if axis.came or late or sampled - axis.sampled > 1:
         return False
-    axis.sampled = sampled
-    axis.prompt = not axis.between and not to_the_one_before
+    axis.came, axis.sampled, axis.prompt = True, sampled, not axis.between and not to_the_one_before
     return True
 
 
 @compiled()
 def _take_position(axis: Any, counts: int, now: float) -> bool:
-    """Take a position in; False where it is the second one that answers a SYNC, or others have been late or lost."""
-    if axis.came:
+    """Accept a position [counts]; return False, and change nothing, if `_answers_in_time` does."""
+    if not _answers_in_time(axis):
         return False
     if abs(counts - axis.stands_at) > axis.still:
         axis.stands_at, axis.stands_since = counts, now
@@ -139,18 +143,18 @@ def _take_position(axis: Any, counts: int, now: float) -> bool:
     step = counts - axis.newest
     if step:
         axis.step = step
-    axis.newest, axis.came = counts, True
-    axis.actual, axis.position = counts, counts / axis.counts_per_metre + axis.zero
-    return _come(axis)
+    axis.newest, axis.actual = counts, counts
+    axis.position = counts / axis.counts_per_metre + axis.zero
+    return True
 
 
 @compiled()
 def _take_turns(axis: Any, turns: float) -> bool:
-    """Take a position in that is no whole number; False where it is none, or as of _take_position."""
-    if axis.came or not math.isfinite(turns):
+    """Accept a position [turns]; return False, and change nothing, if it is not finite or `_answers_in_time` does."""
+    if not math.isfinite(turns) or not _answers_in_time(axis):
         return False
-    axis.came, axis.position = True, turns / axis.counts_per_metre + axis.zero
-    return _come(axis)
+    axis.position = turns / axis.counts_per_metre + axis.zero
+    return True
 
 
 @compiled(i8(FRAMES, i8, EXPECTATIONS, AXES, TIMINGS, f8))
@@ -162,9 +166,9 @@ def take_frames(
     times: NDArray[np.void],
     now: float,
 ) -> int:
-    """Take in so many frames that have come by a time [s]; return how many say nothing new, before the first that does.
+    """Process frames received by a time [s] up to the first that holds anything new; return how many.
 
-    Where that is not all of them, what has been taken in of the others is to be forgotten.
+    The frames from that one on are untouched: the caller continues there.
     """
     for i in range(number):
         frame = frames[i]
@@ -198,7 +202,7 @@ def take_frames(
 
 @compiled()
 def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
-    """Note that the SYNC has been sent, with the setpoints where these wait for one."""
+    """Record that the SYNC has been sent, with the setpoints that waited for it."""
     for i in range(3):
         axis = axes[i]
         axis.syncs += 1
@@ -213,10 +217,12 @@ def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
 
 @compiled(i8(AXES, TIMINGS, f8[:, ::1], f8))
 def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, now: float) -> int:
-    """Note that the frames of a cycle are in; return whether every drive has told all that it should, and follows."""
+    """Record that the frames of a cycle are in, if every drive has sent all that it should, and follows.
+
+    Return whether that is so; else do nothing.
+    """
     for i in range(3):
         axis = axes[i]
-        axis.between, axis.came = True, False
         age = axis.syncs - axis.sampled
         if age - (not axis.prompt) or now - axis.heard > axis.heard_within:
             return False
@@ -226,20 +232,23 @@ def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, no
             due = history[(axis.syncs - min(age, len(history) - 1)) % len(history), i]
             if not abs(due - axis.position) <= axis.follows_within:
                 return False
-    in_time: bool = now < times[0].due
-    return in_time
+    if not now < times[0].due:
+        return False
+    for i in range(3):
+        axes[i].between, axes[i].came = True, False
+    return True
 
 
 @compiled()
 def _put(frame: NDArray[np.uint8], at: int, number: int, size: int) -> None:
-    """Write so many bytes, little-endian."""
+    """Write `size` bytes, little-endian."""
     for i in range(size):
         frame[DATA_AT + at + i] = (number >> (8 * i)) & 0xFF
 
 
 @compiled(i8(FRAMES, AXES, f8[:, ::1]))
 def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -> int:
-    """Write setpoints, rows of positions [m] and velocities [m/s], into their frames; False where one does not fit."""
+    """Write setpoints, rows of positions [m] and velocities [m/s], into frames; return False if one does not fit."""
     for i in range(3):
         axis = axes[i]
         counts = axis.counts_per_metre * (sent[0, i] - axis.zero)
@@ -262,3 +271,41 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
             _put(frames[i], axis.velocity_at, axis.offset, axis.velocity_bytes)
         axis.wanted, axis.wanted_rate = sent[0, i], sent[1, i]
     return True
+
+
+@compiled()
+def exchange_frames(
+    bus: NDArray[np.int64],
+    period_ns: int,
+    begin: NDArray[np.uint64],
+    starts: NDArray[np.uint8],
+    departures: NDArray[np.uint64],
+    setpoints: NDArray[np.uint8],
+    arrivals: NDArray[np.uint64],
+    arrived: NDArray[np.uint8],
+    times: NDArray[np.void],
+    moment: NDArray[np.int64],
+    lateness: NDArray[np.int64],
+    work: NDArray[np.int64],
+) -> int:
+    """Run cycles that exchange frames and compute nothing, to measure the machine; return the frames received.
+
+    Parameters
+    ----------
+    lateness : (n,)
+        Delay of each cycle's start, including the ticks missed before it [ns].
+    work : (n,)
+        Time from there until the setpoints of each cycle were sent [ns].
+
+    """
+    number, deadline_ns = 0, now_ns(moment)
+    for k in range(len(lateness)):
+        deadline_ns += period_ns
+        sleep(deadline_ns, moment)
+        began_ns = now_ns(moment)
+        send_frames(bus, begin, starts, times)
+        number += receive_frames(bus, arrivals, arrived, moment)[0]
+        send_frames(bus, departures, setpoints, times)
+        lateness[k], work[k] = began_ns - deadline_ns, now_ns(moment) - began_ns
+        deadline_ns += lateness[k] // period_ns * period_ns
+    return number

@@ -1,10 +1,10 @@
-"""The fork server: imports what the service's processes need, once, and forks them from itself.
+"""The fork server: imports the modules that the service's processes need, once, and forks them from itself.
 
-It is forked itself, from the supervisor before that has a thread, so that what both need is in memory once. On its
-control, a SEQPACKET socket, it takes requests to fork (`Fork`, with the descriptor on which the child speaks) and says
-what it has forked (`Forked`, with a pidfd) and how that ended (`Ended`). It has no thread, so that a fork is a whole
-process: Zenoh and Rerun, which have, are imported by the child that needs them. It compiles nothing: what is not kept,
-a child does.
+It is forked itself, from the supervisor before that has a thread, so that shared modules are in memory once. On its
+control, a SEQPACKET socket, it receives requests to fork (`Fork`, with the descriptor for the child's messages) and
+reports each fork (`Forked`, with a pidfd) and its end (`Ended`). It has no thread, so that a fork is a whole process:
+Zenoh and Rerun, which have, are imported by the child that needs them. It compiles nothing: a child compiles
+functions that are not cached.
 """
 
 from __future__ import annotations
@@ -25,41 +25,43 @@ import msgspec
 from msgspec import structs
 
 from trirail.processes import compiling
-from trirail.processes.child_process import Child, Order, run
+from trirail.processes.child_process import Child, run
 from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.order import Order
 from trirail.processes.realtime import die_with_parent, name_process
 from trirail.wire.decoding import decoded, prepare
 
 MATHEMATICS = ("loop", "drives", "planner")
-"""Those that need the compiled rooms, or what these need; the others are forked before these are imported."""
+"""Processes that need the compiled rooms or their imports; the others are forked before these are imported."""
 WITH_PARENT: Final = {"loop": signal.SIGTERM, "drives": signal.SIGTERM, "planner": signal.SIGKILL}
-"""What ends a child when this process ends, however that ends. Gateway and recorder end by themselves once the loop has
-gone, so that what it says of its end is published and on disk; so do drives that it has, for it stops them first."""
+"""Signal that ends a child when this process ends, in any way. Gateway and recorder end by themselves once the loop has
+gone, so that its last messages are published and on disk; so do drives that it has, for it stops them first."""
 OF_TERMINAL: Final = (signal.SIGINT, signal.SIGHUP)
-"""What a terminal sends to all of its processes: Ctrl-C, and its own end."""
+"""Signals of a terminal to all of its processes: Ctrl-C, and its own end."""
 AS_NEEDED: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
-"""The environment in which Rerun's allocator takes memory as it is needed, and not in advance."""
+"""Environment in which Rerun's allocator takes memory as it is needed, and not in advance."""
 LARGEST = 4096
-"""Bytes of a packet on CONTROL."""
+"""Largest packet on CONTROL [bytes]."""
 
 
 class Fork(msgspec.Struct, frozen=True):
-    """A request to fork the child `name`; `number` is the supervisor's, and tells it from all others."""
+    """Request to fork the child `name`; `number` is the supervisor's, and unique; see Order."""
 
     number: int
     name: str
     record: str | None = None
+    again: bool = False
 
 
 class Forked(msgspec.Struct, frozen=True, tag=True):
-    """The child of request `number` is process `pid`; its pidfd comes with the packet."""
+    """Start of the child of request `number` as process `pid`; its pidfd comes with the packet."""
 
     number: int
     pid: int
 
 
 class Ended(msgspec.Struct, frozen=True, tag=True):
-    """The child of request `number` has ended: its exit code, or the negative number of the signal that killed it."""
+    """End of the child of request `number`: its exit code, or the negative number of the signal that killed it."""
 
     number: int
     code: int
@@ -71,23 +73,23 @@ prepare(Fork)
 class _Request(NamedTuple):
     fork: Fork
     voice: int
-    """The descriptor on which the child is to speak."""
+    """Descriptor for the child's messages."""
 
 
 class ForkServer:
-    """Forks on request until the supervisor has gone; `work` is what a child does, and returns its exit code."""
+    """Server that forks on request until the supervisor has gone; `work` runs a child, and returns its exit code."""
 
     def __init__(self, inherited: Inheritance) -> None:
         self._inherited = inherited
         self._control = inherited.control
         self._requests: list[_Request] = []
-        """Those whose child has not been forked yet."""
+        """Requests whose child has not been forked yet."""
         self._children: dict[int, int] = {}
-        """The number of each child's request, by its pidfd."""
+        """Request number of each child, by its pidfd."""
         self._compiler: tuple[int, _Request] | None = None
-        """Its pidfd while there is one, and the request for which it compiles."""
+        """Pidfd of the compiling child, if any, and the request for which it compiles."""
         self._kept = True
-        """False where what is compiled cannot be kept: then each that needs it compiles for itself."""
+        """False if compiled code cannot be cached: then each child that needs it compiles for itself."""
         self._poll = select.poll()
         self._poll.register(self._control, select.POLLIN)
 
@@ -106,7 +108,7 @@ class ForkServer:
                 self._done(request)
 
     def _receive(self) -> bool:
-        """Take a request; False where there will be no more."""
+        """Receive a request; return False if there will be no more."""
         try:
             packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 1)
         except ConnectionError:
@@ -116,7 +118,7 @@ class ForkServer:
         return bool(packet)
 
     def _can_be_met(self, request: _Request) -> bool:
-        """Whether the child can be forked now: who needs the compiled rooms waits while these are being compiled."""
+        """Return whether the child can be forked now: one that needs the compiled rooms waits for their compilation."""
         if request.fork.name not in MATHEMATICS or not self._kept:
             return True
         if self._compiler is None and not compiling.load():
@@ -133,7 +135,7 @@ class ForkServer:
     ) -> tuple[int, int]:
         """Return pidfd and process id of a new child; `with_parent` is sent to it at the end of this process."""
         parent = os.getpid()
-        gc.freeze()  # a child's collector would touch, and so copy, what it shares with this process
+        gc.freeze()  # a child's collector would touch, and so copy, memory shared with this process
         pid = os.fork()
         if pid == 0:
             if with_parent is not None:
@@ -146,7 +148,7 @@ class ForkServer:
         return pidfd, pid
 
     def _become(self, request: _Request, work: Callable[[Child], int]) -> NoReturn:
-        """Be the child, with its own descriptors alone."""
+        """Run as the child, with its own descriptors alone."""
         code = 1
         try:
             name = request.fork.name
@@ -158,7 +160,7 @@ class ForkServer:
             gc.enable()
             signal.pthread_sigmask(signal.SIG_SETMASK, [])
             _, order, runtime, heartbeats, sockets = self._inherited
-            order = structs.replace(order, record=request.fork.record)
+            order = structs.replace(order, record=request.fork.record, again=request.fork.again)
             code = work(Child(name, order, runtime, heartbeats, sockets, request.voice))
         except BaseException:  # noqa: BLE001 - nothing of this process may return into that of the parent
             traceback.print_exc()
@@ -186,7 +188,7 @@ class ForkServer:
         try:
             socket.send_fds(self._control, [msgspec.json.encode(what)], descriptors)
         except ConnectionError:
-            return  # the supervisor has gone, as the next look at the socket finds
+            return  # the supervisor has gone, as the next read of the socket finds
 
 
 def _compile(child: Child) -> int:
@@ -195,18 +197,18 @@ def _compile(child: Child) -> int:
 
 
 class Inheritance(NamedTuple):
-    """What the fork server has from the supervisor."""
+    """Objects that the fork server has from the supervisor."""
 
     control: socket.socket
     order: Order
     runtime: Path
     heartbeats: Heartbeats
     sockets: list[int]
-    """Those that the loop listens on."""
+    """Sockets that the loop listens on."""
 
 
 def serve(inheritance: Inheritance, work: Callable[[Child], int] = run) -> None:
-    """Be the fork server until the supervisor has gone."""
+    """Run the fork server until the supervisor has gone."""
     name_process("fork-server")
     die_with_parent(signal.SIGKILL)
     # The supervisor alone acts on what a terminal sends; SIGTERM waits for the child that unblocks it.
@@ -223,7 +225,7 @@ def fork(inheritance: Inheritance) -> int:
     """Return the process id of a new fork server. This process may have no other thread."""
     supervisor = os.getpid()
     gc.collect()
-    gc.freeze()  # either's collector would touch, and so copy, what they share
+    gc.freeze()  # either's collector would touch, and so copy, shared memory
     sys.stdout.flush()
     sys.stderr.flush()
     pid = os.fork()
@@ -234,7 +236,7 @@ def fork(inheritance: Inheritance) -> int:
         signal.set_wakeup_fd(-1)
         _keep(inheritance.control.fileno(), inheritance.heartbeats.descriptor, *inheritance.sockets)
         if not sys.flags.safe_path:
-            del sys.path[0]  # what lies in the current folder is nothing to import, whoever has put it there
+            del sys.path[0]  # files in the current folder must not be imported
         if os.getppid() == supervisor:
             serve(inheritance)
         code = 0
@@ -245,7 +247,7 @@ def fork(inheritance: Inheritance) -> int:
 
 
 def _keep(*descriptors: int) -> None:
-    """Close all but these and the standard ones, of which the input is empty."""
+    """Close all descriptors but these and the standard ones, of which the input is empty."""
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     for entry in os.listdir("/proc/self/fd"):

@@ -1,6 +1,6 @@
-"""The fork server and the processes that it has forked, as the supervisor sees them.
+"""The fork server and the processes that it has forked, from the supervisor's side.
 
-Each says on a pipe when it is ready and what it measures; the pipe's end is its end.
+Each reports on a pipe that it is ready, and its measurements; the pipe's end is its end.
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ from typing import Any
 
 import msgspec
 
-from trirail.processes.child_process import COMPILING, HAPPENED, MEASURED, Order
+from trirail.processes.child_process import COMPILING, HAPPENED, MEASURED
 from trirail.processes.fork_server import LARGEST, MATHEMATICS, OF_TERMINAL, Ended, Fork, Forked, Inheritance, fork
 from trirail.processes.heartbeats import Heartbeats
+from trirail.processes.order import Order
 from trirail.wire.decoding import converted, decoded, prepare
 from trirail.wire.messages import Event
 
 TELLS_WITHIN = 1.0
-"""So long after the end of a child the fork server may take to say how it ended [s]."""
+"""Longest time after the end of a child for the fork server to report how it ended [s]."""
 IMPORTS_WITHIN = 6.0
 """The same while it may be importing the mathematics [s]."""
 UNTOLD = os.EX_UNAVAILABLE
-"""The code of a child whose parent, gone, frozen or busy, does not say how it ended; none ends with it by itself."""
+"""Exit code of a child whose parent, gone, frozen or busy, does not report how it ended; none has it by itself."""
 
 prepare(Forked | Ended)
 
 
 class ServerProcess:
-    """The fork server's process: what Popen is for one's own child."""
+    """Process of the fork server, as Popen is for one's own child."""
 
     def __init__(self, inheritance: Inheritance) -> None:
         self._pid = fork(inheritance)
@@ -46,13 +47,13 @@ class ServerProcess:
         return self._code
 
     def kill(self) -> None:
-        """Kill it, if nobody has waited for its end."""
+        """Kill it, unless its end has been waited for."""
         if self._code is None:
             os.kill(self._pid, signal.SIGKILL)
 
 
 class ForkServerLink:
-    """Starts the fork server, asks it for children, and hears how they end. Its process may have no other thread."""
+    """Link to the fork server: starts it, requests children, receives their ends; only for a process of one thread."""
 
     def __init__(self, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int]) -> None:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -66,25 +67,26 @@ class ForkServerLink:
         self._numbers = 0
         self._hung_for = 0.0
         self.tells_within = IMPORTS_WITHIN
-        """How long what it has to say may take; nothing where it has been waited for in vain [s]."""
+        """Longest wait for its next message; 0 after a wait in vain [s]."""
         self.gone = False
-        """Whether it has ended: then the loop has been told to end as well."""
+        """Whether it has ended: then SIGTERM has been sent to the loop as well."""
 
     def fileno(self) -> int:
-        """For select and its like."""
+        """Return the descriptor for select."""
         return self._control.fileno()
 
-    def fork(self, child: ChildProcess, record: str | None, voice: int) -> None:
-        """Ask for a child that speaks on the descriptor `voice`."""
+    def fork(self, child: ChildProcess, record: str | None, voice: int, *, again: bool = False) -> None:
+        """Request a child that sends its messages on the descriptor `voice`."""
         self._numbers += 1
         self._asked[self._numbers] = child
+        request = Fork(self._numbers, child.name, record, again)
         try:
-            socket.send_fds(self._control, [msgspec.json.encode(Fork(self._numbers, child.name, record))], [voice])
+            socket.send_fds(self._control, [msgspec.json.encode(request)], [voice])
         except OSError:
             self._lost()
 
     def hear(self) -> None:
-        """Take what it says, or that it has ended, if there is something."""
+        """Process its messages, or its end, if any."""
         try:
             packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 1)
         except BlockingIOError:
@@ -104,13 +106,13 @@ class ForkServerLink:
             self._asked.pop(said.number).ended(said.code)
 
     def speaks(self) -> bool:
-        """Wait until it says something; False where it does not, and then it is not waited for again."""
+        """Wait for its next message; return False if none comes, and then do not wait again."""
         heard = bool(select.select([self], [], [], self.tells_within)[0])
         self.tells_within = self.tells_within if heard else 0.0
         return heard
 
     def how(self) -> str:
-        """How it ended, for people."""
+        """Return how it ended, for people."""
         return how_ended(self._process.wait(), self._hung_for)
 
     def kill(self) -> None:
@@ -118,7 +120,7 @@ class ForkServerLink:
         self._process.kill()
 
     def kill_hung(self, silent: float) -> None:
-        """Kill it for not having answered for so long [s]."""
+        """Kill it because it has not answered for `silent` seconds."""
         self._hung_for = silent
         self.kill()
 
@@ -135,14 +137,14 @@ class ForkServerLink:
 
 
 class ChildProcess:
-    """A child of the fork server, as Popen has one's own; and a pipe on which it speaks and whose end is its end."""
+    """Child of the fork server, with the interface of Popen; and a pipe for its messages, whose end is its end."""
 
-    def __init__(self, parent: ForkServerLink, name: str, record: str | None) -> None:
+    def __init__(self, parent: ForkServerLink, name: str, record: str | None, *, again: bool = False) -> None:
         self.name = name
         self._parent = parent
         self._pidfd: int | None = None
         self._killed = False
-        """Whether it is not to be."""
+        """Whether it has been killed."""
         self.pid: int | None = None
         """None before it has been forked."""
         self.returncode: int | None = None
@@ -156,24 +158,24 @@ class ChildProcess:
         self._hung_for = 0.0
         self.pipe, write = os.pipe()
         os.set_blocking(self.pipe, False)
-        parent.fork(self, record, write)
+        parent.fork(self, record, write, again=again)
         os.close(write)
 
     def forked(self, pid: int, pidfd: int) -> None:
-        """It has been forked."""
+        """Record that it has been forked."""
         self.pid, self._pidfd = pid, pidfd
         if self._killed:
             self.send_signal(signal.SIGKILL)
 
     def ended(self, code: int) -> None:
-        """It has ended."""
+        """Record that it has ended."""
         self.returncode = code
         if self._pidfd is not None:
             os.close(self._pidfd)
             self._pidfd = None
 
     def orphaned(self) -> None:
-        """Its parent has ended before it, and nobody will tell how it does."""
+        """Record that its parent has ended before it, so that nobody reports its end."""
         if self.pid is None and self.returncode is None:
             self.ended(UNTOLD)
 
@@ -191,7 +193,7 @@ class ChildProcess:
             self.returncode = 0
 
     def wait(self, deadline: float) -> bool:
-        """Wait for its end until a time of the monotonic clock; False where it has not ended by then."""
+        """Wait for its end until a time of the monotonic clock; return False if it has not ended by then."""
         while self.returncode is None:
             watched = [] if self._parent.gone else [self._parent.fileno()]
             watched += [] if self._pidfd is None else [self._pidfd]
@@ -205,7 +207,7 @@ class ChildProcess:
         return True
 
     def listen(self) -> bool:
-        """Read what the child says; False once it has ended."""
+        """Read the child's messages; return False once it has ended."""
         try:
             content = os.read(self.pipe, 65_536)
         except BlockingIOError:
@@ -224,13 +226,13 @@ class ChildProcess:
         return bool(content)
 
     def kill_hung(self, silent: float) -> None:
-        """Kill it for having given no sign of life for so long [s]; SIGTERM would wait, if it is stopped."""
+        """Kill it after `silent` seconds without a sign of life; SIGTERM would wait, if it is stopped."""
         self._hung_for = silent
         self.kill()
 
     @property
     def how(self) -> str:
-        """How it ended, for people."""
+        """Manner of its end, for people."""
         code = self.returncode
         return how_ended(code, self._hung_for) if code else "another process sent it SIGTERM"
 
@@ -238,8 +240,7 @@ class ChildProcess:
 def how_ended(code: int, hung_for: float) -> str:
     """Return how a process ended, for people.
 
-    `code` is its exit code as Popen has it; `hung_for` how long it had given no sign of life when it was killed for
-    that, 0 where it was not [s].
+    `code` is its exit code, as in Popen; `hung_for` the time without a sign of life for which it was killed, or 0 [s].
     """
     if hung_for and code == -signal.SIGKILL:
         return f"no sign of life for {hung_for:g} s, so it was killed"

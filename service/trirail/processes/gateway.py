@@ -8,9 +8,10 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from typing import Any, NamedTuple
 
 import msgspec
 import zenoh
@@ -21,27 +22,30 @@ from trirail.processes.heartbeats import BEAT_EVERY
 from trirail.processes.inbox import Inbox
 from trirail.processes.incoming import Incoming
 from trirail.processes.loop_death import LoopDeath
+from trirail.processes.memory_budget import HeapTrim
 from trirail.processes.monitoring import Meter
+from trirail.processes.order import Order
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications, StateMaker, info
-from trirail.processes.realtime import give_back
+from trirail.processes.realtime import bound_heap, give_back
 from trirail.processes.replies import Refusals, Replies
 from trirail.processes.requests import CommandReader, Looks, Requests
 from trirail.processes.session_guard import Guard
+from trirail.processes.trajectory_parts import TrajectoryParts
 from trirail.processes.zenoh_links import Crowding, RouterLinks
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, TrajectoryGoal
 from trirail.wire.links import Closed, PacketLink
-from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
+from trirail.wire.looks import AlignmentLook
+from trirail.wire.messages import CommandReply, ErrorReply, Event, Notice, RoleReply
 from trirail.wire.packets import (
     Accepted,
+    Announcement,
     Answer,
     Confirmed,
     Happened,
     Kind,
-    PoseChanged,
     Refused,
-    Remark,
     Status,
     Welcome,
     decode_answer,
@@ -50,18 +54,18 @@ from trirail.wire.packets import (
 from trirail.wire.records import unpack
 from trirail.wire.state import summary_of
 from trirail.wire.text import quoted
-from trirail.wire.vocabulary import Mode
+from trirail.wire.vocabulary import Mode, NoContent
 
 SWITCH_EVERY = 0.0005
-"""After so long a thread lets another have the interpreter, which Zenoh's threads need to hand a message over [s]."""
+"""Interval after which a thread yields the interpreter: Zenoh's threads need it to hand a message over [s]."""
 AT_ONCE = 256
-"""Messages from Zenoh that are read before the loop is listened to again."""
+"""Messages from Zenoh that are read before the loop is read again."""
 SUMMARY_EVERY = 1.0
-"""How often the summary is published [s]."""
+"""Interval between two summaries [s]."""
 
 
 class Gateway:
-    """Takes requests from Zenoh, passes them to the loop, and answers and publishes what the loop says."""
+    """Link between Zenoh and the loop: passes requests on, answers them, and publishes the loop's messages."""
 
     def __init__(
         self,
@@ -73,7 +77,10 @@ class Gateway:
         log: Callable[[Event], None] = lambda _: None,
         measured: Callable[[msgspec.Struct], None] = lambda _: None,
         hurrying: Callable[[], AbstractContextManager[None]] = nullcontext,
+        *,
+        again: bool = False,
     ) -> None:
+        """`again`: whether the service has had a gateway before this one."""
         self._log = log
         self._robot = config.robot.name
         self._link = link
@@ -81,30 +88,40 @@ class Gateway:
         self._guard = guard
         self._loop_death = LoopDeath(config.period)
         self._info = info(config)
+        self._welcomed = False
+        """Whether the loop has answered, so that clients can be served."""
         self._states = StateMaker(config)
         self._meter = Meter(measured) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
         self._state_due = self._summary_due = self._heard = 0.0
         self._replies = Replies(self._robot)
         self._refusals = Refusals(link, self._replies)
-        self._inbox = Inbox(session, self._robot, self._refusals.too_much)
-        self._poses = Poses(config, self._replies.send, self._refusals.refuse, self._send_to_loop, self._inbox.wake)
-        self._looks = Looks(self._robot, lambda looked: link.send(message(looked)))
-        self._requests = Requests(config, link, guard, self._replies, self._loop_death, hurrying)
-        self._commands = CommandReader(
-            self._robot, self._requests, self._replies, self._states, self._inbox, self._refusals.refuse
+        keys = {kind: len(route.names) for kind, route in ROUTES.items()}
+        self._inbox = Inbox(session, self._robot, keys, self._refusals.not_kept)
+        self._poses = Poses(
+            config, self._replies.send, self._refusals.refuse, self._announce, self._inbox.wake, again=again
         )
+        self._looks = Looks(self._announce)
+        self._parts = TrajectoryParts(self._refusals.refuse)
+        self._requests = Requests(config, link, guard, self._replies, self._loop_death, hurrying)
+        self._commands = CommandReader(self._requests, self._replies, self._states, self._inbox, self._refusals.refuse)
         connect = config.zenoh.connect
-        self._routers = RouterLinks(connect, partial(guard.linked, session), guard.why_not_linked, self._send_to_loop)
+        self._routers = RouterLinks(connect, partial(guard.linked, session), guard.why_not_linked, self._announce)
         known = {*guard.users, config.zenoh.router or ""}
         self._crowding = Crowding(
-            partial(guard.links, session), guard.disconnect, known, zenoh_session.SESSIONS, self._send_to_loop
+            partial(guard.links, session),
+            guard.disconnect,
+            known,
+            zenoh_session.SESSIONS,
+            self._announce,
+            unopened=guard.unopened,
         )
+        self._heap = HeapTrim()
         self._ending = False
         self._publications = Publications(session, self._robot)
 
     def serve(self, ready: Callable[[], None]) -> None:
-        """Serve until told to end or the loop has gone; `ready` is called once the loop has said welcome."""
+        """Serve until `end` is called or the loop has gone; call `ready` once the loop has sent its welcome."""
         door = self._guard.stop_door(self._inbox.stop_at_door)
         poll = select.poll()
         poll.register(self._link.fileno(), select.POLLIN)
@@ -126,8 +143,10 @@ class Gateway:
                 self._routers.poll()
                 self._crowding.poll()
                 self._requests.give_up_late()
+                self._parts.poll()
                 self._summarize()
                 self._refusals.tell_of_overruns()
+                self._heap.poll()
         except Closed:
             self._hear_the_rest(ready)
             self._tell_of_its_end()
@@ -135,13 +154,13 @@ class Gateway:
             with contextlib.suppress(Closed):
                 self._poses.close()
             self._routers.close()
-            for incoming in self._requests:
+            for incoming in (*self._requests, *self._parts):
                 self._replies.answer(incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
             door.close()
             self._replies.close()
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what people should know of how the service is run, one line each."""
+        """Return warnings about how the service is run, one line each."""
         return (*self._guard.warnings(), *self._poses.warnings(), *self._routers.warnings(), *self._crowding.warnings())
 
     def end(self) -> None:
@@ -152,23 +171,11 @@ class Gateway:
     # ------------------------------------------------------------------ Zenoh to loop
 
     def _handle(self, incoming: Incoming) -> None:
-        """Take a message; whatever is wrong with it is answered, and told to everyone, since a put has no answer."""
+        """Handle a message; any error in it is answered and announced to everyone, since a put has no answer."""
         try:
-            if incoming.kind == "info":
-                self._replies.send(incoming, self._info)
-            elif incoming.kind == "role":
-                (user,) = boundary.names(incoming.key, self._key("role"), ("user",))
-                self._replies.send(incoming, RoleReply(user, self._guard.role(user)))
-            elif incoming.kind == "goal":
-                self._goal(incoming)
-            elif incoming.kind == "poses":
-                self._replies.send(incoming, self._poses.table())
-            elif incoming.kind in ("teach", "forget"):
-                self._poses.edit(incoming)
-            elif incoming.kind == "alignment":
-                self._replies.send(incoming, self._looks.forward(incoming))
-            else:
-                self._commands.read(incoming)
+            route = ROUTES[incoming.kind]
+            if (reply := route.handle(self, route.read(incoming, self._robot))) is not None:
+                self._replies.send(incoming, reply)
         except RefusedError as refusal:
             self._refusals.refuse(incoming, refusal)
         except Closed:
@@ -178,13 +185,34 @@ class Gateway:
                 incoming, RefusedError(RefusalCode.INTERNAL, f"internal error, please report it: {error!r}")
             )
 
-    def _goal(self, incoming: Incoming) -> None:
-        (user,) = boundary.names(incoming.key, self._key("goal"), ("user",))
-        sent: Goal = incoming.content(Goal, "not a goal")
-        self._requests.goal(incoming, user, self._poses.of_name(sent))
+    def _user_role(self, message: RoutedMessage) -> RoleReply:
+        (user,) = message.names
+        return RoleReply(user, self._guard.role(user))
 
-    def _send_to_loop(self, what: PoseChanged | Remark) -> None:
-        self._link.send(message(what))
+    def _edit_poses(self, message: RoutedMessage) -> None:
+        self._poses.edit(message.incoming, *message.names)
+
+    def _command(self, message: RoutedMessage) -> None:
+        self._commands.read(message.incoming, *message.names)
+
+    def _forward_look(self, message: RoutedMessage) -> AlignmentLook:
+        (user,) = message.names
+        return self._looks.forward(user, message.content)
+
+    def _goal(self, message: RoutedMessage) -> None:
+        incoming, (user,), sent = message
+        if not isinstance(sent, TrajectoryGoal):
+            self._requests.goal(incoming, user, self._poses.of_name(sent))
+        elif (whole := self._parts.add(incoming, user, sent)) is not None:
+            parts, goal = whole
+            try:
+                self._requests.goal(parts, user, goal)
+            except RefusedError as refusal:
+                self._refusals.refuse(parts, refusal)
+
+    def _announce(self, notice: Notice) -> bool:
+        """Have the loop announce a notice; return whether it accepts that now."""
+        return self._link.send(message(Announcement(notice)))
 
     # ------------------------------------------------------------------ loop to Zenoh
 
@@ -205,8 +233,10 @@ class Gateway:
             return
         if isinstance(answer, Welcome):
             self._info = msgspec.structs.replace(self._info, missing_protections=answer.missing_protections)
-            self._inbox.declare()
-            ready()
+            if not self._welcomed:
+                self._welcomed = True
+                self._inbox.declare()
+                ready()
 
     def _on_answer(self, answer: Answer) -> None:
         self._loop_death.follow(answer)
@@ -215,9 +245,8 @@ class Gateway:
                 self._happened(event)
             case Status() | Welcome():
                 self._states.update(answer)
-            case Accepted(ticket, goal_id, duration, slowed, stops_first, queued, lag):
-                expected = duration if math.isfinite(duration) else None
-                self._requests.answer(ticket, GoalReply(goal_id, expected, slowed, stops_first, queued, lag))
+            case Accepted(ticket, reply):
+                self._requests.answer(ticket, reply)
             case Confirmed(ticket, name, mode, cycle):
                 self._commands.confirmed(ticket)
                 self._requests.answer(ticket, CommandReply(name, mode, cycle))
@@ -226,7 +255,7 @@ class Gateway:
                 self._requests.answer(ticket, self._commands.refused(ticket, error))
 
     def _publish(self, batch: memoryview) -> None:
-        """Take in a batch of records and pass it on; publish the newest state when it is time."""
+        """Update from a batch of records and publish it; publish the newest state if it is due."""
         rows = unpack(batch)
         self._publications.records(bytes(batch))
         self._states.records(rows)
@@ -240,14 +269,14 @@ class Gateway:
             self._publications.state(self._states.newest(self.warnings()))
 
     def _summarize(self) -> None:
-        """Publish the summary when it is time, also while the loop says nothing: then it tells since when."""
+        """Publish the summary if it is due, also while the loop is silent: it then shows since when."""
         now = time.monotonic()
         if now >= self._summary_due and self._states.cycle:
             self._summary_due = now + SUMMARY_EVERY
             self._publications.summary(summary_of(self._states.newest(), now - self._heard, self._info.version))
 
     def _happened(self, event: Event) -> None:
-        """Tell everyone of an event, and the service's log; what others have sent under a new holder does not begin."""
+        """Publish and log an event; a new lease withdraws the waiting goals of everyone but its holder."""
         if event.kind == "lease":
             self._requests.backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
@@ -256,27 +285,67 @@ class Gateway:
             self._meter.event(event)
 
     def _hear_the_rest(self, ready: Callable[[], None]) -> None:
-        """Hear what the loop said before it ended: that may be its farewell."""
+        """Process the loop's last messages: they may include its farewell."""
         with contextlib.suppress(Closed):
             while (packet := self._link.receive()) is not None:
                 self._loop_death.heard()
-                with contextlib.suppress(Closed):  # it takes nothing any more
+                with contextlib.suppress(Closed):  # the loop receives nothing any more
                     self._hear(packet, ready)
 
     def _tell_of_its_end(self) -> None:
-        """The loop has gone: where it has died, tell everyone in its place."""
+        """Announce the death of the loop in its place, if it has died."""
         for event in self._loop_death.events(self._states.cycle):
             self._happened(event)
         if (reason := self._loop_death.reason) and self._states.cycle:
-            state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason,))
+            state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason.text,))
             self._publications.state(state)
 
-    def _key(self, *parts: str) -> str:
-        return zenoh_session.key(self._robot, *parts)
+
+class RoutedMessage(NamedTuple):
+    """A message whose key and content have been read."""
+
+    incoming: Incoming
+    names: Sequence[str]
+    """The names in its key."""
+    content: Any
+    """A value of its route's type."""
+
+
+class Route(NamedTuple):
+    """Key on which clients ask, with the handler of its messages and the type of their content."""
+
+    names: tuple[str, ...]
+    """Names that follow in the key, a user's first; if there are none, the key of a message is not checked."""
+    handle: Callable[[Gateway, RoutedMessage], msgspec.Struct | None]
+    """Returns the reply; None if it is sent later."""
+    content: Any = None
+    """Type of the content; None if the content has no meaning, or depends on a name."""
+    expected: str = ""
+    """Beginning of the refusal of other content."""
+
+    def read(self, incoming: Incoming, robot: str) -> RoutedMessage:
+        """Read a message's key and content. Raises RefusedError."""
+        prefix = zenoh_session.key(robot, incoming.kind)
+        names = boundary.names(incoming.key, prefix, self.names) if self.names else ()
+        content = incoming.content(self.content, self.expected) if self.content is not None else None
+        return RoutedMessage(incoming, names, content)
+
+
+ROUTES: dict[str, Route] = {
+    "goal": Route(("user",), Gateway._goal, Goal, "not a goal"),
+    "cmd": Route(("user", "command"), Gateway._command),
+    "info": Route((), lambda gateway, _: gateway._info),
+    "role": Route(("user",), Gateway._user_role),
+    "poses": Route((), lambda gateway, _: gateway._poses.table()),
+    "teach": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "teach takes no content"),
+    "forget": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "forget takes no content"),
+    "alignment": Route(("user",), Gateway._forward_look, AlignmentLook, "not a look of an alignment"),
+}
+"""Every key that clients query."""
 
 
 def main(
-    config: Config,
+    order: Order,
     link: PacketLink,
     beat: Callable[[], None],
     ready: Callable[[object], None],
@@ -287,12 +356,14 @@ def main(
     """Run the gateway's process.
 
     `ready` is called once it can be reached, `log` with each event, `measured` each second if there are metrics;
-    what is sent to the loop `hurrying` is taken in the cycle in which it comes.
+    packets sent to the loop `hurrying` are handled in the cycle in which they arrive.
     """
     sys.setswitchinterval(SWITCH_EVERY)
-    guard = Guard(config)
+    bound_heap()
+    config = order.config
+    guard = Guard(config, order.admission)
     with guard.open() as session:
-        gateway = Gateway(config, link, beat, session, guard, log, measured, hurrying)
+        gateway = Gateway(config, link, beat, session, guard, log, measured, hurrying, again=order.again)
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
 
         def is_ready() -> None:

@@ -1,37 +1,39 @@
-"""Heartbeats between the service's processes, and haste: counters in memory that they share; and who hangs.
+"""Heartbeats between the service's processes, and urgent requests: counters in shared memory; and detection of hangs.
 
-To beat and to look cost 0.1 µs, and nothing can wait: no packet stands in a queue behind another one, and a process
-that is frozen fills no buffer. A process beats in the thread that does its work, so that a hung one does not.
+A beat and a check cost 0.1 µs, and nothing can wait: no packet queues behind another one, and a process that is frozen
+fills no buffer. A process beats in the thread that does its work, so that a hung one does not.
 
-A process that hangs is told from one that a busy machine keeps waiting: killing that one would help nobody. Without a
-sign of life counts the time in which a process could have given one: what its main thread has used of a processor, and
-the turns in which it wanted none, as when it is stopped or waits for what does not come. While it waits for a processor
-or for a disk, nothing counts.
+A process that hangs is distinguished from one that a busy machine keeps waiting: killing that one would help nobody.
+Silence is the time in which a process could have given a sign of life: the processor time of its main thread, and the
+turns in which it wanted none, as when it is stopped or waits in vain. While it waits for a processor or for a disk,
+nothing counts.
 """
 
 from __future__ import annotations
 
 import mmap
 import os
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
 PROCESSES = ("loop", "gateway", "planner", "recorder")
-"""Those that beat; simulated drives do so on their bus, to the loop."""
+"""Processes that beat; simulated drives do so on their bus, to the loop."""
 HASTE = len(PROCESSES)
-"""Where behind theirs the count of hastes stands."""
+"""Index of the counter of urgent requests."""
 BEAT_EVERY = 0.05
-"""How often a process beats at least, while it waits for work as well [s]."""
+"""Longest interval between two beats of a process, also while it waits for work [s]."""
 
 
 class Heartbeats:
-    """The counters; 0 before the first beat of a process and after its last, when nobody may expect one."""
+    """Shared counters; 0 before the first beat of a process and after its last, when none may be expected."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
-        """To be inherited by the processes that beat and look."""
+        """Memory file, inherited by the processes that beat and check."""
+        self._close: Callable[[], object] | None = None
         self._counts = memoryview(mmap.mmap(descriptor, mmap.PAGESIZE)).cast("Q")
 
     @property
@@ -41,10 +43,17 @@ class Heartbeats:
 
     @classmethod
     def create(cls) -> Heartbeats:
-        """Return counters of which nobody has beaten yet."""
+        """Return counters without a beat. The descriptor is closed with them."""
         descriptor = os.memfd_create("trirail-heartbeats")
         os.ftruncate(descriptor, mmap.PAGESIZE)
-        return cls(descriptor)
+        created = cls(descriptor)
+        created._close = weakref.finalize(created, os.close, descriptor)
+        return created
+
+    def close(self) -> None:
+        """Close the descriptor of counters that were created here; the counters themselves stay."""
+        if self._close is not None:
+            self._close()
 
     def of(self, process: str) -> Heart:
         """Return the counter of one of PROCESSES."""
@@ -52,9 +61,9 @@ class Heartbeats:
 
     @contextmanager
     def hurrying(self) -> Iterator[None]:
-        """Have the loop take what is sent meanwhile in the cycle in which it comes: a stop must not wait for the next.
+        """Have the loop handle packets sent meanwhile in the cycle of their arrival: a stop must not wait for the next.
 
-        It counts before and after: whenever the loop looks, it finds a haste that it has not seen, or the packet.
+        It counts before and after: whenever the loop checks, it finds a count that it has not seen, or the packet.
         """
         self._counts[HASTE] += 1
         yield
@@ -73,45 +82,45 @@ class Heart:
         self._counts[self._place] += 1
 
     def rest(self) -> None:
-        """Say that no beat is to be expected until the next one."""
+        """Report that no beat is expected until the next one."""
         self._counts[self._place] = 0
 
     @property
     def count(self) -> int:
-        """How often it has beaten; 0 while no beat is to be expected."""
+        """Number of beats; 0 while none is expected."""
         return self._counts[self._place]
 
 
 class Haste:
-    """The loop's look at whether somebody hurries."""
+    """The loop's check for urgent requests."""
 
     def __init__(self, heartbeats: Heartbeats) -> None:
         self._counts = heartbeats.counts
         self.seen = 0
-        """The count when it was last looked at."""
+        """Count at the last check."""
 
     def hurried(self) -> bool:
-        """Whether somebody has, since this was last asked."""
+        """Return whether there has been an urgent request since the last call."""
         before, self.seen = self.seen, self._counts[HASTE]
         return self.seen != before
 
 
 class Watch:
-    """Looks at the heart of another process, once in each turn of the one that watches.
+    """Watch on the heart of another process, checked once in each turn of the one that watches.
 
-    Silence is counted in these turns and not by the clock: while the whole machine stands still, nobody is silent.
+    Silence is counted in these turns and not by the clock: while the whole machine is stopped, nobody is silent.
     """
 
     def __init__(self, heart: Heart, patience: int) -> None:
         self._heart = heart
         self.patience = patience
         self.seen = 0
-        """Its count when it was last looked at."""
+        """Count at the last check."""
         self.turns = 0
         """Turns for which that has stayed the same."""
 
     def silent(self) -> bool:
-        """Look, in every turn; whether there has been no beat for more turns than there is patience."""
+        """Check, in every turn; return whether there has been no beat for more turns than `patience`."""
         count = self._heart.count
         if count == self.seen and count:
             self.turns += 1
@@ -121,33 +130,33 @@ class Watch:
 
     @property
     def heard(self) -> bool:
-        """Whether the last look found a beat."""
+        """Whether the last check found a beat."""
         return self.seen > 0 and self.turns == 0
 
 
 READY, ON_DISK = "R", "D"
-"""States of proc(5): it runs or would, and it waits for a disk, where no signal reaches it."""
+"""States of proc(5): running or runnable, and waiting for a disk, where no signal reaches it."""
 _STATE, _UTIME, _STIME = 0, 11, 12
-"""Fields of /proc/PID/stat behind the name, which stands in parentheses and may hold some."""
+"""Fields of /proc/PID/stat behind the name, which is in parentheses and may hold some."""
 _TICK: Final = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 class Effort(NamedTuple):
-    """What the kernel says of a thread."""
+    """State of a thread in the kernel."""
 
     state: str
-    """A letter of proc(5)."""
+    """Letter of proc(5)."""
     used: float
     """Processor time since it began [s]."""
 
     @property
     def kept_waiting(self) -> bool:
-        """Whether it would go on if the machine had a processor or a disk for it; or it runs."""
+        """Whether it runs, or would if the machine had a processor or a disk for it."""
         return self.state in (READY, ON_DISK)
 
 
 def effort(pid: int) -> Effort | None:
-    """Return what the kernel says of a process's main thread; None where it says nothing."""
+    """Return the kernel's state of a process's main thread; None if there is none."""
     try:
         said = Path(f"/proc/{pid}/task/{pid}/stat").read_bytes()
     except OSError:  # it has just ended, or there is no such file system
@@ -157,7 +166,7 @@ def effort(pid: int) -> Effort | None:
 
 
 class HangWatch:
-    """Looks at the heart of another process, once in each turn of who watches."""
+    """Watch on the heart of another process, checked once in each of the watcher's turns."""
 
     def __init__(
         self, heart: Heart, patience: float, turn: float, effort: Callable[[int], Effort | None] = effort
@@ -171,7 +180,7 @@ class HangWatch:
         self._used: float | None = None
 
     def hangs(self, pid: int) -> bool:
-        """Look, in every turn; whether it could have given a sign of life for longer than there is patience [s]."""
+        """Check, in every turn; return whether it could have given a sign of life for longer than the patience [s]."""
         count = self._heart.count
         if count != self._seen or not count:
             self._seen, self._could, self._used = count, 0.0, None

@@ -1,4 +1,4 @@
-"""What Zenoh hands over to the gateway: kept by user until it is read, bounded in number and in bytes."""
+"""Messages that Zenoh hands to the gateway: kept by user until they are read, bounded in number and in bytes."""
 
 from __future__ import annotations
 
@@ -7,90 +7,94 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+import weakref
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 import zenoh
 
-from trirail.processes.incoming import FairQueue, Incoming, Kind, Pace
+from trirail.errors import RefusalCode
+from trirail.processes.incoming import FairQueue, Incoming, Pace
+from trirail.processes.memory_budget import OVERHEAD, Budget
 from trirail.processes.stop_door import Answer
-from trirail.wire import zenoh_session
-from trirail.wire.sizes import MAX_MESSAGE, MAX_NAME, MAX_UNREAD
+from trirail.wire import boundary, zenoh_session
+from trirail.wire.messages import ErrorReply
+from trirail.wire.sizes import MAX_BESIDE, MAX_MESSAGE, MAX_NAME, MAX_UNREAD, MAX_UNREAD_OF_ONE
 from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest
 from trirail.wire.text import is_id
 
 UNREAD = 8192
-"""Messages that may wait to be read; beyond that they are refused, commands at twice as many: a flood of goals must not
-keep a stop out."""
+"""Most unread messages; more are refused, commands at twice as many: a flood of goals must not keep a stop
+out."""
 UNREAD_OF_ONE = 2048
-"""Of them those of one user, and likewise."""
+"""Most unread messages of one user; twice as many for commands."""
+TOO_MUCH = "too many messages at once: send fewer"
 ALIKE = 32
-"""Stops of one user that are read as one, where they came one behind the other and ask for the same."""
+"""Most stops of one user that are read as one, if they are consecutive and request the same."""
 
 
 class Inbox:
-    """Declares what the gateway listens to, and keeps what comes. `too_much` is given what there is no room for.
+    """Inbox of the gateway's keys. `refuse` is given each message that is not kept, and the reason.
 
-    Users take turns, each at his pace, so that one who floods waits for himself. What stops the robot comes before all
-    else, known by its key alone: by its number the goals are known that were sent before it, and no goal that was sent
-    after it is read before it. `clock` gives seconds.
+    `keys` has the kinds of queries, with the number of names that follow each in its key.
+
+    Users take turns, each at a limited rate, so that a flood delays only its sender. Stops come before all else, known
+    by their key alone: a stop's number shows which goals were sent before it, and no goal that was sent after it is
+    read before it. `clock` gives seconds.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         robot: str,
-        too_much: Callable[[Incoming], None],
+        keys: Mapping[str, int],
+        refuse: Callable[[Incoming, ErrorReply], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock = clock
         self._session = session
         self._robot = robot
-        self._too_much = too_much
+        self._keys = keys
+        self._refuse = refuse
+        self._budget = Budget(MAX_UNREAD, MAX_UNREAD_OF_ONE)
         self._lock = threading.Lock()
         self._stops: FairQueue[list[Incoming]] = FairQueue()
-        """Each with those that are alike behind it."""
+        """Stops, each with the equal ones behind it."""
         self._newest: dict[str, list[Incoming]] = {}
-        """Where a user's last message of all is a stop that waits: with what it waits."""
+        """Stops that wait and are their user's last message of all, with the equal ones behind them."""
         self._others: FairQueue[Incoming] = FairQueue()
         self._stops_pace, self._others_pace = Pace(), Pace()
-        """Who sends many stops has his pace in the rest for himself, and likewise."""
+        """Separate: a user's many stops do not delay the user's other messages, or vice versa."""
         self._number = 0
-        self._bytes = 0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self._wake)
 
     def fileno(self) -> int:
-        """For select and its like: readable where something waits, or `wake` was called."""
+        """Return the descriptor for select: readable while messages wait, or after `wake`."""
         return self._wake
 
     def wake(self) -> None:
-        """Make it readable; safe from a signal handler."""
+        """Make the descriptor readable; safe from a signal handler."""
         os.eventfd_write(self._wake, 1)
 
     def declare(self) -> None:
-        """Listen from now on."""
+        """Receive from now on."""
 
         # Called as messages arrive, by one thread: they are numbered in that order.
-        def queries(kind: Kind) -> zenoh.handlers.Callback[zenoh.Query]:
-            return zenoh.handlers.Callback(partial(self._on_query, kind), indirect=False)
+        def declare(kind: str, names: int) -> zenoh.Queryable[None]:
+            on_query = zenoh.handlers.Callback(partial(self._on_query, kind), indirect=False)
+            return self._session.declare_queryable(key(kind, *"*" * names), on_query)
 
         on_sample = zenoh.handlers.Callback(self._on_sample, indirect=False)
-        key, declare = partial(zenoh_session.key, self._robot), self._session.declare_queryable
+        key = partial(zenoh_session.key, self._robot)
         self._declared = [
-            declare(key("goal", "*"), queries("goal")),
-            declare(key("cmd", "*", "*"), queries("cmd")),
-            declare(key("info"), queries("info")),
-            declare(key("role", "*"), queries("role")),
-            declare(key("poses"), queries("poses")),
-            declare(key("teach", "*", "*"), queries("teach")),
-            declare(key("forget", "*", "*"), queries("forget")),
-            declare(key("alignment", "*"), queries("alignment")),
+            *(declare(kind, names) for kind, names in self._keys.items()),
             self._session.declare_subscriber(key("goal", "*"), on_sample),
             self._session.liveliness().declare_token(key("alive")),
         ]
 
     def next_messages(self, at_most: int) -> Iterator[Incoming]:
-        """Take what may be read now, user by user in turn, stops first; if that is more, it stays readable."""
+        """Yield the messages that may be read now, users in turn, stops first; if more wait, it stays readable."""
         for _ in range(at_most):
             with self._lock:
                 incoming = self._next(self._clock())
@@ -103,12 +107,12 @@ class Inbox:
                     os.eventfd_read(self._wake)
 
     def due(self) -> float:
-        """Return how long it is until something of what waits may be read; infinite where nothing waits [s]."""
+        """Return the time until a waiting message may be read; infinite if none waits [s]."""
         with self._lock:
             return self._due(self._clock())
 
     def earlier(self, number: int) -> bool:
-        """Whether something that came before a message waits to be read."""
+        """Return whether an earlier message than that number waits to be read."""
         with self._lock:
             return any(self._others.first(user).number < number for user in self._others.users)
 
@@ -119,18 +123,15 @@ class Inbox:
             stop, *alike = stops = self._stops.pop(user)
             if self._newest.get(user) is stops:
                 del self._newest[user]
-            self._bytes -= len(stop.payload)
             return stop._replace(alike=tuple(alike))
         user = next((user for user in self._readable() if not _wait(self._others_pace, user, now)), None)
         if user is not None:
             self._others_pace.count(user, now)
-            incoming = self._others.pop(user)
-            self._bytes -= len(incoming.payload)
-            return incoming
+            return self._others.pop(user)
         return None
 
     def _readable(self) -> Iterator[str]:
-        """Yield users whose next message is none that a stop has to be read before, in the order of their turns."""
+        """Yield users whose next message need not wait for an earlier stop, in the order of their turns."""
         stop = min((self._stops.first(user)[0].number for user in self._stops.users), default=math.inf)
         for user in self._others.users:
             incoming = self._others.first(user)
@@ -143,40 +144,62 @@ class Inbox:
         return min((*stops, *others), default=math.inf)
 
     def stop_at_door(self, request: StopRequest, answer: Answer) -> None:
-        """Keep a request at the door for stops; safe from any thread."""
+        """Keep a request from the door for stops; safe from any thread."""
         content = request.content.encode()
-        stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns())
-        self._keep(_named(stop._replace(at_door=answer), request.id))
+        stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns(), at_door=answer)
+        self._keep(_named(stop._replace(held=len(content) + OVERHEAD), request.id))
 
-    def _on_query(self, kind: Kind, query: zenoh.Query) -> None:
+    def _on_query(self, kind: str, query: zenoh.Query) -> None:
         encoding = str(query.encoding) if query.encoding is not None else ""
-        incoming = _incoming(kind, str(query.key_expr), query.payload, encoding, query)
-        if _stops(incoming) and query.attachment is not None and len(query.attachment) <= MAX_NAME:
-            incoming = _named(incoming, query.attachment.to_bytes().decode(errors="replace"))
+        attachment = query.attachment
+        beside = len(str(query.selector)) + (len(attachment) if attachment is not None else 0)
+        incoming = _incoming(kind, str(query.key_expr), query.payload, encoding, query, beside)
+        if incoming.size + beside > MAX_MESSAGE + MAX_BESIDE:
+            self._keep_nothing(incoming._replace(size=incoming.size + beside, payload=b""))
+            return
+        if _stops(incoming) and attachment is not None and len(attachment) <= MAX_NAME:
+            incoming = _named(incoming, attachment.to_bytes().decode(errors="replace"))
         self._keep(incoming)
+
+    def _keep_nothing(self, large: Incoming) -> None:
+        """Answer a message that is too large immediately, to free its memory; a stop among them still takes effect."""
+        error = ErrorReply(RefusalCode.TOO_LARGE, boundary.too_large(large.size))
+        if _stops(large):
+            name = large.key.rpartition("/")[2]
+            if self._has_kept(large.unanswered()):
+                error = ErrorReply(error.code, f"{error.message}; the robot is told to {name} all the same")
+            else:
+                error = ErrorReply(RefusalCode.BUSY, TOO_MUCH)
+        self._refuse(large, error)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         self._keep(_incoming("goal", str(sample.key_expr), sample.payload, str(sample.encoding), None))
 
     def _keep(self, incoming: Incoming) -> None:
-        user, size, room = incoming.user, len(incoming.payload), 2 if incoming.kind == "cmd" else 1
+        if not self._has_kept(incoming):
+            self._refuse(incoming._replace(payload=b""), ErrorReply(RefusalCode.BUSY, TOO_MUCH))
+
+    def _has_kept(self, incoming: Incoming) -> bool:
+        """Keep a message if there is room for it, and return whether there is."""
+        user, room = incoming.user, 2 if incoming.kind == "cmd" else 1
+        hold = self._budget.hold(user, incoming.held, room)
+        if hold is None:
+            return False
         with self._lock:
             self._number += 1
-            incoming = incoming._replace(number=self._number)
+            incoming = incoming._replace(number=self._number, hold=hold)
             fits = self._joins(incoming)
             if not fits:
                 unread, own = len(self._stops) + len(self._others), self._stops.of(user) + self._others.of(user)
                 fits = unread < room * UNREAD and own < room * UNREAD_OF_ONE
-                fits = fits and self._bytes + size <= room * MAX_UNREAD
                 if fits:
                     self._put(incoming)
         if fits:
             self.wake()
-        else:
-            self._too_much(incoming._replace(payload=b""))
+        return fits
 
     def _joins(self, incoming: Incoming) -> bool:
-        """Whether a message goes with the one before it of its user: a stop that asks for the same, and waits."""
+        """Return whether a message joins the user's previous one: a waiting stop with the same request."""
         stops = self._newest.get(incoming.user)
         if not _stops(incoming) or stops is None or len(stops) >= ALIKE or _asked(stops[0]) != _asked(incoming):
             return False
@@ -190,31 +213,34 @@ class Inbox:
             self._stops.put(incoming.user, self._newest[incoming.user])
         else:
             self._others.put(incoming.user, incoming)
-        self._bytes += len(incoming.payload)
 
 
 def _stops(incoming: Incoming) -> bool:
-    """Whether it stops the robot, whatever it holds."""
+    """Return whether a message stops the robot, whatever its content."""
     return incoming.kind == "cmd" and incoming.key.rpartition("/")[2] in STOPS
 
 
 def _named(stop: Incoming, name: str) -> Incoming:
-    """Return a stop with its id, where it is one; what has more content than the door takes has no copy there."""
+    """Return a stop with its id, if that is one; a stop with more content than the door takes has no copy there."""
     return stop._replace(id=name) if is_id(name) and stop.size <= MAX_LINE else stop
 
 
 def _asked(stop: Incoming) -> tuple[object, ...]:
-    """What is asked for; of what is too large to be kept nobody knows."""
+    """Return a stop's request, to compare it; one too large to be kept is equal to no other."""
     known = stop.size == len(stop.payload)
     return stop.key, stop.payload, stop.encoding, None if known else stop.arrived_ns
 
 
-def _incoming(kind: Kind, key: str, payload: zenoh.ZBytes | None, encoding: str, query: zenoh.Query | None) -> Incoming:
+def _incoming(
+    kind: str, key: str, payload: zenoh.ZBytes | None, encoding: str, query: zenoh.Query | None, beside: int = 0
+) -> Incoming:
+    """Return a message; `beside` is the size of its query without the payload [bytes]."""
     size = len(payload) if payload is not None else 0
     content = payload.to_bytes() if payload is not None and size <= MAX_MESSAGE else b""
-    return Incoming(kind, key, size, content, encoding, query, time.monotonic_ns())
+    held = len(content) + OVERHEAD + (size + beside if query is not None else 0)
+    return Incoming(kind, key, size, content, encoding, query, time.monotonic_ns(), held=held)
 
 
 def _wait(pace: Pace, user: str, now: float) -> float:
-    """Return how long a user's next message has to wait; what names nobody only asks, and waits for its turn alone."""
+    """Return the wait until a user's next message; one that names no user is a query, and waits for its turn alone."""
     return pace.wait(user, now) if user else 0.0

@@ -1,6 +1,6 @@
-"""What is to be said when the loop has died: it numbers the events, and there is nobody else to say how goals ended.
+"""Events after the death of the loop: it numbers the events, and nobody else can report how goals ended.
 
-Gateway and recorder hear the same of the loop, so each works it out by itself and both say the same.
+Gateway and recorder receive the same from the loop, so each derives them by itself, and both report the same.
 """
 
 from __future__ import annotations
@@ -8,16 +8,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import REMEMBERED_IDS, Event, FaultDetail, Notice
 from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
 from trirail.wire.vocabulary import FaultCause, Mode
 
 FROZEN, CYCLES = 0.5, 3
-"""The loop sends records every 20 ms, or in every cycle: silent for so long before its end, it was frozen [s]."""
+"""Silence before the loop's end that means it was frozen [s, cycles]: it sends records every 20 ms or cycle."""
 
 
 class LoopDeath:
-    """Follows what the loop says; `events` is what is missing when it has gone."""
+    """Follower of the loop's messages; `events` returns those missing when it has gone."""
 
     def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._period = period
@@ -30,12 +31,12 @@ class LoopDeath:
         self._greeted = False
 
     def heard(self) -> None:
-        """The loop has sent something."""
+        """Record that the loop has sent something."""
         self._heard = self._clock()
         self._greeted = True
 
     def follow(self, said: Answer | GoalRequest) -> None:
-        """Take what the loop says, or a goal that it is given."""
+        """Process a message of the loop, or a goal that it is given."""
         match said:
             case ControlInput(given=GoalRequest() as request) | (GoalRequest() as request):
                 self._begun(request.id, request.user)
@@ -59,23 +60,25 @@ class LoopDeath:
             del self._ended[next(iter(self._ended))]
 
     @property
-    def reason(self) -> str:
-        """What has become of the loop, for people; empty where it has ended as it should, or has never turned."""
+    def reason(self) -> EventText | None:
+        """Cause of the loop's end, for people; None if it has ended as it should, or has never turned."""
         if self._farewell or not self._greeted:
-            return ""
+            return None
         frozen = self._clock() - self._heard > max(FROZEN, CYCLES * self._period)
         how = "was frozen and has been killed" if frozen else "has died"
-        return f"the loop {how}: the drives stop by their own watchdogs"
+        code = EventCode.LOOP_FROZEN if frozen else EventCode.LOOP_DIED
+        return coded(f"the loop {how}: the drives stop by their own watchdogs", code)
 
     def events(self, cycle: int) -> list[Event]:
-        """Return what the loop would have said of its end in that cycle, the last that is known; nothing if it has."""
+        """Return the loop's missing events of its end in that cycle, the last known; none if it has sent them."""
         reason = self.reason
-        if not reason:
+        if reason is None:
             return []
-        missing = [Notice("fault", "error", reason, fault=FaultDetail(FaultCause.LOOP))]
+        missing = [Notice("fault", "error", reason.text, fault=FaultDetail(FaultCause.LOOP), **reason.fields)]
         for goal_id, user in self._open.items():
             words = f"goal {goal_id} faulted: {reason}"
-            missing.append(Notice("goal", "error", words, id=goal_id, outcome="faulted", reason=reason, user=user))
-        missing.append(Notice("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT))
+            ended = {"outcome": "faulted", "reason": reason.text, **reason.fields}
+            missing.append(Notice("goal", "error", words, id=goal_id, user=user, **ended))
+        missing.append(Notice("mode", "info", f"{Mode.FAULT}: {reason}", mode=Mode.FAULT, **reason.fields))
         t, wall = cycle * self._period, time.time()
         return [what.event(self._seq + n, t, cycle, wall) for n, what in enumerate(missing, 1)]

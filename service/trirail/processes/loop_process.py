@@ -1,14 +1,13 @@
-"""The loop's process: it rehearses, connects the drives, takes its rights, and turns until it is told to end.
+"""The loop's process: rehearses, connects the drives, acquires its rights, and runs the loop until it must end.
 
-What must come without delay, stop, quick stop, a fault, a lost gateway, the end, it runs once, on simulated drives of
-the configured kind, before the first cycle on the real ones: what that needs is then in memory, and locked there.
+All that must happen without delay, stop, quick stop, a fault, a lost gateway, the end, runs once on simulated drives of
+the configured kind, before the first cycle on the real ones: the pages for it are then in memory, and locked there.
 """
 
 from __future__ import annotations
 
-import os
+import itertools
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -16,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from msgspec import structs
+from trirail_drivers import files
 from trirail_drivers.bus.capture import Capture
 from trirail_drivers.config import Can
 from trirail_drivers.connection.opening import connect, simulated_bus
@@ -35,34 +35,44 @@ from trirail.wire import links
 from trirail.wire.goals import VelocityGoal
 from trirail.wire.links import PacketLink, Port
 from trirail.wire.packets import CommandRequest, Farewell, GoalRequest, Request, message
-from trirail.wire.plan_packets import MAX_PLANNING, decode_plan_request, encode
+from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.vocabulary import Command, Mode
 
 PLANNER_WITHIN = 120.0
-"""How long the planner may take to come up: the very first start compiles the kinematics [s]."""
+"""Longest time for the planner to come up: the very first start compiles the kinematics [s]."""
 STEP_WITHIN = 500
-"""Cycles after which the next step comes, whatever has become of the one before."""
+"""Most cycles of a step. A robot whose limits make it slower starts without the steps that would follow."""
 IN_MOTION = 20
-"""Cycles of a jog before what ends it."""
+"""Cycles of a jog before it is ended."""
 SLOW = 0.1
 """Share of the platform's velocity along x at which it jogs."""
 
 
+class _UnfinishedError(Exception):
+    """A step has taken longer than STEP_WITHIN."""
+
+
 class _RehearsedTime:
-    """The monotonic clock until the cycles begin, and then their time: a busy machine makes nobody late."""
+    """Monotonic clock, replaced by the cycles' own time while they run: a busy machine delays nothing."""
 
     def __init__(self) -> None:
         self._now: float | None = None
+        self._offset = 0.0
 
     def __call__(self) -> float:
-        return time.monotonic() if self._now is None else self._now
+        return time.monotonic() + self._offset if self._now is None else self._now
 
     def advance(self, seconds: float) -> None:
+        """Stop following the monotonic clock, and advance by `seconds`."""
         self._now = self() + seconds
+
+    def release(self) -> None:
+        """Follow the monotonic clock again: a wait for a deadline would otherwise never end."""
+        self._offset, self._now = self() - time.monotonic(), None
 
 
 class _Rehearsal:
-    """Ticks as fast as it can, and does what gateway, planner and drives would."""
+    """Rehearsal of the loop at full speed, which also plays gateway, planner and drives."""
 
     def __init__(self, config: Config, folder: Path) -> None:
         self._config = config
@@ -73,11 +83,11 @@ class _Rehearsal:
         self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock)
         listening = [links.listen(folder / name) for name in Ports._fields]
         gateway, recorder, planner = listening
-        self._ports = Ports(Port(gateway), Port(recorder), Port(planner, MAX_PLANNING))
+        self._ports = Ports(Port(gateway), Port(recorder), Port(planner))
         self._heartbeats = Heartbeats.create()
-        # What Python does is rehearsed, in each cycle: compiled code has its pages from the first one on.
+        # Python runs each cycle, since its part needs the rehearsal: compiled code has its pages from the first one on.
         self._loop = Loop(config, self._drives, self._ports, self._heartbeats, quiet=False, now=lambda: self._now_ns)
-        self._asked = links.connect(folder / "planner", MAX_PLANNING)
+        self._asked = links.connect(folder / "planner")
         self._planner = MotionPlanner(config)
         self._gateway: PacketLink | None = None
         self._now_ns = round(self._clock() * 1e9)
@@ -85,25 +95,26 @@ class _Rehearsal:
         self._steps = self._script()
 
     def run(self) -> None:
-        """Run all of it."""
+        """Run all steps."""
         try:
             self._drives.configure(self._config.period, self._config.limits.slider.fastest)
             self._loop.run(Ticker(round(self._config.period * 1e9), lambda: self._now_ns, self._pass))
         finally:
+            self._clock.release()
             self._drives.close()
             self._hang_up()
             self._asked.close()
-            os.close(self._heartbeats.descriptor)
+            self._heartbeats.close()
             for port in self._ports:
                 port.close()
 
     def _pass(self, deadline_ns: int) -> None:
-        """Let a period pass, and the others do what they have to."""
+        """Let a period pass, with the work of the other processes."""
         self._clock.advance(self._config.period)
         self._now_ns = deadline_ns
         while (packet := self._asked.receive()) is not None:
             self._asked.send(encode(self._planner.plan(decode_plan_request(packet))))
-        next(self._steps, None)
+        next(self._steps)
 
     def _script(self) -> Iterator[None]:
         yield from self._jog()
@@ -121,15 +132,16 @@ class _Rehearsal:
         self._hang_up()
         yield from self._until(lambda: self._mode is Mode.HOLDING)
         self._loop.ending = True
+        yield from self._until(lambda: False)  # the loop returns before
 
     def _reset(self) -> Iterator[None]:
-        """Leave the fault once the robot stands."""
+        """Leave the fault once the robot is at rest."""
         yield from self._until(lambda: not self._loop.control.measured.powered)
         self._order(Command.RESET)
         yield from self._until(lambda: self._mode is Mode.DISABLED)
 
     def _jog(self) -> Iterator[None]:
-        """Have the robot in motion, with power and a gateway."""
+        """Bring the robot into motion, with power and a gateway."""
         if self._gateway is None:
             self._gateway = links.connect(self._folder / "gateway")
             yield from self._until(lambda: self._ports.gateway.connected)
@@ -140,21 +152,22 @@ class _Rehearsal:
         self._tickets += 1
         self._send(GoalRequest(self._tickets, "", f"{self._tickets}", velocity, self._now_ns))
         yield from self._until(lambda: self._mode is Mode.MOVING)
-        yield from self._until(lambda: False, IN_MOTION)
+        yield from itertools.repeat(None, IN_MOTION)
 
     @property
     def _mode(self) -> Mode:
         return self._loop.control.state.mode
 
-    def _until(self, condition: Callable[[], bool], within: int = STEP_WITHIN) -> Iterator[None]:
-        """Let cycles pass until something holds, so many at most."""
-        for _ in range(within):
+    def _until(self, condition: Callable[[], bool]) -> Iterator[None]:
+        """Let cycles pass until a condition holds. Raises _UnfinishedError."""
+        for _ in range(STEP_WITHIN):
             yield
             if self._gateway is not None:
                 while self._gateway.receive() is not None:
                     pass
             if condition():
                 return
+        raise _UnfinishedError(f"the robot was still {self._mode.value} after {STEP_WITHIN} cycles")
 
     def _order(self, name: Command) -> None:
         self._tickets += 1
@@ -172,13 +185,13 @@ class _Rehearsal:
 
 
 def rehearse(config: Config) -> tuple[str, ...]:
-    """Run what must come without delay, once; return why that was not possible, if it was not."""
+    """Rehearse all that must happen without delay; return why that was not possible, if it was not."""
     each = {name: structs.replace(drive, homing=None) for name, drive in zip(NAMES, config.drives.each, strict=True)}
     config = structs.replace(config, drives=structs.replace(config.drives, **each))
-    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+    with files.temporary_folder() as folder:
         try:
-            _Rehearsal(config, Path(folder)).run()
-        except DriveError as error:
+            _Rehearsal(config, folder).run()
+        except (DriveError, _UnfinishedError) as error:
             return (f"rehearsed stops: {error}",)
     return ()
 
@@ -190,7 +203,7 @@ def main(
     heartbeats: Heartbeats,
     ready: Callable[[object], None],
 ) -> int:
-    """Run the loop's process; `ready` is called with what the loop runs without once it turns.
+    """Run the loop's process; `ready` is called once it turns, with the rights that the loop lacks.
 
     `bus` waits for the drives' bus and returns it.
     """
@@ -201,8 +214,10 @@ def main(
         unrehearsed = rehearse(config)
         ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
-        drives = connect(bus(), config.drives, capture=capture)
-        drives.configure(config.period, config.limits.slider.fastest)
+        # Simulated drives that have died come back with the service's next start only: there is nothing to wait for.
+        awaits = config.can.interface != "simulated"
+        drives = connect(bus(), config.drives, capture=capture, awaits=awaits)
+        drives.configure(config.period, config.limits.slider.fastest, awaits=True)
         lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
 

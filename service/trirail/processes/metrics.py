@@ -1,25 +1,44 @@
-"""The metrics of a service, as Prometheus takes them: made at each scrape, of what was measured last."""
+"""/metrics for Prometheus and /healthz for monitoring of the service, over HTTP, in threads of the supervisor.
+
+In the supervisor, since it outlives the others and sees their heartbeats: it reports a dead or frozen gateway, loop,
+planner or recorder all the same. Their measurements have arrived on their pipes, so that a scrape asks no process.
+Plain HTTP on the loopback; beyond it TLS, for users that have a role, as with `zenoh.listen`.
+"""
 
 from __future__ import annotations
 
+import ipaddress
 import os
-from collections.abc import Iterator, Mapping
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from http import HTTPStatus
 from pathlib import Path
+from socketserver import TCPServer
 from typing import Any, Final
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
+import msgspec
 from msgspec import structs
-from prometheus_client import Metric
+from prometheus_client import CollectorRegistry, Metric, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.exposition import ThreadingWSGIServer
 from prometheus_client.registry import Collector
 from trirail_drivers.interface import NAMES
 
+from trirail.config import Config, metrics_url
+from trirail.errors import ServiceError
 from trirail.processes.monitoring import Health, Histogram, Running, ServiceMeasured
 from trirail.processes.zenoh_links import InUse
+from trirail.telemetry.provenance import software
+from trirail.wire import tls
+from trirail.wire.credentials import Credentials, with_role
 from trirail.wire.vocabulary import MODES
 
 PREFIX: Final = "trirail"
 Values = Mapping[Any, float]
-"""By a label's value, or where a metric has several labels, by a tuple of theirs."""
+"""Values by label value, or by a tuple of label values if a metric has several labels."""
 NONE_YET: Final[Values] = {}
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 TICKS: Final = os.sysconf("SC_CLK_TCK")
@@ -34,7 +53,7 @@ class ServiceMetrics(Collector):
         self._health = health
 
     def collect(self) -> Iterator[Metric]:
-        """Yield every metric; what has not been measured yet is left out."""
+        """Yield every metric; values not measured yet are left out."""
         words = "The robot and the software that runs."
         yield _gauge("service_info", words, ["robot", "version"], {(self._robot, self._version): 1.0})
         yield from self._processes()
@@ -103,6 +122,8 @@ def _use(use: InUse) -> Iterator[Metric]:
     used = {"sessions": use.sessions, "descriptors": use.descriptors}
     most = {"sessions": use.sessions_most, "descriptors": use.descriptors_most}
     yield _gauge("gateway_used", "What is in use of what the gateway has so many of.", ["what"], used)
+    words = "Connections to endpoints with TLS that have opened no session; a new session waits for them."
+    yield _gauge("gateway_unopened_connections", words, [], {(): use.unopened})
     yield _gauge("gateway_most", "How many of it there are.", ["what"], most)
 
 
@@ -124,7 +145,7 @@ def _counter(
 
 
 def _histogram(name: str, words: str, values: Histogram) -> HistogramMetricFamily:
-    """A histogram as Prometheus has it: each bucket counts those below it as well."""
+    """Return a histogram as Prometheus expects it: each bucket counts those below it as well."""
     buckets: list[tuple[str, float]] = []
     so_far = 0
     for bound, count in zip((*values.bounds, float("inf")), values.counts, strict=True):
@@ -134,10 +155,123 @@ def _histogram(name: str, words: str, values: Histogram) -> HistogramMetricFamil
 
 
 def _used(pid: int) -> tuple[float, float] | None:
-    """Return memory [bytes] and processor time [s] of a process, None where it has just ended; proc(5)."""
+    """Return memory [bytes] and processor time [s] of a process, None if it has just ended; proc(5)."""
     try:
         pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     except (OSError, IndexError):
         return None
     return int(pages) * PAGE, (int(fields[11]) + int(fields[12])) / TICKS
+
+
+PATIENCE: Final = 2.0
+"""Longest time for a connection to send a request [s]."""
+AT_ONCE: Final = 16
+"""Most connections served at a time; more are closed."""
+
+_Start = Callable[..., Any]
+
+
+class MetricsServer:
+    """HTTP server, while the context lasts. Raises ServiceError if the port is taken or a certificate is invalid."""
+
+    def __init__(self, config: Config, health: Health) -> None:
+        telemetry = config.telemetry
+        self._address = telemetry.metrics_address, telemetry.metrics_port
+        self._health = health
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(ServiceMetrics(config.robot.name, software().trirail, health))
+        self._metrics = make_wsgi_app(registry)
+        self._tls: ssl.SSLContext | None = None
+        if config.zenoh.tls is not None and metrics_url(config).startswith("https:"):
+            folder = Path(config.zenoh.tls.directory)
+            self._tls = tls.server(Credentials.read(folder))
+            self._users = with_role(config.zenoh.users, folder)
+
+    def __enter__(self) -> MetricsServer:
+        self._server = self._listen(*self._address)
+        self._thread = threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def _listen(self, address: str, port: int) -> WSGIServer:
+        kind = _ServerIPv6 if ipaddress.ip_address(address).version == 6 else _Server
+        try:
+            server = make_server(address, port, self._answer, kind, _Handler)
+        except OSError as error:
+            raise ServiceError(
+                f"metrics: cannot listen on {address}:{port}: {error.strerror}; "
+                "set telemetry.metrics_port to a free port, or to 0 for no metrics"
+            ) from error
+        if self._tls is not None:
+            # start_http_server of prometheus_client does the handshake in the thread that accepts: one silent
+            # connection would keep all others out. Nor does it give the name in the certificate.
+            server.socket = self._tls.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
+        return server
+
+    def _answer(self, environ: Mapping[str, Any], start: _Start) -> Iterable[bytes]:
+        """Answer a request, as a WSGI application."""
+        if self._tls is not None and environ[USER] not in self._users:
+            return _say(start, HTTPStatus.FORBIDDEN, {"error": f"{environ[USER] or 'nobody'} has no role"})
+        match environ["PATH_INFO"]:
+            case "/metrics":
+                return self._metrics(environ, start)  # type: ignore[no-any-return]
+            case "/healthz":
+                troubles = self._health.troubles()
+                fit = not any(troubles.values())
+                status = HTTPStatus.OK if fit else HTTPStatus.SERVICE_UNAVAILABLE
+                processes = {name: trouble or "ok" for name, trouble in troubles.items()}
+                service = self._health.service
+                warnings = service.warnings if service is not None else ()
+                return _say(start, status, {"ok": fit, "processes": processes, "warnings": warnings})
+        return _say(start, HTTPStatus.NOT_FOUND, {"error": "there are /metrics and /healthz"})
+
+
+USER: Final = "trirail.user"
+"""WSGI key of the user named in the client's certificate."""
+
+
+class _Handler(WSGIRequestHandler):
+    timeout = PATIENCE
+    places = threading.BoundedSemaphore(AT_ONCE)
+
+    def handle(self) -> None:
+        if not self.places.acquire(blocking=False):
+            return  # the connection is closed
+        try:
+            if isinstance(self.connection, ssl.SSLSocket):
+                self.connection.do_handshake()
+            super().handle()
+        except OSError:
+            pass  # the peer has gone: no one is left to answer
+        finally:
+            self.places.release()
+
+    def get_environ(self) -> dict[str, Any]:
+        shown = tls.peer(self.connection) if isinstance(self.connection, ssl.SSLSocket) else ""
+        return super().get_environ() | {USER: shown}
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the name that it has in http.server
+        pass
+
+
+class _Server(ThreadingWSGIServer):
+    def server_bind(self) -> None:
+        # Not that of http.server, which asks the network for the name of the address.
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
+        self.setup_environ()
+
+
+class _ServerIPv6(_Server):
+    address_family = socket.AF_INET6
+
+
+def _say(start: _Start, status: HTTPStatus, content: object) -> Iterable[bytes]:
+    start(f"{status.value} {status.phrase}", [("Content-Type", "application/json"), ("Cache-Control", "no-store")])
+    return [msgspec.json.encode(content) + b"\n"]

@@ -1,22 +1,20 @@
-"""What gateway and recorder measure, and whether each process does its work: the supervisor keeps it for who watches.
+"""Measurements of gateway and recorder, and the health of each process: the supervisor keeps them for monitoring.
 
-Measured are totals since the loop began, told once a second. The supervisor looks at all processes once in each of its
-turns; who asks does so in a thread of its own, so that a supervisor that is held up itself, by its output for one, is
-told as well.
+Measurements are totals since the loop began, sent once a second. The supervisor checks all processes once in each of
+its turns; requests are answered in threads of their own, so that they also show a supervisor that is held up itself,
+by its output for one.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from trirail.config import Config
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
 from trirail.processes.zenoh_links import InUse
 from trirail.wire.decoding import converted, prepare
@@ -24,33 +22,33 @@ from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 
 TOLD_EVERY: Final = 1.0
-"""How often they are told [s]."""
+"""Interval between two messages of measurements [s]."""
 CYCLE_BOUNDS: Final = (1e-6, 2e-6, 5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
-"""Of the histograms of lateness and cycle [s]."""
+"""Bounds of the histograms of lateness and cycle [s]."""
 SETTLE_BOUNDS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Of that of settle times [s]."""
+"""Bounds of the histogram of settle times [s]."""
 KINDS_OF_FAULT: Final = 20
-"""So many faults are told apart, by cause, drive and code; what more there are count as one."""
+"""Most faults that are distinguished, by cause, drive and code; further ones count as one."""
 OTHER: Final = FaultDetail("other")
 
 
 class Histogram(Struct):
-    """Values, counted by how large they are."""
+    """Histogram of values."""
 
     bounds: tuple[float, ...]
-    """Rising."""
+    """Upper bounds, rising."""
     counts: list[int]
-    """How many values are at most each bound and above the one before; at the end those above all."""
+    """Number of values at most each bound and above the one before; the last is of those above all bounds."""
     total: float = 0.0
-    """Of all values."""
+    """Sum of all values."""
 
     @classmethod
     def of(cls, bounds: tuple[float, ...]) -> Histogram:
-        """Return one without values."""
+        """Return an empty histogram."""
         return cls(bounds, [0] * (len(bounds) + 1))
 
     def add(self, values: NDArray[np.float64]) -> None:
-        """Take values in, (n,)."""
+        """Add values, (n,)."""
         places = np.searchsorted(self.bounds, values)  # the first bound that is not below the value
         more = np.bincount(places, minlength=len(self.counts)).tolist()
         self.counts = [count + n for count, n in zip(self.counts, more, strict=True)]
@@ -58,41 +56,41 @@ class Histogram(Struct):
 
 
 class FaultCount(Struct, frozen=True):
-    """How often there was a fault of a kind."""
+    """Number of faults of a kind."""
 
     fault: FaultDetail
     times: int
 
 
 class ServiceMeasured(Struct, frozen=True):
-    """What the gateway tells."""
+    """Measurements of the gateway."""
 
     mode: str
     """A trirail.wire.vocabulary.Mode."""
     cycles: int
-    """As in trirail.wire.state.LoopState, and the three below."""
+    """This and the three below: see trirail.wire.state.LoopState."""
     overruns: int
     bus_load: float
     bus_load_measured: float
     traffic: tuple[FrameCounts, FrameCounts, FrameCounts]
     """Frames of each drive that were late or lost."""
     lateness: Histogram
-    """How much after its deadline each cycle began [s]."""
+    """Delay of each cycle after its deadline [s]."""
     cycle: Histogram
-    """How long each cycle worked [s]."""
+    """Duration of each cycle's work [s]."""
     settle: Histogram
-    """How long goals took to be in position, of those that are done [s]."""
+    """Time until each goal that is done was in position [s]."""
     goals: dict[str, int]
-    """How many ended, by outcome."""
+    """Number of ended goals, by outcome."""
     faults: tuple[FaultCount, ...]
     use: InUse
-    """Of what there is an end to."""
+    """Use of limited resources."""
     warnings: tuple[str, ...]
-    """What is nearly used up."""
+    """Warnings of resources nearly used up."""
 
 
 class RecorderMeasured(Struct, frozen=True):
-    """What the recorder tells: its gaps, since it was started."""
+    """Measurements of the recorder: its gaps, since it was started."""
 
     lost: int
     """Batches that the disk did not take."""
@@ -103,7 +101,7 @@ class RecorderMeasured(Struct, frozen=True):
 
 
 class Meter:
-    """Counts what passes the gateway; one that is started again counts the cycles anew, and is told the past events."""
+    """Counts of the gateway's traffic; a restarted gateway counts cycles from 0, and receives the past events."""
 
     def __init__(self, tell: Callable[[Struct], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._tell = tell
@@ -115,12 +113,12 @@ class Meter:
         self._faults: dict[FaultDetail, int] = {}
 
     def records(self, rows: NDArray[np.void]) -> None:
-        """Take in a batch of records."""
+        """Count a batch of records."""
         self._lateness.add(rows["lateness_ns"] * 1e-9)
         self._cycle.add(rows["parts_ns"].sum(axis=1) * 1e-9)
 
     def event(self, event: Event) -> None:
-        """Take in an event."""
+        """Count an event."""
         if event.outcome is not None:
             self._goals[event.outcome] = self._goals.get(event.outcome, 0) + 1
             if event.settle is not None:
@@ -132,7 +130,7 @@ class Meter:
             self._faults[fault] = self._faults.get(fault, 0) + 1
 
     def publish(self, newest: Callable[[], State], use: InUse, warnings: tuple[str, ...]) -> None:
-        """Tell all of it, where that is due."""
+        """Send all measurements if they are due."""
         now = self._clock()
         if now < self._due:
             return
@@ -159,31 +157,31 @@ class Meter:
 
 
 MEASURED_BY: Final = {"gateway": ServiceMeasured, "recorder": RecorderMeasured}
-"""What each process measures."""
+"""Type of each process's measurements."""
 prepare(*MEASURED_BY.values())
 
 SILENT: Final = 3.0
-"""A process is told as frozen that has given no sign of life for so long [s]; most have been killed for it by then."""
+"""Silence after which a process is reported as frozen [s]; most have been killed for it by then."""
 LEAST_CYCLES: Final = 3
-"""So many cycles the loop may take for a sign of life, however long they are."""
+"""Fewest cycles within which the loop must give a sign of life, however long they are."""
 
 
 class Running(NamedTuple):
-    """What the supervisor knows of a process."""
+    """State of a process, from the supervisor's side."""
 
     pid: int | None
-    """None where there is none."""
+    """Process id; None without a process."""
     ready: bool
-    """Whether it has said that it is up."""
+    """Whether it has reported that it is up."""
     restarts: int
-    """How often it was started again."""
+    """Number of restarts."""
 
 
 NOT_RUNNING: Final = Running(None, ready=False, restarts=0)
 
 
 class Health:
-    """The newest look at every process, and what they measured last; any thread may ask."""
+    """Newest check of every process, and the newest measurements; any thread may ask."""
 
     def __init__(
         self, heartbeats: Heartbeats, period: float, turn: float, clock: Callable[[], float] = time.monotonic
@@ -194,25 +192,25 @@ class Health:
         silent = dict.fromkeys(PROCESSES, SILENT) | {"loop": max(SILENT, LEAST_CYCLES * period)}
         self._watches = {name: Watch(heartbeats.of(name), round(silent[name] / turn)) for name in PROCESSES}
         self.processes: Mapping[str, Running] = dict.fromkeys(PROCESSES, NOT_RUNNING)
-        """What was known of each at the newest look."""
+        """State of each at the newest check."""
         self._troubles: Mapping[str, str] = dict.fromkeys(PROCESSES, "starting")
         self._told: dict[str, float] = {}
         self.service: ServiceMeasured | None = None
         self.recorder: RecorderMeasured | None = None
 
     def poll(self, processes: Mapping[str, Running]) -> None:
-        """Look at all of them, in every turn of the supervisor's."""
+        """Check all processes, in every turn of the supervisor."""
         self._troubles = {name: self._trouble(name, running) for name, running in processes.items()}
         self.processes = processes
         self._looked = self._clock()
 
     def end(self, processes: Mapping[str, Running]) -> None:
-        """Look for the last time: the service is ending."""
+        """Check for the last time: the service is ending."""
         self.poll(processes)
         self._ending = True
 
     def store(self, process: str, content: Mapping[str, Any]) -> None:
-        """Keep what a process has measured."""
+        """Keep a process's measurements."""
         measured = converted(content, MEASURED_BY[process])
         if isinstance(measured, ServiceMeasured):
             self.service = measured
@@ -221,11 +219,11 @@ class Health:
         self._told[process] = self._clock()
 
     def ages(self) -> dict[str, float]:
-        """Return how old that is, by process [s]."""
+        """Return the age of the measurements, by process [s]."""
         return {name: self._clock() - told for name, told in self._told.copy().items()}
 
     def troubles(self) -> dict[str, str]:
-        """Return what is wrong, by process, "" for nothing; the supervisor is one of them."""
+        """Return the trouble of each process, "" for none; the supervisor is one of them."""
         held_up = self._clock() - self._looked > SILENT
         supervisor = "the service is ending" if self._ending else "no sign of life" if held_up else ""
         return {**self._troubles, "supervisor": supervisor}
@@ -237,12 +235,3 @@ class Health:
         if not running.ready:
             return "starting"
         return "no sign of life" if silent else ""
-
-
-def metrics_server(config: Config, health: Health) -> AbstractContextManager[object]:
-    """Return what serves it while the context lasts; nothing where [telemetry] metrics_port is not given."""
-    if not config.telemetry.metrics_port:
-        return nullcontext()
-    from trirail.processes.metrics_server import MetricsServer
-
-    return MetricsServer(config, health)

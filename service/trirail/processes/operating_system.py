@@ -1,6 +1,6 @@
-"""What the service asks of the operating system: programs, processes by their names, signals, and systemd's attention.
+"""The service's use of the operating system: programs, processes by name, signals, and reports to systemd.
 
-What systemd is told, where it asked for it, is of sd_notify(3) and sd_watchdog_enabled(3).
+Reports to systemd, if it asks for them, follow sd_notify(3) and sd_watchdog_enabled(3).
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from trirail.processes.heartbeats import Heart
 def python(*arguments: str) -> list[str]:
     """Return the command that runs this interpreter, with nothing of the current folder on its path.
 
-    With `-m` and `-c`, Python else imports a file `msgspec.py` that lies there, whoever has put it there.
+    Otherwise, with `-m` and `-c`, Python would import a file `msgspec.py` from there, whatever its origin.
     """
     return [sys.executable, "-P", *arguments]
 
 
 ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""The environment in which numpy's libraries begin no threads: none is carried over a fork, and the service's matrices
+"""Environment in which numpy's libraries start no threads: a fork carries none over, and the service's matrices
 are small."""
 TITLE = "trirail: "
-"""What `ps` and its like show of one of the service's processes, before its name."""
+"""Prefix of the names of the service's processes in `ps` and the like."""
 
 
 def processes(service: int) -> dict[str, int]:
-    """Return the process ids of a service's processes by their names; `service` is the supervisor's."""
+    """Return the process ids of a service's processes by name; `service` is the supervisor's."""
     found = {"supervisor": service}
     for pid in [grandchild for parent in _children(service) for grandchild in (parent, *_children(parent))]:
         with contextlib.suppress(OSError):
@@ -46,7 +46,7 @@ def processes(service: int) -> dict[str, int]:
 
 
 def child(service: int, name: str) -> int:
-    """Return the process id of one of a service's processes. Raises ServiceError where there is none."""
+    """Return the process id of one of a service's processes. Raises ServiceError if there is none."""
     try:
         return processes(service)[name]
     except KeyError:
@@ -54,7 +54,7 @@ def child(service: int, name: str) -> int:
 
 
 def title(name: str) -> str:
-    """Return what one of the service's processes is called by `ps` and its like."""
+    """Return the name of one of the service's processes in `ps` and the like."""
     return TITLE + name
 
 
@@ -65,10 +65,10 @@ def _children(process: int) -> list[int]:
 
 
 class Signals:
-    """SIGTERM, SIGINT and, where it is not ignored, as under nohup, SIGHUP as something to select on.
+    """Source for select of SIGTERM, SIGINT and, unless it is ignored, as under nohup, SIGHUP.
 
-    Whichever thread the kernel hands a signal: Python's handlers are run by the main thread alone, which nothing wakes
-    from a lock where another one was interrupted.
+    The kernel may hand a signal to any thread, but only the main thread runs Python's handlers, and nothing wakes that
+    from a lock if another one was interrupted.
     """
 
     def __enter__(self) -> Signals:
@@ -94,16 +94,16 @@ class Signals:
 
 
 SEND_WITHIN = 0.3
-"""How long it is waited for a systemd that does not read [s]."""
+"""Longest wait for a systemd that does not read [s]."""
 FEEDS = 4
-"""So often within the watchdog's time it is fed: systemd advises twice at least."""
+"""Number of feeds within the watchdog's time: systemd advises at least two."""
 
 
 def notify(state: str) -> None:
-    """Tell systemd of a state, `READY=1` and its like."""
+    """Notify systemd of a state, such as `READY=1`."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
-        # An end of systemd's must not keep the robot from being stopped.
+        # A failure of systemd must not keep the robot from being stopped.
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, contextlib.suppress(OSError):
             sender.settimeout(SEND_WITHIN)
             sender.connect("\0" + address[1:] if address.startswith("@") else address)
@@ -111,7 +111,7 @@ def notify(state: str) -> None:
 
 
 class Watchdog:
-    """Feeds systemd's watchdog while all hearts beat, each since it was fed before; else systemd ends the service."""
+    """Feeds of systemd's watchdog while all hearts have beaten since the last one; else systemd ends the service."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ class Watchdog:
         self._fed = [0] * len(hearts)
 
     def feed(self) -> None:
-        """Feed it if that is due."""
+        """Feed it if due."""
         now = self._clock()
         counts = [heart.count for heart in self._hearts]
         beating = all(count and count != before for count, before in zip(counts, self._fed, strict=True))
@@ -136,6 +136,6 @@ class Watchdog:
 
 
 def _microseconds(environment: Mapping[str, str]) -> int:
-    """Return the watchdog's time [µs]; 0 where there is none, or not for this process."""
+    """Return the watchdog's time [µs]; 0 if there is none, or not for this process."""
     wanted, process = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", str(os.getpid()))
     return int(wanted) if wanted.isdecimal() and process == str(os.getpid()) else 0

@@ -1,4 +1,4 @@
-"""Where the processes beside the loop connect, and the loop's sides of gateway and planner."""
+"""Ports for the processes beside the loop, and the loop's sides of gateway and planner."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import NamedTuple
 import msgspec
 
 from trirail.processes.heartbeats import Watch
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.links import Port
 from trirail.wire.packets import PlannerLost, Request, decode_request
 from trirail.wire.plan_packets import PlanAnswer, PlanRequest, decode_plan_answer, encode
 
 
 class Ports(NamedTuple):
-    """One for each of them."""
+    """One port for each of them."""
 
     gateway: Port
     recorder: Port
@@ -22,13 +23,16 @@ class Ports(NamedTuple):
 
 
 REQUESTS_A_CYCLE = 4
-"""Requests that are taken in one cycle: at 1 kHz more than the gateway can send, so that a stop waits for nothing."""
+"""Requests that are handled in one cycle: at 1 kHz more than the gateway sends on average."""
+URGENT_REQUESTS_A_CYCLE = 128
+"""Requests that are handled in a cycle with an urgent stop: more than the gateway has under way at a time, so that
+a stop waits for none of those sent before it, and none of these begins after it."""
 ANSWERS_A_CYCLE = 2
-"""Packets of the planner's that are taken in one cycle: it has been asked once."""
+"""Packets of the planner that are handled in one cycle: it has one request at a time."""
 
 
 class GatewayLink:
-    """What the gateway asks for, and whether it lives."""
+    """Requests of the gateway, and whether it is alive."""
 
     def __init__(self, port: Port, watch: Watch, timeout: float) -> None:
         self._port = port
@@ -40,21 +44,21 @@ class GatewayLink:
 
     @property
     def ended(self) -> bool:
-        """Whether it has gone, and that has not been found by receiving or sending yet."""
+        """Whether it has gone, and receiving or sending has not found that yet."""
         return self._port.ended
 
     @property
     def postponed(self) -> bool:
-        """Whether something has been read, and nobody has taken it up."""
+        """Whether requests have been read and not handled."""
         return bool(self._in_hand)
 
-    def read(self) -> None:
-        """Read what it has sent: as much as comes in a cycle, and no more than a cycle has time for.
+    def read(self, limit: int = REQUESTS_A_CYCLE) -> None:
+        """Read its packets, `limit` requests at most: no more than a cycle has time for.
 
-        Nothing is read of what a frozen one has left, until it serves again. One that says what cannot be read has lost
-        its mind: it is let go, and started again.
+        Nothing is read from a frozen gateway until it serves again. One that sends an unreadable packet is
+        disconnected, and started again.
         """
-        for _ in range(0 if self.frozen else REQUESTS_A_CYCLE):
+        for _ in range(0 if self.frozen else limit):
             packet = self._port.receive()
             if packet is None:
                 return
@@ -64,30 +68,31 @@ class GatewayLink:
                 self._port.hang_up()
 
     def requests(self) -> Iterator[Request]:
-        """Yield what has been read."""
+        """Yield the requests that have been read."""
         while self._in_hand and not self.frozen:
             yield self._in_hand.pop(0)
 
-    def lost(self) -> str | None:
-        """Return how it has been lost in this cycle, to be asked once in each; None where it has not.
+    def lost(self) -> EventText | None:
+        """Return how it has been lost in this cycle, to be called once in each; None if it has not.
 
-        What has been read of it and not taken up goes with it: nobody is there who could stop what would come of that.
+        Its requests that were read and not handled are dropped: nobody is there to stop their effects.
         """
         if self._port.take_lost():
             self.frozen = False
             self._in_hand.clear()
-            return "the gateway is gone: controlled stop"
+            return coded("the gateway is gone: controlled stop", EventCode.GATEWAY_LOST)
         if self._watch.silent():
             if not self.frozen:
                 self.frozen = True
-                return f"the gateway is frozen, no sign of life for {self._timeout:g} s: controlled stop"
+                words = f"the gateway is frozen, no sign of life for {self._timeout:g} s: controlled stop"
+                return coded(words, EventCode.GATEWAY_FROZEN, timeout=self._timeout)
         elif self._watch.heard:
             self.frozen = False
         return None
 
 
 class PlannerLink:
-    """Where the control asks the planner: trirail.control.plan_requests.PlannerPort."""
+    """Requests of the control to the planner: trirail.control.plan_requests.PlannerPort."""
 
     def __init__(self, port: Port) -> None:
         self._port = port
@@ -96,11 +101,11 @@ class PlannerLink:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to be said that the planner does not say itself."""
+        """Whether there is nothing to report that the planner does not report itself."""
         return self._unsent is None
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Send a request; what cannot be sent is said in the next cycle."""
+        """Send a request; a failure is reported in the next cycle."""
         if not self._port.connected:
             self._unsent = "the planner is not there, it is being started again"
         elif not self._port.send(encode(request)):
@@ -109,7 +114,7 @@ class PlannerLink:
             self._awaited = request.number
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
-        """Yield what there is to be given to the control; what was not asked for is left aside."""
+        """Yield the answers for the control; answers without a request are ignored."""
         if self._unsent is not None:
             unsent, self._unsent = self._unsent, None
             yield PlannerLost(unsent)
@@ -121,7 +126,7 @@ class PlannerLink:
                 continue
             try:
                 answer = decode_plan_answer(packet)
-            except msgspec.DecodeError as error:  # one that says such things is started again
+            except msgspec.DecodeError as error:  # a planner that sends such packets is started again
                 self._port.hang_up()
                 self._awaited = None
                 yield PlannerLost(f"the planner has said something unreadable, {error}")
@@ -134,5 +139,5 @@ class PlannerLink:
             yield PlannerLost("the planner has died")
 
     def accept(self) -> None:
-        """Take a planner that comes anew."""
+        """Accept a new planner."""
         self._port.accept()

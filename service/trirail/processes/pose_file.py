@@ -1,8 +1,9 @@
-"""The file of taught poses, in the service's state directory: whole after a power cut, whenever that comes."""
+"""The file of taught poses, in the service's state directory: intact after a power cut at any time."""
 
 from __future__ import annotations
 
 import fcntl
+import itertools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ prepare(Taught)
 
 
 def state_directory(robot: str) -> Path:
-    """Return where a robot's service keeps what must outlast it: below systemd's directory for it, else the user's."""
+    """Return the directory of a robot's lasting data: below systemd's directory for the service, else the user's."""
     of_unit = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if of_unit:
         return Path(of_unit) / robot
@@ -33,13 +34,13 @@ def state_directory(robot: str) -> Path:
 
 
 class PoseFile:
-    """Reads and changes it. Both raise ServiceError, with the file and what would be right."""
+    """Access to the file. Reading and changing raise ServiceError, with the file and the remedy."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
 
     def read(self) -> Taught:
-        """Return what was taught; nothing where there is no file yet."""
+        """Return the taught poses; none if there is no file yet."""
         try:
             return decoded(files.text(self.path), Taught) if self.path.exists() else {}
         except (FileError, OSError) as error:
@@ -48,16 +49,24 @@ class PoseFile:
             problem = str(error).replace("`", "")
             raise ServiceError(f"{self.path}: {problem}; mend it, or move it away and teach the poses anew") from error
 
+    def set_aside(self) -> Path:
+        """Rename it, never over another file, and return its new name. Raises OSError."""
+        with _alone_in(self.path.parent):
+            names = (self.path.with_name(f"{NAME}.broken{number or ''}") for number in itertools.count())
+            aside = next(name for name in names if not os.path.lexists(name))
+            self.path.rename(aside)
+        return aside
+
     @property
     def gone(self) -> bool:
         """Whether it has been deleted or moved away: its folder is made with it, and it stays without a pose in it."""
         return self.path.parent.is_dir() and not self.path.exists()
 
     def change(self, name: str, pose: Coordinates | None, known: Taught | None = None) -> None:
-        """Keep a pose by a name, None for none; it is on the disk when this returns. It may take as long as that does.
+        """Save a pose under a name, or remove it for None; return once that is on the disk, however long it takes.
 
-        What another service of the same robot has written meanwhile stays; where the file has gone, it has what is
-        `known` again.
+        Poses that another service of the same robot has written meanwhile stay; if the file has gone, it starts from
+        `known`.
         """
         try:
             files.make_folder(self.path.parent)
@@ -74,7 +83,7 @@ class PoseFile:
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep others who ask out of a folder."""
+    """Lock a folder against other callers."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

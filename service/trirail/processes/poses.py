@@ -1,11 +1,12 @@
-"""Named poses as the gateway knows them: those of [poses], and those that are taught and kept.
+"""Named poses in the gateway: those of [poses], and the taught ones, which are kept.
 
-A disk may take longer than the loop waits for a sign of life: what is taught is written by a thread of its own, and
-is answered, told and known to goals when it is on the disk.
+A disk may take longer than the loop waits for a sign of life: a thread of its own writes taught poses, which are
+answered, announced and known to goals once they are on the disk.
 """
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import time
 from collections import deque
@@ -20,25 +21,24 @@ from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.kinematics.geometry import travels
 from trirail.processes.incoming import Incoming
-from trirail.processes.pose_file import PoseFile, state_directory
-from trirail.wire import boundary, zenoh_session
+from trirail.processes.pose_file import PoseFile, Taught, state_directory
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goals import Coordinates, Goal, NamedGoal
 from trirail.wire.kinds.pose import pose_in_place_of
-from trirail.wire.messages import ErrorReply
-from trirail.wire.packets import PoseChanged, Remark
+from trirail.wire.messages import ErrorReply, Notice
 from trirail.wire.state import NamedPose, NamedPoses
-from trirail.wire.text import check_name, check_new_pose
-from trirail.wire.vocabulary import MODES, Mode, NoContent
+from trirail.wire.text import check_new_pose
+from trirail.wire.vocabulary import MODES, Mode
 
 MOST = 1000
-"""Poses that may be kept."""
+"""Most poses that are kept."""
 UNDER_WAY = 32
-"""Poses that may be taught or removed at once; beyond that they are refused."""
+"""Most poses that are being taught or removed at a time; more are refused."""
 LOOK_EVERY = 2.0
-"""How often it is looked whether the file of taught poses is there [s]."""
+"""Interval of the checks that the file of taught poses is there [s]."""
 BELONGS = 1e-3
-"""A measured pose whose sliders are not where they are measured is none [m]: it is of earlier cycles, and theirs is
-none that closes the loops."""
+"""Largest error of a measured pose's sliders [m]: beyond it the pose is of earlier cycles, and the present sliders
+do not close the loops."""
 
 
 class _Change(NamedTuple):
@@ -51,10 +51,11 @@ class _Change(NamedTuple):
 
 
 class Poses:
-    """Takes what comes on …/poses, …/teach and …/forget, and puts poses in the place of their names.
+    """Handler of …/poses, …/teach and …/forget, which also replaces names in goals by their poses.
 
-    `reply` answers, `refuse` says no, `tell` has everyone told, `wake` has `settle` called soon, from any thread.
-    Raises ServiceError where what was taught cannot be read.
+    `reply` answers, `refuse` refuses, `announce` informs everyone, `wake` has `settle` called soon, from any thread.
+    Raises ServiceError if the taught poses cannot be read, but not in a gateway that is started `again`: the robot is
+    then served without, and the file is kept aside.
     """
 
     def __init__(
@@ -62,44 +63,64 @@ class Poses:
         config: Config,
         reply: Callable[[Incoming, msgspec.Struct], None],
         refuse: Callable[[Incoming, RefusedError], None],
-        tell: Callable[[PoseChanged | Remark], object],
+        announce: Callable[[Notice], object],
         wake: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
+        *,
+        again: bool = False,
     ) -> None:
-        self._robot = config.robot.name
         self._geometry = corrected_geometry(config)
         self._configured = config.poses
         self._file = PoseFile(state_directory(config.robot.name))
-        self._taught = self._file.read()
-        self._reply, self._refuse, self._tell, self._wake = reply, refuse, tell, wake
+        self._lacking = ""
+        """Reason why the taught poses are missing; empty if they are not."""
+        self._taught = self._read(again=again)
+        self._reply, self._refuse, self._announce, self._wake = reply, refuse, announce, wake
         self._to_measure: deque[_Change] = deque()
+        self._lacking_told = False
         self._under_way = 0
         self._written: queue.SimpleQueue[tuple[_Change, ServiceError | None]] = queue.SimpleQueue()
         self._writer = ThreadPoolExecutor(1, "poses")
         self._clock = clock
         self._next_look = clock()
         self._gone = ""
-        """That the file of taught poses has gone, and what that means; empty while it is there."""
+        """Warning that the file of taught poses has gone, with its consequence; empty while it is there."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what people should know, one line each: a file that has gone, names that the configuration has now."""
+        """Return warnings, one line each: a file that has gone, names that are now in the configuration."""
         both = sorted(self._taught.keys() & self._configured.keys())
-        gone = (self._gone,) if self._gone else ()
+        gone = tuple(filter(None, (self._lacking, self._gone)))
         return *gone, *(
             f"pose {name} is that of [poses]; the taught one is not used: trirail forget {name}" for name in both
         )
 
     def poll(self) -> None:
-        """See whether the file of taught poses is still there, once in a while; have everyone told where it is not."""
+        """Check at intervals that the file of taught poses is still there; announce it if it is not."""
         if self._clock() < self._next_look:
             return
         self._next_look = self._clock() + LOOK_EVERY
-        before, self._gone = self._gone, self._lost() if self._file.gone else ""
+        if self._lacking and not self._lacking_told:
+            lacking = coded(self._lacking, EventCode.POSES_UNREADABLE, file=str(self._file.path))
+            self._announce(Notice("service", "warning", lacking.text, **lacking.fields))
+            self._lacking_told = True
+        before, self._gone = self._gone, self._lost() if self._file.gone and not self._lacking else ""
         if self._gone and not before:
-            self._tell(Remark("warning", self._gone))
+            gone = coded(self._gone, EventCode.POSES_LOST, file=str(self._file.path))
+            self._announce(Notice("service", "warning", gone.text, **gone.fields))
+
+    def _read(self, *, again: bool) -> Taught:
+        try:
+            return self._file.read()
+        except ServiceError as error:
+            if not again:
+                raise
+            self._lacking = f"{error}; there are no taught poses now"
+            with contextlib.suppress(OSError):  # it stays where it is, and no change is taken
+                self._lacking += f"; the file is kept as {self._file.set_aside()}"
+            return {}
 
     def _lost(self) -> str:
-        """Say what it means that the file has gone."""
+        """Return the warning that the file has gone."""
         if not self._taught:
             return f"{self._file.path} has gone: what was taught is lost, if anything was"
         known = ", ".join(sorted(self._taught))
@@ -109,28 +130,24 @@ class Poses:
         )
 
     def table(self) -> NamedPoses:
-        """Return all that there are."""
+        """Return all poses."""
         found = {**self._taught, **self._configured}
         return NamedPoses(
             tuple(NamedPose(name, *found[name], taught=name not in self._configured) for name in sorted(found))
         )
 
     def of_name(self, goal: Goal) -> Goal:
-        """Return the pose goal that a named one means; any other, and one of a name that there is not, as it is."""
+        """Return the pose goal that a named one means; any other goal, and one with an unknown name, unchanged."""
         pose = (self._configured.get(goal.name) or self._taught.get(goal.name)) if isinstance(goal, NamedGoal) else None
         if pose is None:
             return goal
         return pose_in_place_of(goal, *pose)
 
-    def edit(self, incoming: Incoming) -> None:
-        """Take a query on …/teach or …/forget. Raises RefusedError."""
-        kind = incoming.kind
-        user, name = boundary.names(incoming.key, zenoh_session.key(self._robot, kind), ("user", "pose"))
-        check_name(name, "pose")
-        incoming.content(NoContent | None, f"{kind} takes no content")
+    def edit(self, incoming: Incoming, user: str, name: str) -> None:
+        """Handle a query on …/teach or …/forget. Raises RefusedError."""
         if self._under_way >= UNDER_WAY:
             raise RefusedError(RefusalCode.BUSY, f"{self._under_way} poses are being taught already: send fewer")
-        if kind == "forget":
+        if incoming.kind == "forget":
             self._check_known(name)
             self._write(_Change(incoming, user, name, None))
             return
@@ -145,7 +162,7 @@ class Poses:
         self._to_measure.append(_Change(incoming, user, name, None))
 
     def measure(self, record: np.void) -> None:
-        """Take the pose to be taught from a record: the newest that there is, and later than the request."""
+        """Measure the pose to be taught in a record: the newest that there is, and later than the request."""
         while self._to_measure:
             wanted = self._to_measure.popleft()
             self._under_way -= 1
@@ -155,7 +172,7 @@ class Poses:
                 self._refuse(wanted.incoming, refusal)
 
     def settle(self) -> None:
-        """Answer and tell what has been written."""
+        """Answer and announce the changes that have been written."""
         while True:
             try:
                 change, failure = self._written.get_nowait()
@@ -163,7 +180,7 @@ class Poses:
                 return
             self._under_way -= 1
             pose = change.pose or self._taught.get(change.name)
-            if failure is not None or pose is None:  # the latter where two have removed it at once
+            if failure is not None or pose is None:  # the latter if two have removed it at the same time
                 why = f"{change.name} is as it was: {failure or 'it has been removed already'}"
                 self._refuse(change.incoming, RefusedError(RefusalCode.FAILED, why))
                 continue
@@ -172,10 +189,11 @@ class Poses:
             else:
                 del self._taught[change.name]
             self._reply(change.incoming, NamedPose(change.name, *pose, taught=True))
-            self._tell(PoseChanged(change.user, _words(change)))
+            text = _words(change)
+            self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))
 
     def close(self) -> None:
-        """Write what is to be written and answer it; what waits for a record has none any more."""
+        """Write and answer all pending changes; requests that wait for a record get an error."""
         for wanted in self._to_measure:
             self._reply(wanted.incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
         self._to_measure.clear()
@@ -192,7 +210,7 @@ class Poses:
         raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r} was taught: there is {there_are}")
 
     def _measured(self, record: np.void) -> Coordinates:
-        """Return where the robot stands, measured. Raises RefusedError where it moves, or that is not known."""
+        """Return the measured pose. Raises RefusedError if the robot moves, or its pose is not known."""
         mode = MODES[record["mode"]]
         if mode is Mode.FAULT:
             raise RefusedError(RefusalCode.FAULT, "the robot is in fault: remove the cause, then send reset")
@@ -211,7 +229,7 @@ class Poses:
         self._writer.submit(self._keep, change)
 
     def _keep(self, change: _Change) -> None:
-        """Write a change; in the thread that does nothing else."""
+        """Write a change, in the thread that does nothing else."""
         failure = None
         try:
             self._file.change(change.name, change.pose, dict(self._taught))
@@ -221,8 +239,11 @@ class Poses:
         self._wake()
 
 
-def _words(change: _Change) -> str:
+def _words(change: _Change) -> EventText:
     if change.pose is None:
-        return f"pose {change.name} removed by {change.user}"
+        words = f"pose {change.name} removed by {change.user}"
+        return coded(words, EventCode.POSE_REMOVED, pose=change.name, user=change.user)
     x, y, phi = (f"{round(value, 4) + 0.0:g}" for value in np.array(change.pose) * (1e3, 1e3, np.degrees(1.0)))
-    return f"pose {change.name} taught by {change.user}: x {x} mm, y {y} mm, phi {phi}°"
+    words = f"pose {change.name} taught by {change.user}: x {x} mm, y {y} mm, phi {phi}°"
+    x_m, y_m, phi_rad = change.pose
+    return coded(words, EventCode.POSE_TAUGHT, pose=change.name, user=change.user, x=x_m, y=y_m, phi=phi_rad)

@@ -1,4 +1,4 @@
-"""What the gateway publishes and answers for one robot: state, records, events with their past, and its info."""
+"""Publications and answers of the gateway for one robot: state, records, events with their past, and its info."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from trirail.wire.state import (
     Info,
     LoopState,
     Percentiles,
+    Pose,
     RobotSummary,
     Sliders,
     State,
@@ -31,14 +32,14 @@ from trirail.wire.state import (
 from trirail.wire.vocabulary import MODES, Mode
 
 EVENTS_KEPT = 1000
-"""So many events a client hears that asks for the past."""
+"""Number of events that a client receives if it asks for the past."""
 _PAST = RepliesConfig(
     priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.BLOCK, express=False
 )
 
 
 class Publications:
-    """Publishers on a robot's keys. State and records are dropped where somebody is slow, events wait for them."""
+    """Publishers on a robot's keys. State and records are dropped for a slow subscriber, events wait for it."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         def dropping(name: str, encoding: str, priority: zenoh.Priority) -> zenoh.Publisher:
@@ -56,7 +57,7 @@ class Publications:
             session,
             zenoh_session.key(robot, "event"),
             encoding=boundary.JSON,
-            # The past goes out in one burst, whole, in a queue of its own: who is slow to take it delays nothing else.
+            # The past goes out in one burst, whole, in a queue of its own: a slow subscriber delays nothing else.
             cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_PAST),
             sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             publisher_detection=True,
@@ -75,7 +76,7 @@ class Publications:
         self._records.put(batch)
 
     def event(self, event: Event) -> None:
-        """Publish an event; who comes later hears it too."""
+        """Publish an event, for later subscribers as well."""
         self._event.put(msgspec.json.encode(event))
 
 
@@ -87,7 +88,7 @@ _NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
 
 
 class StateMaker:
-    """Keeps the newest record and the timing of the last minute."""
+    """Newest record, and timing of the last minute."""
 
     def __init__(self, config: Config) -> None:
         self._period = config.period
@@ -103,14 +104,14 @@ class StateMaker:
         self._status = Status(None, 1.0, None)
 
     def update(self, news: Status | Welcome) -> None:
-        """Take in what the loop says beside its records."""
+        """Update from a message of the loop other than records."""
         if isinstance(news, Welcome):
             self._welcome = news
         else:
             self._status = news
 
     def records(self, rows: NDArray[np.void]) -> None:
-        """Take in a batch of records."""
+        """Update from a batch of records."""
         newest, before = rows[-1], self._newest
         if before is not None:
             # Over a batch and not over a cycle: at 1 kHz a count of the encoder is a large step of velocity.
@@ -130,7 +131,7 @@ class StateMaker:
 
     @property
     def lease(self) -> str | None:
-        """Who holds the lease."""
+        """User that holds the lease."""
         return self._status.lease
 
     @property
@@ -139,21 +140,21 @@ class StateMaker:
         return 0 if self._newest is None else int(self._newest["cycle"])
 
     def newest(self, warnings: tuple[str, ...] = ()) -> State:
-        """Make the state of the newest record; with what people should know of how the service is run."""
+        """Return the state of the newest record, with warnings about how the service is run."""
         row = self._newest
         lateness, cycle = self._statistics
-        goal = self._status.goal
+        goal, target = self._status.goal, self._status.target
         a, b, c = self._status.counts
-        offset = row["backlash"]  # in what the drives are told and tell, not where the sliders are
+        offset = row["backlash"]  # part of the drives' positions, not of the sliders'
         return State(
             seq=int(row["cycle"]),
             t=round(int(row["cycle"]) * self._period, 9),
             mode=MODES[row["mode"]],
-            pose=_triple(row["pose"]),
+            pose=Pose(*row["pose"].tolist()),
             velocity=_triple(self._velocity),
             acceleration=_triple(self._acceleration),
             commanded=Commanded(
-                pose=_triple(row["commanded_pose"]),
+                pose=Pose(*row["commanded_pose"].tolist()),
                 pose_velocity=_triple(row["commanded_pose_velocity"]),
                 pose_acceleration=_triple(row["commanded_pose_acceleration"]),
                 position=_triple(row["commanded_position"] - offset),
@@ -168,13 +169,15 @@ class StateMaker:
                 status=tuple(str(PowerState(state)) for state in row["drive_state"]),  # type: ignore[arg-type]
                 traffic=(FrameCounts(*a), FrameCounts(*b), FrameCounts(*c)),
             ),
-            goal=GoalState(goal, float(row["progress"]), float(row["remaining"]), self._status.target, self._status.lag)
+            goal=GoalState(
+                goal, float(row["progress"]), float(row["remaining"]), target and Pose(*target), self._status.lag
+            )
             if goal
             else None,
             settled=bool(row["settled"]),
             override=self._status.override,
             lease=self._status.lease,
-            faults=(self._status.fault,) if self._status.fault else (),
+            faults=tuple(dict.fromkeys(filter(None, (self._status.fault, *self._status.unready)))),
             warnings=(*warnings, self._status.unrecorded) if self._status.unrecorded else warnings,
             loop=LoopState(
                 rate_hz=self._rate_hz,
@@ -190,7 +193,7 @@ class StateMaker:
 
 
 class _Recent:
-    """The last so many values [ns]."""
+    """Most recent values [ns]."""
 
     def __init__(self, size: int) -> None:
         self._values = np.zeros(size, dtype=np.int64)
@@ -217,7 +220,7 @@ def _triple(values: NDArray[np.float64]) -> Triple:
 
 
 def info(config: Config) -> Info:
-    """Return what a service of this configuration answers on …/info."""
+    """Return the answer on …/info of a service with this configuration."""
     live = config.telemetry.live_port
     legs: list[dict[str, Any]] = []
     for name, leg in zip(NAMES, geometry(config.geometry).each, strict=True):

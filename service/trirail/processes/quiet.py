@@ -1,18 +1,18 @@
-"""Cycles in which nothing happens, as one compiled call: it goes on from cycle to cycle until Python is needed.
+"""Cycles without events, as one compiled call: it runs from cycle to cycle until Python is needed.
 
-Wait, SYNC, what has arrived, `observe`, `command`, `hold` or `follow`, the last gate, setpoints, record. A cycle where
-the drives say anything but positions, where somebody hurries or has gone, or where the last gate refuses, leaves no
-trace: what it has changed is put back, and Python runs it from its SYNC on. What can wait until its setpoints have
-left is left to Python behind it. So nothing is decided here.
+Wait, SYNC, received frames, `observe`, `command`, `hold` or `follow`, the last gate, setpoints, record. Nothing is
+decided here: if a decision must precede the setpoints, because a drive sends anything but its position, a request is
+urgent, a neighbour has gone, or the last gate refuses, the call ends at that stage, and Python continues from it. Work
+that can wait until the setpoints have left is left to Python behind them.
 
-A wait that a signal interrupts goes on to its deadline; Python's handlers run when the call has returned, which is at
+A wait that a signal interrupts continues to its deadline; Python's handlers run when the call has returned, which is at
 the end of a batch of records at the latest.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numba import f8, from_dtype, i8, types, u1, u8
@@ -30,7 +30,6 @@ from trirail.processes.cycle_frames import (
     TIMINGS,
     begin_cycle,
     end_read,
-    memcpy,
     receive_frames,
     send_frames,
     set_frames,
@@ -40,26 +39,30 @@ from trirail.processes.heartbeats import HASTE
 from trirail.wire.records import LONGEST, Part
 
 _GONE: Final = (0x008 | 0x010) << 16
-"""POLLERR and POLLHUP of poll.h, where poll leaves them."""
+"""POLLERR and POLLHUP of poll.h, at the place of `revents`."""
 
 
 class Reached(IntEnum):
-    """How far the newest cycle has come."""
+    """Stage that the newest cycle has reached."""
 
     WAITED = 0
-    """Its tick is there; frames may have been taken from the bus."""
+    """Its tick is there; frames may have been received."""
     SYNCED = 1
-    """Its SYNC has been sent, as far as the bus takes it, and frames may have been taken from the bus."""
-    WRITTEN = 2
-    """All is done, but for setpoints that the bus has not taken."""
-    DONE = 3
+    """Its SYNC has been sent, as far as the bus takes it, and frames may have been received."""
+    OBSERVED = 2
+    """A following error beyond its limit has been found."""
+    SOLVED = 3
+    """The sliders have been solved; the last gate has refused that, it is late, or a frame cannot hold a setpoint."""
+    WRITTEN = 4
+    """All is done, except for setpoints that the bus has not taken."""
+    DONE = 5
     """All is done."""
-    CALLED = 4
-    """All is done, and somebody has called while the next tick was waited for."""
+    CALLED = 6
+    """All is done, and a neighbour has called during the wait for the next tick."""
 
 
 FOLLOW, HOLD, COMMAND = 0, 1, 2
-"""What the setpoints come from."""
+"""Sources of the setpoints."""
 
 STATE = np.dtype(
     [
@@ -72,41 +75,43 @@ STATE = np.dtype(
         ("marked_ns", "<i8"),  # when its newest part ended
         ("cycle", "<i8"),
         ("until", "<i8"),  # the last cycle that may be run
-        ("due", "<i8"),  # the cycle behind which something is to be decided
+        ("due", "<i8"),  # the cycle behind which a decision is due
         ("overruns", "<i8"),  # ticks that have been missed
-        ("in_a_row", "<i8"),  # those before the newest, and how many may be
+        ("in_a_row", "<i8"),  # those before the newest, and their maximum
         ("allowed", "<i8"),
         ("missed", "<i8"),  # those before the newest tick
         ("parts_ns", "<i4", len(Part)),
         ("mode", "u1"),  # as in a record
         ("source", "u1"),  # FOLLOW, HOLD or COMMAND
-        ("held", "u1"),  # as of trirail.control.cycle.follow
-        ("stands", "u1"),  # as of trirail.control.cycle.observe
+        ("held", "u1"),  # as in trirail.control.cycle.follow
+        ("stands", "u1"),  # as in trirail.control.cycle.observe
         ("in_sliders", "u1"),  # of the path
-        ("found", "<i8"),  # what trirail.control.cycle.command has found
+        ("behind", "<i8"),  # result of trirail.control.cycle.observe
+        ("found", "<i8"),  # result of trirail.control.cycle.command
         ("time", "<f8"),  # of the law [s], and the rate that it leads to
         ("target", "<f8"),
-        ("course", "<f8", 3),  # trirail.motion.runs.Course
-        ("fastest", "<f8"),  # as of trirail.control.cycle.observe
+        ("course", "<f8", 3),  # trirail.motion.runs.GoalSpan
+        ("fastest", "<f8"),  # as in trirail.control.cycle.observe
         ("limit", "<f8"),
-        ("step", "<f8"),  # as of trirail.control.cycle.follow
+        ("step", "<f8"),  # as in trirail.control.cycle.follow
         ("settles", "u1"),  # whether a goal waits for the robot to be in position, and until which cycle
         ("timeout", "<i8"),
-        ("haste", "<u8"),  # the count of hastes when it was last looked at
-        ("listens", "u1"),  # whether who calls while the next tick is waited for is heard at once
-        ("called", "u1"),  # whether there is something to decide behind the newest cycle
+        ("haste", "<u8"),  # the count of urgent requests at the last check
+        ("listens", "u1"),  # whether a call during the wait for the next tick is served immediately
+        ("called", "u1"),  # whether a decision is due behind the newest cycle
         ("gateway_seen", "<u8"),  # trirail.processes.heartbeats.Watch
         ("gateway_turns", "<i8"),
         ("gateway_patience", "<i8"),
         ("gateway_place", "<i8"),
         ("batched", "<i8"),  # records in the batch
-        ("arrived", "<i8"),  # frames that Python has to look at
-        ("error", "<i8"),  # with which taking frames has failed: a number of errno.h
-        ("sent", "<i8"),  # setpoints that the bus has taken
+        ("handled", "<i8"),  # frames that have been processed
+        ("arrived", "<i8"),  # frames that have been received; Python must check those behind
+        ("error", "<i8"),  # of receiving frames: a number of errno.h
+        ("sent", "<i8"),  # setpoints that the bus has accepted
     ],
     align=True,
 )
-"""What the call goes on from, and what it leaves."""
+"""State from which the call continues, and its results."""
 
 _STATE = from_dtype(STATE)[::1]
 
@@ -120,7 +125,7 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
 
 @compiled()
 def _wait(state: NDArray[np.void], moment: NDArray[np.int64], doors: NDArray[np.int32]) -> bool:
-    """Wait for the deadline; return whether somebody is at a door who is to be heard before."""
+    """Wait for the deadline; return whether a neighbour at a door must be served before it."""
     if state[0].injected_ns >= 0:
         return bool(state[0].listens and called(doors))
     if state[0].listens:
@@ -131,22 +136,33 @@ def _wait(state: NDArray[np.void], moment: NDArray[np.int64], doors: NDArray[np.
 
 @compiled()
 def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None:
-    """Note how long a part of the cycle has taken, at its end."""
+    """Record how long a part of the cycle took, at its end."""
     now = _now_ns(state, moment)
     state[0].parts_ns[part] = min(now - state[0].marked_ns, LONGEST)
     state[0].marked_ns = now
 
 
 @compiled()
-def _copy(kept: NDArray[np.int64], to: int, source: int) -> None:
-    """Copy all that is kept: rows of two addresses and a number of bytes; `to` and `source` say which is which."""
-    for i in range(len(kept)):
-        memcpy(kept[i, to], kept[i, source], np.uint64(kept[i, 2]))
+def _receive(
+    s: Any,
+    bus: NDArray[np.int64],
+    arrivals: NDArray[np.uint64],
+    arrived: NDArray[np.uint8],
+    moment: NDArray[np.int64],
+    expected: NDArray[np.void],
+    axes: NDArray[np.void],
+    times: NDArray[np.void],
+    t: float,
+) -> bool:
+    """Process the frames that have arrived; return whether none of them holds anything new, and none is left."""
+    s.arrived, s.error = receive_frames(bus, arrivals, arrived, moment)
+    s.handled = take_frames(arrived, s.arrived, expected, axes, times, t)
+    return bool(s.error == 0 and s.handled == s.arrived and s.arrived < MOST_FRAMES)
 
 
 @compiled(
     i8(
-        *(_STATE, i8[:, ::1], i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
+        *(_STATE, i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND),
@@ -158,7 +174,6 @@ def _copy(kept: NDArray[np.int64], to: int, source: int) -> None:
 )
 def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     state: NDArray[np.void],
-    kept: NDArray[np.int64],
     moment: NDArray[np.int64],
     bus: NDArray[np.int64],
     arrived: NDArray[np.uint8],
@@ -196,40 +211,30 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     law_pieces: Array,
     furthest: Array,
 ) -> int:
-    """Run cycles; return how far the newest has come: Reached.
+    """Run cycles; return the stage that the newest has reached: Reached.
 
-    `kept` (n, 3) are addresses and sizes of all that a cycle changes, and of copies of it; `moment` (2,) room for a
-    struct timespec, `bus` (3,) a BusAccess, `doors` (n, 2) as poll takes them, the
+    `moment` (2,) is room for a struct timespec, `bus` (3,) a BusAccess, `doors` (n, 2) an array for poll, the
     gateway's first, `hearts` the counters of trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made`
-    (SIZE,) the bytes of `record`. All else as in control.cycle and exchange.
+    (SIZE,) the bytes of `record`. All else as in control.cycle and cycle_frames.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
         s.deadline_ns += s.period_ns
         if _wait(state, moment, doors):
             s.deadline_ns -= s.period_ns
-            s.marked_ns, s.arrived, s.error = _now_ns(state, moment), 0, 0
+            s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
             return Reached.CALLED
         now, s.listens = _now_ns(state, moment), s.period_ns > SPARE_NS
-        s.marked_ns, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0
+        s.marked_ns, s.handled, s.arrived, s.sent, s.error, s.called = now, 0, 0, 0, 0, 0
         s.lateness_ns = now - s.deadline_ns
         s.missed = max(0, s.lateness_ns // s.period_ns)
-        if s.missed and s.in_a_row + s.missed > s.allowed:
-            return Reached.WAITED
-        _copy(kept, 1, 0)
         t = now / 1e9
-        number, s.error = receive_frames(bus, arrivals, arrived, moment)
-        s.arrived = number
-        if (
-            s.error != 0
-            or number >= MOST_FRAMES
-            or t >= times[0].due
-            or take_frames(arrived, number, expected, axes, times, t) < number
-        ):
-            _copy(kept, 0, 1)
+        if (s.missed and s.in_a_row + s.missed > s.allowed) or t >= times[0].due:
+            return Reached.WAITED
+        if not _receive(s, bus, arrivals, arrived, moment, expected, axes, times, t):
             return Reached.WAITED
         s.deadline_ns, s.lateness_ns = s.deadline_ns + s.missed * s.period_ns, s.lateness_ns - s.missed * s.period_ns
-        s.synced, s.arrived = t, 0
+        s.synced, s.handled, s.arrived = t, 0, 0
         begun, due = send_frames(bus, begin, starts, times), t >= times[0].beat_due
         first, number = times[0].next_beat, times[0].beats
         if begun == len(begin) and due:
@@ -242,63 +247,56 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         begin_cycle(axes, history)
         _mark(state, moment, Part.SYNC)
 
-        _copy(kept, 1, 0)
+        somebody = called(doors)
+        count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch checks it
+        turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
+        if hearts[HASTE] != s.haste or doors[0, 1] & _GONE != 0 or turns > s.gateway_patience:
+            return Reached.SYNCED
         t = _now_ns(state, moment) / 1e9
-        number, s.error = receive_frames(bus, arrivals, arrived, moment)
-        s.arrived = number
-        if s.error != 0 or number >= MOST_FRAMES or take_frames(arrived, number, expected, axes, times, t) < number:
-            _copy(kept, 0, 1)
+        if not (
+            _receive(s, bus, arrivals, arrived, moment, expected, axes, times, t) and end_read(axes, times, history, t)
+        ):
             return Reached.SYNCED
-        if not end_read(axes, times, history, t):
-            _copy(kept, 0, 1)
-            return Reached.SYNCED
+        s.handled, s.arrived = 0, 0
         _mark(state, moment, Part.READ)
 
+        s.overruns += s.missed
+        s.in_a_row = s.in_a_row + s.missed if s.missed else 0
+        s.gateway_seen, s.gateway_turns = count, turns
         for i in range(3):
             feedback[0].position[i] = axes[i].position
             feedback[0].age[i] = axes[i].syncs - axes[i].sampled
-        behind = cycle.observe(
+        _mark(state, moment, Part.MODE)
+        s.behind = cycle.observe(
             *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.stands != 0),
             *(jumps, room, monitored, record),
         )
-        in_position = s.settles and (monitored[0].inside >= monitored[0].dwell or s.cycle + 1 >= s.timeout)
-        somebody = called(doors)
-        count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch looks at it
-        turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
-        hurried = hearts[HASTE] != s.haste or doors[0, 1] & _GONE != 0
-        if behind or hurried or turns > s.gateway_patience:
-            _copy(kept, 0, 1)
-            return Reached.SYNCED
-        _mark(state, moment, Part.MODE)
+        if s.behind:
+            return Reached.OBSERVED
         _mark(state, moment, Part.MOTION)
 
-        time = s.time
         if s.source == COMMAND:
-            time = s.time + s.period
-            begun, end, arrival = s.course[0], s.course[1], s.course[2]
+            s.time += s.period
             code = cycle.command(
-                *(legs, bounds, knots, pieces, s.in_sliders != 0, tools, law_knots, law_pieces, time, s.target),
-                *(furthest, begun, end, arrival, motion, sliders, backlash, found, record),
+                *(legs, bounds, knots, pieces, s.in_sliders != 0, tools, law_knots, law_pieces, s.time, s.target),
+                *(furthest, s.course[0], s.course[1], s.course[2], motion, sliders, backlash, found, record),
             )
         elif s.source == HOLD:
             code = cycle.hold(legs, bounds, motion, sliders, backlash, found, record)
         else:
             code = 0
             cycle.follow(legs, feedback, jumps, s.held != 0, False, s.step, motion, sliders, backlash, record)
+        in_position = s.settles and (monitored[0].inside >= monitored[0].dwell or s.cycle + 1 >= s.timeout)
+        s.called, s.found = in_position or somebody or code != s.found or s.cycle + 1 >= s.due, code
         late = _now_ns(state, moment) / 1e9 - s.synced > s.period
         if code >> 2 != 0 or late or not set_frames(setpoints, axes, sliders[0]):
-            _copy(kept, 0, 1)
-            return Reached.SYNCED
+            return Reached.SOLVED
         _mark(state, moment, Part.KINEMATICS)
 
-        s.called, s.found = in_position or somebody or code != s.found or s.cycle + 1 >= s.due, code
-        s.arrived, s.time, s.gateway_seen, s.gateway_turns = 0, time, count, turns
         s.sent = send_frames(bus, departures, setpoints, times)
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1
-        s.overruns += s.missed
-        s.in_a_row = s.in_a_row + s.missed if s.missed else 0
         row.cycle, row.deadline_ns, row.lateness_ns, row.overruns = s.cycle, s.deadline_ns, s.lateness_ns, s.overruns
         row.parts_ns[:] = s.parts_ns
         s.parts_ns[Part.DECIDE] = 0

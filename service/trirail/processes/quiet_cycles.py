@@ -1,17 +1,16 @@
-"""Runs the cycles in which nothing happens by the compiled call, as far as it goes."""
+"""Run of the cycles without events by the compiled call, as far as possible."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import MutableSequence, Sequence
+from collections.abc import MutableSequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from trirail_drivers.driver.cyclic import Cyclic, Lender
 
 from trirail.control.control import Calm, Control
-from trirail.motion.paths import Path, constant
+from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run
 from trirail.processes import quiet
 from trirail.processes.clock import Doors, Overruns, Ticker
@@ -24,16 +23,16 @@ from trirail.wire.vocabulary import MODES
 
 _NAMES = quiet.STATE.names or ()
 _MOST = 1 << 40
-"""Cycles that are run at once: more than any batch has."""
+"""Cycles per call: more than any batch has."""
 _NEVER = 1 << 62
 """No cycle."""
-_UNMOVED = constant(1.0)
+_UNMOVED = constant_law(1.0)
 _NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
-"""A law and a path for compiled code where there is no motion."""
+"""Law and path for compiled code without a motion."""
 
 
 class Newest(NamedTuple):
-    """The newest cycle that the compiled call has begun."""
+    """Newest cycle that the compiled call has begun."""
 
     reached: Reached
     deadline_ns: int
@@ -41,13 +40,17 @@ class Newest(NamedTuple):
     missed: int
     """Ticks skipped before it, not counted yet."""
     marked_ns: int
-    """When its newest part ended."""
+    """Time at which its newest part ended."""
     called: bool
-    """Whether somebody has something to say, or something is to be said."""
+    """Whether a neighbour has called, or messages must be sent."""
+    behind: int
+    """Result of trirail.control.cycle.observe, if the cycle has ended behind that."""
+    found: int
+    """Result of trirail.control.cycle.command, if the cycle has ended behind that."""
 
 
 class QuietCycles:
-    """Holds what the compiled call needs. `run` is to be called between two cycles, while nothing is under way."""
+    """Data of the compiled call. `run` may be called between two cycles, while nothing is under way."""
 
     def __init__(
         self,
@@ -61,7 +64,7 @@ class QuietCycles:
         haste: Haste,
     ) -> None:
         self.cycles = 0
-        """So many have been run."""
+        """Number of cycles run."""
         self._control = control
         self._drives = drives
         self._reports = reports
@@ -74,31 +77,29 @@ class QuietCycles:
         self._doors = doors
         self._lent: Cyclic | None = None
         self._orders = 0
-        """How many orders the drives had been given when they lent it."""
+        """Number of orders given to the drives before they lent it."""
         self._decided = False
         """Whether anything has been decided since the newest cycle."""
         self._calm: Calm | None = None
         self._tables: tuple[Any, ...] = ()
         self._motion: tuple[Any, ...] = ()
-        """What the compiled call is given: the same arrays until others are lent, or the robot moves otherwise."""
+        """Arguments of the compiled call: the same arrays until others are lent, or the motion changes."""
         self._nothing = np.zeros(1)
-        self._rooms: list[NDArray[Any]] = []
-        self._kept = np.zeros((0, 3), np.int64)
         measured, setpoints = control.measured, control.setpoints
         self._made = measured.record.view(np.uint8)
         state = self._state[0]
         self.parts_ns: MutableSequence[int] = state["parts_ns"]
-        """How long the parts of the newest cycle took, in the room where compiled code writes it."""
+        """Durations of the newest cycle's parts, in the memory that compiled code writes."""
         state["period"], state["period_ns"] = control.period, round(control.period * 1e9)
         state["injected_ns"] = -1
         state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
     def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> Newest | None:
-        """Run cycles until something happens; return how far the newest has come, None where none was begun.
+        """Run cycles until an event; return the newest, or None if none was begun.
 
-        `listens`: who calls while the first tick is waited for is heard before it. `once`: one cycle, for something
-        waits to be said behind it. At the end of a batch the next call goes on, if nothing has been said meanwhile.
+        `listens`: a call during the wait for the first tick is served before it. `once`: one cycle, since messages
+        wait to be sent behind it. At the end of a batch the next call continues, if no message has come meanwhile.
         """
         control, state = self._control, self._state[0]
         if not ((once or self._reports.idle) and self._gateway.calm and self._goes_on()):
@@ -118,28 +119,28 @@ class QuietCycles:
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
-        decides = bool(left["called"]) and reached not in (Reached.SYNCED, Reached.CALLED)
+        decides = bool(left["called"]) and reached in (Reached.WRITTEN, Reached.DONE)
         called = decides or reached is Reached.CALLED
         self._decided = self._decided or called or once
         if reached not in (Reached.DONE, Reached.CALLED):
-            synced = left["synced"] if reached is Reached.SYNCED else None
-            self.leave(left["arrived"], synced=synced, error=max(left["error"], 0))
+            synced = left["synced"] if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
+            self.leave(left["handled"], left["arrived"], synced=synced, error=max(left["error"], 0))
         control.go_on(left["cycle"], left["time"], left["found"] if decides else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(left["sent"])
         tick = left["deadline_ns"], left["lateness_ns"], left["missed"]
-        return Newest(reached, *tick, left["marked_ns"], called)
+        return Newest(reached, *tick, left["marked_ns"], called, left["behind"], left["found"])
 
-    def leave(self, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
-        """Give back to the drives what they have lent, as of trirail_drivers.driver.cyclic.Lender.take_back."""
+    def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
+        """Return the lent tables to the drives, as in trirail_drivers.driver.cyclic.Lender.take_back."""
         if self._lent is not None:
-            self._control.measured.feedback = self._drives.take_back(arrived, synced=synced, error=error)
+            self._control.measured.feedback = self._drives.take_back(handled, arrived, synced=synced, error=error)
             self._lent = None
 
     def _goes_on(self) -> bool:
-        """Whether nothing is to be done but what tables hold: those that are lent, if nothing was decided since.
+        """Return whether tables hold all the work: those that are lent, if nothing was decided since.
 
-        They stay lent as long as nothing is decided but how the robot moves.
+        They stay lent as long as decisions only concern how the robot moves.
         """
         if self._lent is not None and not self._decided:
             return True
@@ -158,7 +159,7 @@ class QuietCycles:
         return self._lent is not None
 
     def add(self, part: Part) -> None:
-        """Count what has passed since the newest cycle into a part of it; none where a simulated time is ahead."""
+        """Add the time since the newest cycle to a part of it; none if a simulated time is ahead."""
         passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
         self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, LONGEST)
 
@@ -173,20 +174,13 @@ class QuietCycles:
         runs = self._control.schedule.runs
         state["time"] = runs[0].time if runs else 0.0
         if run is not None:
-            state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.course
+            state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.goal_span
 
     def _gather(self, lent: Cyclic) -> tuple[Any, ...]:
-        """Return what the compiled call is given as long as the drives' tables are lent."""
+        """Return the compiled call's arguments that stay as long as the drives' tables are lent."""
         measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
-        if not self._rooms:
-            kept = (
-                *(measured.numbers, measured.written, measured.backlash, measured.jumping),
-                *(measured.settling.monitored, measured.record, schedule.motion, setpoints.sliders),
-                *(setpoints.found, lent.axes, lent.times, lent.history, self._nothing),
-            )
-            self._kept, self._rooms = _copies(kept)
         return (
-            *(self._state, self._kept, self._moment, lent.bus),
+            *(self._state, self._moment, lent.bus),
             *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
             *(lent.expected, lent.axes, lent.times, lent.history),
@@ -197,15 +191,7 @@ class QuietCycles:
         )
 
     def _follow(self, run: Run | None) -> tuple[Any, ...]:
-        """Return what the compiled call is given of a motion."""
+        """Return the compiled call's arguments for a motion."""
         path, law = (run.path, run.law) if run is not None else (_NOWHERE, _UNMOVED)
         furthest = run.furthest if run is not None else self._nothing
-        self._kept[-1, 0] = furthest.ctypes.data
         return path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest
-
-
-def _copies(arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[np.int64], list[NDArray[Any]]]:
-    """Return what the compiled call keeps of arrays, (n, 3), and the rooms where it does, which are to live as long."""
-    rooms = [np.empty_like(array) for array in arrays]
-    rows = [(array.ctypes.data, room.ctypes.data, array.nbytes) for array, room in zip(arrays, rooms, strict=True)]
-    return np.array(rows, np.int64), rooms

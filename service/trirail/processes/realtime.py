@@ -1,6 +1,6 @@
 """The loop's rights: real-time scheduling, locked memory, its own processor, no garbage collector in its way.
 
-And for every process: memory is given back that starting has touched and running does not need.
+And for every process: release of memory that only its start needs.
 """
 
 from __future__ import annotations
@@ -19,21 +19,37 @@ from trirail.errors import ServiceError
 from trirail.processes.operating_system import title
 
 _MADV_DONTNEED = 4
+_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
 def trim() -> None:
-    """Collect garbage, and return to the system what is free."""
+    """Collect garbage, and return free memory to the system."""
     gc.collect()
+    return_free_memory()
+
+
+def return_free_memory() -> None:
+    """Return malloc's free memory to the system."""
     _libc.malloc_trim(0)
 
 
-def give_back() -> None:
-    """Trim, and unmap what of libraries their files have as well.
+def bound_heap() -> None:
+    """Keep bursts of large blocks from fragmenting the heap; to be called before the first thread.
 
-    Loading a library touches most of it, LLVM's 68 MB for instance; what is needed of it later comes from the page
+    malloc raises its threshold for mapping a block to the largest that was freed, and has an arena for each of
+    Zenoh's threads, each of which keeps its greatest size: mallopt(3).
+    """
+    _libc.mallopt(_M_MMAP_THRESHOLD, 131_072)
+    _libc.mallopt(_M_ARENA_MAX, 2)
+
+
+def give_back() -> None:
+    """Trim, and unmap the parts of libraries that their files have as well.
+
+    Loading a library touches most of it, LLVM's 68 MB for instance; the parts needed later come from the page
     cache again.
     """
     trim()
@@ -57,9 +73,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 
 PLANNER_BELOW = 10
-"""By so much is the planner's priority lower than the loop's."""
+"""Difference by which the planner's priority is lower than the loop's."""
 DRIVES_BELOW = 5
-"""The same of simulated drives: a plan takes longer than a drive has for an answer."""
+"""The same for simulated drives: a plan takes longer than a drive has for an answer."""
 
 
 def _call(name: str, *arguments: int) -> None:
@@ -74,7 +90,7 @@ def die_with_parent(signal_number: int) -> None:
 
 
 def name_process(name: str) -> None:
-    """Give this process a name of its own for `ps` and its like: a forked one has its parent's."""
+    """Give this process a name of its own for `ps` and the like: a forked one has its parent's."""
     setproctitle(title(name))
 
 
@@ -83,7 +99,7 @@ def _fifo(loop: LoopTable) -> None:
 
 
 def _lock_memory(_: LoopTable) -> None:
-    """Lock what is touched, now or later: mlockall(2). All that is mapped would be five times as much."""
+    """Lock pages touched now or later: mlockall(2). All mapped pages would be five times as much."""
     _call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
 
 
@@ -114,7 +130,7 @@ _MEASURES: tuple[tuple[str, Callable[[LoopTable], None], str], ...] = (
 
 
 def stay_beside(loop: LoopTable, below: int) -> tuple[str, ...]:
-    """Keep off the loop's processor where there is another, and so much below its priority; return what failed."""
+    """Keep off the loop's processor if there is another, and `below` its priority; return failures."""
     trim()
     gc.freeze()
     if loop.realtime == "off":
@@ -133,7 +149,7 @@ def stay_beside(loop: LoopTable, below: int) -> tuple[str, ...]:
 def acquire(loop: LoopTable) -> tuple[str, ...]:
     """Take every measure that the configuration asks for; return those that failed, each with its remedy.
 
-    Raises ServiceError with `realtime = "enforce"` where one of them is missing.
+    Raises ServiceError with `realtime = "enforce"` if one of them is missing.
     """
     _call("prctl", _PR_SET_TIMERSLACK, 1)  # 50 µs by default for tasks that are not real-time
     trim()

@@ -1,4 +1,4 @@
-"""The recorder's process: takes what the loop sends and gives it to the recorder and to the black box."""
+"""The recorder's process: passes the loop's packets to the recorder and to the black box."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from trirail.processes.realtime import give_back
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.session_index import SessionIndex
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.links import Closed, PacketLink
-from trirail.wire.messages import Level
+from trirail.wire.messages import Level, Notice
 from trirail.wire.packets import (
+    Announcement,
     Answer,
     ControlInput,
     Happened,
     Kind,
     RecorderSaid,
-    Remark,
     Status,
     Unrecorded,
     Welcome,
@@ -41,17 +41,17 @@ from trirail.wire.packets import (
 from trirail.wire.records import last_cycle
 
 GATHER = 0.14
-"""How long to let packets gather before they are taken: to wake for each costs more than what is in it [s].
+"""Time for packets to gather before they are read: to wake for each costs more than its content [s].
 
-A killed recorder loses what it has not written: that much, and the batch that the loop holds. It is less than 0.2 s.
+A killed recorder loses the packets not written: those of that time, and the loop's batch; less than 0.2 s.
 """
 
 NOT_FOR_OTHERS = 0o027
-"""Least umask of what is recorded: files are written by their owner, read by the group, and by nobody else."""
+"""Least umask of recordings: files are written by their owner, read by the group, and by nobody else."""
 
 
 class Intake:
-    """Takes the loop's packets to the recorder and the black box, and tells the loop what it should know."""
+    """Intake of the loop's packets for the recorder and the black box, with notices to the loop."""
 
     def __init__(self, config: Config, record: str | None, link: PacketLink, ready: Callable[[object], None]) -> None:
         self._link = link
@@ -61,17 +61,17 @@ class Intake:
         self._loop_death = LoopDeath(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
-        index = None if path else SessionIndex(directory)  # where somebody wants one file he finds it by himself
-        self.recorder = recorder = Recorder(config, directory, path=path, index=index, warn=self._warn)
+        sidecars = path is None  # the user has named a single file, and knows where it is
+        self.recorder = recorder = Recorder(config, directory, path=path, sidecars=sidecars, warn=self._warn)
         folder = recorder.path.parent
 
         def box(name: str, reason: str) -> Recorder:
-            return Recorder(config, folder, name=name, reason=reason, index=index, live=False)
+            return Recorder(config, folder, name=name, reason=reason, sidecars=sidecars, live=False)
 
         self._box = BlackBox(config.loop.rate_hz, box, self._warn)
 
     def on_packet(self, packet: bytes) -> None:
-        """Take a packet."""
+        """Process a packet."""
         self._loop_death.heard()
         content = packet[1:]
         if packet[0] == Kind.RECORDS:
@@ -84,14 +84,14 @@ class Intake:
             self._hear(decode_answer(content))
 
     def save(self) -> None:
-        """Write what has been taken; tell everyone where that fails, and once it does no more."""
+        """Write the packets processed; report to the loop when that begins to fail, and when it works again."""
         self.recorder.save()
         what, why = self.recorder.unrecorded  # its reason changes with every byte of the disk
         if what != self._told_unrecorded and self._send(Unrecorded(what and f"{what}: {why}")):
             self._told_unrecorded = what
 
     def loop_gone(self) -> None:
-        """The loop has gone: where it has died, keep what it can no longer say."""
+        """Record the death of the loop in its place, if it has died."""
         for event in self._loop_death.events(self._cycle):
             self._hear(Happened(event))
 
@@ -117,21 +117,22 @@ class Intake:
             case Welcome():
                 recorder.bus_load(said.bus_load)
                 box.stands("bus_load", said.bus_load)
-                self._remark("info", f"recording to {recorder.path}")
+                path = str(recorder.path)
+                self._announce("info", coded(f"recording to {path}", EventCode.RECORDING, file=path))
                 self._ready({"recording": str(recorder.path), "live": recorder.live_url})
 
-    def _warn(self, words: str) -> None:
-        """Say it in the service's log, and to everyone."""
+    def _warn(self, text: EventText) -> None:
+        """Warn in the service's log, and announce it to everyone."""
         with contextlib.suppress(OSError):  # the log may be on the disk that takes no more
-            print(f"trirail: recorder: {words}", file=sys.stderr, flush=True)  # noqa: T201 - the log
-        self._remark("warning", words)
+            print(f"trirail: recorder: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the log
+        self._announce("warning", text)
 
-    def _remark(self, level: Level, words: str) -> None:
-        """Have the loop tell everyone."""
-        self._send(Remark(level, words))
+    def _announce(self, level: Level, text: EventText) -> None:
+        """Have the loop announce a notice."""
+        self._send(Announcement(Notice("service", level, text.text, **text.fields)))
 
     def _send(self, said: RecorderSaid) -> bool:
-        """Send it to the loop; False where that takes no more now, or has gone and nobody is left to be told."""
+        """Send a packet to the loop; return False if that takes no more now, or has gone."""
         with contextlib.suppress(Closed):
             return self._link.send(message(said))
         return False
@@ -145,7 +146,7 @@ def main(
     ready: Callable[[object], None],
     measured: Callable[[msgspec.Struct], None],
 ) -> int:
-    """Record until the loop has gone or the process is told to end; tell `measured` of gaps, if there are metrics."""
+    """Record until the loop has gone or SIGTERM; send `measured` the gaps, if there are metrics."""
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
     give_back()

@@ -1,8 +1,8 @@
-"""Answers to queries, sent by threads of their own, and what is refused, which everyone is told, but not too often.
+"""Answers to queries, sent by threads of their own, and refusals, which are announced to everyone at a limited rate.
 
-Whoever does not take an answer holds up nobody else. A stop goes over Zenoh and to the door: it is carried out once,
-and each copy is answered alike. The slower copy may come when the robot moves again: it must not stop goals that were
-sent after the first was confirmed.
+A client that takes no answer holds up no other. A stop is sent over Zenoh and to the door: it is carried out once,
+and each copy is answered alike. The slower copy may arrive when the robot moves again: it must not stop goals that
+were sent after the first was confirmed.
 """
 
 from __future__ import annotations
@@ -18,22 +18,25 @@ import zenoh
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.incoming import Incoming
+from trirail.processes.memory_budget import Budget
 from trirail.wire import boundary, zenoh_session
+from trirail.wire.event_codes import EventCode
 from trirail.wire.links import PacketLink
-from trirail.wire.messages import ErrorReply
-from trirail.wire.packets import RefusedRequest, message
+from trirail.wire.messages import ErrorReply, Notice
+from trirail.wire.packets import Announcement, message
+from trirail.wire.sizes import MAX_REFUSED
 from trirail.wire.text import is_name, quoted
 
 REMEMBERED = 60.0
-"""How long an answer is kept for a copy that is to come; nobody waits longer for one [s]."""
+"""Time for which an answer is kept for a later copy; no client waits longer for one [s]."""
 COPIES_KEPT = 4096
-"""So many are remembered at once; beyond that the oldest are forgotten."""
+"""Most stops remembered at a time; beyond that the oldest are forgotten."""
 
 _Id = tuple[str, str, bytes]
 
 
 class _Stop:
-    """What is known of one."""
+    """State of one stop."""
 
     def __init__(self, came: float) -> None:
         self.came = came
@@ -42,14 +45,14 @@ class _Stop:
 
 
 class Copies:
-    """Keeps which stops have come, by key, id and content. One without an id has no copies. `clock` gives seconds."""
+    """Stops that have arrived, by key, id and content. One without an id has no copies. `clock` gives seconds."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._stops: dict[_Id, _Stop] = {}  # in the order in which they came
 
     def first(self, incoming: Incoming) -> bool:
-        """Whether none of it has come before; a later one waits for the answer of the first, or has it `known`."""
+        """Return whether it is the first copy; a later one waits for the answer of the first, or has it `known`."""
         if not incoming.id:
             return True
         if (stop := self._stops.get(_id(incoming))) is not None:
@@ -61,12 +64,12 @@ class Copies:
         return True
 
     def known(self, incoming: Incoming) -> msgspec.Struct | None:
-        """Return what the first was answered; None where it was not yet."""
+        """Return the answer to the first copy; None if there is none yet."""
         stop = self._stops.get(_id(incoming))
         return stop.answer if stop is not None else None
 
     def answered(self, incoming: Incoming, content: msgspec.Struct) -> list[Incoming]:
-        """Note an answer, and return who else has waited for it. What was not carried out is not remembered."""
+        """Record an answer, and return the other copies that wait for it. A stop not carried out is not remembered."""
         stop = self._stops.get(_id(incoming))
         if stop is None or stop.answer is not None:
             return []
@@ -77,7 +80,7 @@ class Copies:
         return waiting
 
     def _forget(self) -> None:
-        """Forget what nobody asks for any more."""
+        """Forget stops whose copies have expired."""
         while self._stops:
             name, oldest = next(iter(self._stops.items()))
             if len(self._stops) < COPIES_KEPT and self._clock() - oldest.came < REMEMBERED:
@@ -90,19 +93,19 @@ def _id(stop: Incoming) -> _Id:
 
 
 THREADS = 32
-"""So many askers that take no answer hold up nobody else."""
+"""Number of askers that may take no answer and hold up no other."""
 CLOSE_WITHIN = 2.0
-"""How long the last answers may take [s]."""
+"""Longest time for the last answers [s]."""
 
 
 class Replies:
-    """Sends answers, to each asker in their order. One is never dropped before the transport gives its asker up."""
+    """Sender of answers, to each asker in order. None is dropped before the transport gives its asker up."""
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
         self.copies = Copies()
         self._changed = threading.Condition()
-        # Not bounded: a query that is let go says so to its asker, and that may wait as long as an answer.
+        # Not bounded: dropping a query notifies its asker, which may wait as long as an answer.
         self._of: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
         self._idle: deque[str] = deque()
         """Askers with answers of which none is being sent, in the order of their turns."""
@@ -113,7 +116,7 @@ class Replies:
 
     @property
     def waiting(self) -> int:
-        """How many answers wait for their turn."""
+        """Number of answers that wait for their turn."""
         with self._changed:
             return sum(map(len, self._of.values()))
 
@@ -123,8 +126,9 @@ class Replies:
             incoming.at_door(content)
         if incoming.query is None:
             return
-        # Of a command the user decides and not its name: who asks for one thing and does not listen is the same.
-        asker = "/".join(incoming.key.split("/")[:4])
+        # The asker of a command is its user, not its name: a user that reads no answer to one reads none to others.
+        # Queries for a role, of whatever user, share one place.
+        asker = f"{incoming.kind}/{incoming.user}"
         with self._changed:
             if asker not in self._of:
                 self._of[asker] = deque()
@@ -132,17 +136,25 @@ class Replies:
                 self._changed.notify()
             self._of[asker].append((incoming, content))
 
+    def send_now(self, incoming: Incoming, content: msgspec.Struct) -> None:
+        """Answer a message alone, in this thread, which waits for as long as the asker takes no answer."""
+        if incoming.at_door is not None:
+            incoming.at_door(content)
+        if incoming.query is not None:
+            with contextlib.suppress(zenoh.ZError):  # the asker has gone
+                self._answer(incoming, incoming.query, content)
+
     def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Answer what was carried out, or refused, and all that were read as one with it, and the copies of each."""
+        """Answer a message carried out or refused, all that were read as one with it, and the copies of each."""
         for each in (incoming, *incoming.alike):
             self.send(each, content)
             for copy in self.copies.answered(each, content):
                 self.send(copy, content)
 
     def fresh(self, incoming: Incoming) -> Incoming | None:
-        """Return a stop, and those read as one with it, without the copies of others: these get the answer of those.
+        """Return a stop, and those read as one with it, without copies: these get the answer of the first.
 
-        Its number is the newest. None where there are but copies.
+        Its number is the newest. None if there are only copies.
         """
         fresh = []
         for each in (incoming, *incoming.alike):
@@ -155,7 +167,7 @@ class Replies:
         return fresh[0]._replace(number=fresh[-1].number, alike=tuple(fresh[1:]))
 
     def close(self) -> None:
-        """Send what waits, for a while at most."""
+        """Send the waiting answers, for a limited time."""
         deadline = time.monotonic() + CLOSE_WITHIN
         with self._changed:
             self._closed = True
@@ -171,10 +183,8 @@ class Replies:
                     return
                 asker = self._idle.popleft()
                 incoming, content = self._of[asker].popleft()
-            if incoming.query is not None:
-                with contextlib.suppress(zenoh.ZError):  # the asker has gone
-                    self._answer(incoming, incoming.query, content)
-            del incoming, content  # for a query ends when nobody has it any more
+            self.send_now(incoming._replace(at_door=None), content)
+            del incoming, content  # a query ends with its last reference
             with self._changed:
                 if self._of[asker]:
                     self._idle.append(asker)
@@ -192,51 +202,60 @@ class Replies:
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:
-                of_robot = incoming.kind in ("info", "poses")  # what was asked may have wildcards
+                of_robot = incoming.kind in ("info", "poses")  # the key of the query may have wildcards
                 key = zenoh_session.key(self._robot, incoming.kind) if of_robot else incoming.key
                 query.reply(key, payload, encoding=encoding)
 
 
-TOO_MUCH = "too many messages at once: send fewer"
 REFUSALS_PER_SECOND = 10
-"""What is refused of one user that is told to everyone; the rest only gets its error reply."""
+"""Refusals of one user a second that are announced to everyone; the rest only get their error reply."""
 REFUSALS_OF_ALL = 50
-"""Likewise, of all users."""
+"""The same for all users."""
 
 
 class Refusals:
-    """Answers what cannot be taken, and has the loop tell everyone of it: a put has no answer."""
+    """Answers to rejected messages, which the loop also announces to everyone: a put has no answer."""
 
     def __init__(self, link: PacketLink, replies: Replies) -> None:
         self._link = link
         self._replies = replies
         self._told: Counter[str] = Counter()
         self._told_since = 0.0
-        self._overruns: deque[str] = deque(maxlen=REFUSALS_OF_ALL)
+        self._overruns: deque[tuple[str, ErrorReply]] = deque(maxlen=REFUSALS_OF_ALL)
+        self._budget = Budget(MAX_REFUSED, MAX_REFUSED)
 
-    def too_much(self, incoming: Incoming) -> None:
-        """Answer what there is no room for; safe from any thread, told of by `tell_of_overruns`."""
-        self._overruns.append(incoming.user)
-        self._replies.send(incoming, ErrorReply(RefusalCode.BUSY, TOO_MUCH))
+    def not_kept(self, incoming: Incoming, error: ErrorReply) -> None:
+        """Answer a message that the inbox does not keep; safe from any thread, announced by `tell_of_overruns`.
+
+        If such answers hold too much memory, the sender's own thread of Zenoh sends this one: then nothing more is
+        received of a sender that takes no answer, until the transport gives it up.
+        """
+        self._overruns.append((incoming.user, error))
+        hold = self._budget.hold(incoming.user, incoming.held)
+        if hold is None:
+            self._replies.send_now(incoming, error)
+        else:
+            self._replies.send(incoming._replace(hold=hold), error)
 
     def tell_of_overruns(self) -> None:
-        """Tell everyone whose messages there was no room for."""
+        """Announce whose messages were not kept."""
         while self._overruns:
-            user = self._overruns.popleft()
-            self.warn_everyone(TOO_MUCH, user if is_name(user) else "")
+            user, why = self._overruns.popleft()
+            self.warn_everyone(why.message, user if is_name(user) else "", why.code)
 
     def refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
-        """Answer what cannot be taken, and tell everyone."""
+        """Answer a rejected message, and announce it to everyone."""
         text = quoted(str(refusal))
         self._replies.answer(incoming, ErrorReply(refusal.code, text))
-        self.warn_everyone(text, incoming.user if is_name(incoming.user) else "")
+        self.warn_everyone(text, incoming.user if is_name(incoming.user) else "", refusal.code)
 
-    def warn_everyone(self, text: str, user: str = "") -> None:
-        """Have the loop tell everyone, but not too often."""
+    def warn_everyone(self, text: str, user: str = "", code: RefusalCode = RefusalCode.INTERNAL) -> None:
+        """Have the loop announce a refusal, at a limited rate."""
         now = time.monotonic()
         if now - self._told_since >= 1.0:
             self._told.clear()
             self._told_since = now
         if self._told[user] < REFUSALS_PER_SECOND and self._told.total() < REFUSALS_OF_ALL:
             self._told[user] += 1
-            self._link.send(message(RefusedRequest(user, text)))
+            notice = Notice("refused", "warning", text, user=user, code=code, event_code=EventCode.REFUSED)
+            self._link.send(message(Announcement(notice)))

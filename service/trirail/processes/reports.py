@@ -1,4 +1,4 @@
-"""What the loop says to the processes beside it, and what the recorder has to say."""
+"""Messages of the loop to the processes beside it, and messages of the recorder."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from trirail_drivers.bus.capture import Capture
-from trirail_drivers.interface import DriveGroup
+from trirail_drivers.interface import DriveGroup, UnreadyDrives
 
 from trirail.config import Config
 from trirail.control.control import Control
 from trirail.processes.clock import Tick
+from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.links import Port
 from trirail.wire.messages import Notice
 from trirail.wire.packets import (
+    Announcement,
     ControlInput,
     GivenInput,
     Kind,
-    Remark,
     Status,
     Welcome,
     decode_recorder,
@@ -34,17 +35,18 @@ from trirail.wire.vocabulary import MODES
 
 BATCHES_PER_SECOND = 50
 ANSWERS_A_CYCLE = 8
+PROGRESS_EVERY = 0.1
+"""Interval between two progress reports of drives that are being configured [s]."""
 INPUTS_KEPT = 8
-"""So much of what the control was given may wait for the next batch of records; the recorder has no use for it before.
-"""
+"""Most control inputs that wait for the next batch of records; the recorder has no use for them before it."""
 EVENTS_KEPT = 1000
-"""Events kept for a gateway that comes anew: the one before may have died with some that it had not published."""
+"""Events kept for a new gateway: the previous one may have died with some that it had not published."""
 
 
 class Reports:
-    """Passes on what each cycle has made: records in batches, events, answers, and what records do not say.
+    """Reports of each cycle: records in batches, events, answers, and the status that records do not have.
 
-    Nothing in it waits: what the gateway is too slow for is kept for it, what the recorder is too slow for it lacks.
+    Nothing in it waits: packets for a slow gateway are kept, those for a slow recorder are lost.
     """
 
     def __init__(
@@ -63,12 +65,13 @@ class Reports:
         self._recorder = recorder
         self._capture = capture
         self._period = config.period
-        self._welcome = message(Welcome(lacking, drives.bus_load, drives.missing_protections))
+        self._welcome = Welcome(lacking, drives.bus_load, drives.missing_protections)
         self._status = Status(None, 1.0, None)
         self._bitrate = config.can.bitrate
         self._bus_load = 0.0
         self._bits = drives.traffic
-        self._weighed_at = 0
+        self._weighed_at = self._progress_at = 0
+        self._unready: UnreadyDrives = (None, None, None)
         self._events = 0
         self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._answers: deque[bytes] = deque()
@@ -76,7 +79,7 @@ class Reports:
         self._inputs = 0
         self._given: list[ControlInput] = []
         self._postponed = 0, 0
-        """How many events wait that belong to an earlier cycle than what comes behind them, and to which."""
+        """Number of waiting events that belong to an earlier cycle than those behind them, and that cycle."""
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._made = control.measured.record.view(np.uint8).data
         """The cycle's record, as the control makes it."""
@@ -88,9 +91,9 @@ class Reports:
         self._unrecorded = ""
 
     def note(self, now_ns: int, given: GivenInput, *, urgent: bool = False, waiting: bool = False) -> None:
-        """Keep what the control is given before the next cycle or, `urgent`, in the one under way: for the recorder.
+        """Keep an input of the control for the recorder: one of the next cycle or, if `urgent`, of the one under way.
 
-        `waiting` as of a ControlInput.
+        `waiting` as in ControlInput.
         """
         self._inputs += 1
         self._given.append(ControlInput(self._inputs, self._control.modes.cycle, now_ns, given, urgent, waiting))
@@ -106,23 +109,23 @@ class Reports:
 
     @property
     def full(self) -> bool:
-        """Whether the batch is, and is to be flushed."""
+        """Whether the batch is full, and must be flushed."""
         return self.batched == self._batch_size
 
     @property
     def idle(self) -> bool:
-        """Whether nothing waits to be passed on but what goes with a batch."""
+        """Whether nothing waits to be sent except with a batch."""
         return not (self._answers or self._told < self._events)
 
     @property
     def batch(self) -> NDArray[np.uint8]:
-        """Room for the records of a batch, (n, SIZE) bytes; `batched` of them are there."""
+        """Room for the records of a batch, (n, SIZE) bytes, of which `batched` are there."""
         return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
     def pass_on(self) -> None:
-        """Pass on what has happened and what is answered, if anything, and what the control was given before that.
+        """Send events and answers, if any, and the control's inputs before them.
 
-        An event belongs to the first cycle that it shows in: that under way or, behind its end, the next.
+        An event belongs to the first cycle that shows it: that under way or, behind its end, the next.
         """
         if self._control.ledger.answers or self._control.ledger.notices or len(self._given) > INPUTS_KEPT:
             self._publish()
@@ -130,11 +133,11 @@ class Reports:
             self._send_answers()
 
     def postpone(self) -> None:
-        """Leave what has happened to be passed on behind the next cycle: it shows in that already."""
+        """Leave events to be sent behind the next cycle: its record shows them already."""
         self._postponed = len(self._control.ledger.notices), self._control.modes.cycle
 
     def flush(self) -> None:
-        """Send the batch, take new peers, and what was kept for them."""
+        """Send the batch, accept new peers, and send the events kept for them."""
         self._send_given()
         if self.batched:
             batch = self._batch[: 1 + self.batched * SIZE]
@@ -145,20 +148,36 @@ class Reports:
             for frames in self._capture.drain():
                 self._recorder.send(bytes((Kind.FRAMES,)) + frames)
         self._measure_bus_load()
+        if self._control.measured.feedback.unready != self._unready:
+            self._report_progress()
         self.accept_peers()
         self._send_events()
 
     def accept_peers(self) -> None:
-        """Take new peers."""
+        """Accept new peers."""
         for port in (self._gateway, self._recorder):
             if port.accept():
-                port.send(self._welcome)
+                port.send(message(self._welcome))
                 port.send(message(self._status))
                 if port is self._gateway:
                     self._told = 0
 
+    def report_protections(self) -> None:
+        """Report to the gateway which protections drives lack, if drives set up meanwhile lack others."""
+        missing = self._drives.missing_protections
+        if missing != self._welcome.missing_protections:
+            self._welcome = msgspec.structs.replace(self._welcome, missing_protections=missing)
+            self._gateway.send(message(self._welcome))
+
+    def _report_progress(self) -> None:
+        """Publish the progress of the drives' configuration, a few times a second."""
+        cycles = self._control.cycles
+        if (cycles - self._progress_at) * self._period >= PROGRESS_EVERY:
+            self._progress_at, self._unready = cycles, self._control.measured.feedback.unready
+            self._publish_status()
+
     def _measure_bus_load(self) -> None:
-        """Once a second, work out how much of the bus is in use, and tell it."""
+        """Compute and report the share of the bus in use, once a second."""
         cycles = self._control.cycles - self._weighed_at
         if cycles * self._period >= 1.0:
             bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
@@ -167,12 +186,13 @@ class Reports:
             self._publish_status()
 
     def listen(self) -> None:
-        """Tell everyone what the recorder has to say, and if it has gone."""
+        """Announce the recorder's messages, and its loss."""
         packet = self._recorder.receive()
         if self._recorder.take_lost() and self._recorded:
             self._recorded = False
             self._unrecorded = "the recorder has gone: nothing is recorded until it is back"
-            self._control.ledger.notices.append(Notice("service", "warning", self._unrecorded))
+            lost = coded(self._unrecorded, EventCode.RECORDER_LOST)
+            self._control.ledger.notices.append(Notice("service", "warning", lost.text, **lost.fields))
             self._publish_status()
         if packet is None:
             return
@@ -181,18 +201,18 @@ class Reports:
         try:
             said = decode_recorder(memoryview(packet)[1:])
         except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
-            self._control.ledger.notices.append(
-                Notice("service", "warning", f"the recorder said something unreadable: {error}")
-            )
+            words = f"the recorder said something unreadable: {error}"
+            text = coded(words, EventCode.RECORDER_UNREADABLE, error=str(error))
+            self._control.ledger.notices.append(Notice("service", "warning", text.text, **text.fields))
             return
-        if isinstance(said, Remark):
-            self._control.ledger.notices.append(Notice("service", said.level, said.message))
+        if isinstance(said, Announcement):
+            self._control.ledger.notices.append(said.notice)
         else:
             self._unrecorded = quoted(said.why) if said.why else ""
         self._publish_status()
 
     def _publish(self) -> None:
-        """Answer requests, number what has happened, and pass on what the control was given."""
+        """Answer requests, number the events, and send the control's inputs."""
         control, ledger = self._control, self._control.ledger
         self._send_given()
         (postponed, earlier), self._postponed = self._postponed, (0, 0)
@@ -209,25 +229,25 @@ class Reports:
         ledger.answers.clear()
 
     def _send_given(self) -> None:
-        """Tell the recorder what the control was given."""
+        """Send the recorder the control's inputs."""
         for given in self._given:
             self._recorder.send(message(given))
         self._given.clear()
 
     def _publish_status(self) -> None:
-        """Tell what records do not say, where that has changed."""
+        """Send the status that records do not have, if it has changed."""
         control, goal = self._control, self._control.ledger.goal
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
         fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
         said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
-        status = Status(*said, self._unrecorded)
+        status = Status(*said, self._unrecorded, tuple(map(quoted, control.measured.unready)))
         if status != self._status:
             self._status, packet = status, message(status)
             self._gateway.send(packet)
             self._recorder.send(packet)
 
     def _send_answers(self) -> None:
-        """Answer some requests; what the gateway is too slow for waits, what it has gone without is nobody's."""
+        """Send some answers; those for a slow gateway wait, those for a lost one are dropped."""
         if not self._gateway.connected:
             self._answers.clear()
         for _ in range(min(len(self._answers), ANSWERS_A_CYCLE)):
@@ -236,7 +256,7 @@ class Reports:
             self._answers.popleft()
 
     def _send_events(self) -> None:
-        """Tell the gateway of every event that is kept and that it does not know."""
+        """Send the gateway every kept event that it does not know."""
         self._told = max(self._told, self._events - len(self._kept))
         while self._told < self._events and self._gateway.send(self._kept[self._told - self._events]):
             self._told += 1

@@ -1,6 +1,6 @@
-"""What clients ask of the loop, goals by turns and commands at once, each answered exactly once; and what they tell it.
+"""Requests of clients to the loop: goals in turn, commands immediately, each answered exactly once; alignment reports.
 
-A command that stops the robot is carried out even where it cannot be read.
+A command that stops the robot is carried out even if it cannot be read.
 """
 
 from __future__ import annotations
@@ -23,30 +23,29 @@ from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies
 from trirail.processes.session_guard import Guard
-from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal
 from trirail.wire.links import PacketLink
-from trirail.wire.looks import WELL, AlignmentLook, in_words
-from trirail.wire.messages import CommandReply, ErrorReply
-from trirail.wire.packets import CommandRequest, GoalRequest, Looked, message
+from trirail.wire.looks import WELL, AlignmentLook, in_words, look_text
+from trirail.wire.messages import CommandReply, ErrorReply, Level, Notice
+from trirail.wire.packets import CommandRequest, GoalRequest, message
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
 
 AHEAD = 3
-"""Goals of one user that the loop has at once: one that is planned, the next one, and one more, which takes the next
-one's place where both tell of the same target. The others wait here: a command overtakes them, and what waits when the
-robot is told to stop does not begin any more."""
+"""Goals of one user that the loop has at a time: one being planned, the next one, and one more, which replaces the
+next one if both have the same target. The others wait here: a command overtakes them, and goals that wait when the
+robot is stopped do not begin any more."""
 AHEAD_OF_ALL = 16
-"""Goals that the loop has at once, of all users: what it takes in four cycles."""
+"""Goals of all users that the loop has at a time: as many as it takes in four cycles."""
 UNDER_WAY = 8
-"""Commands of one user that the loop has at once; beyond that they are refused, but for those that stop the robot."""
+"""Commands of one user that the loop has at a time; more are refused, except those that stop the robot."""
 UNDER_WAY_OF_ALL = 64
-"""Likewise, of all users."""
+"""The same for all users."""
 REPLY_WITHIN = 15.0
-"""A command that the loop has not carried out by then is answered with an error [s]."""
+"""Longest time for the loop to carry a command out; after it an error is answered [s]."""
 LOOKS, LOOKS_PER_SECOND = 50, 20.0
-"""Looks of one user that pass at once, and then a second: three times what an alignment without a camera has."""
+"""Looks of one user that pass in a burst, and then per second: three times those of an alignment without a camera."""
 
 
 class _Waiting(NamedTuple):
@@ -55,7 +54,7 @@ class _Waiting(NamedTuple):
 
 
 class Requests:
-    """Gives goals and commands to the loop, and its answers to those who asked. Each has a ticket, by which it ends."""
+    """Goals and commands of clients in the loop, each with a ticket until it ends; passes answers to their senders."""
 
     def __init__(
         self,
@@ -66,7 +65,7 @@ class Requests:
         loop_death: LoopDeath,
         hurrying: Callable[[], AbstractContextManager[None]],
     ) -> None:
-        """`hurrying` has the loop take what is sent in it in the cycle in which it comes."""
+        """`hurrying` makes the loop handle packets sent in it in the cycle in which they arrive."""
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_WITHIN + sum(homing)
         self._takeover = config.control.takeover
@@ -78,21 +77,21 @@ class Requests:
         self.backlog = Backlog()
         """Goals that the loop has not been given yet."""
         self._ahead: dict[int, str] = {}
-        """The tickets of the goals that the loop has, and whose they are."""
+        """Users of the goals that the loop has, by ticket."""
         self._commands: dict[int, str] = {}
-        """Likewise, of the commands."""
+        """Users of the commands that the loop has, by ticket."""
         self._waiting: dict[int, _Waiting] = {}
         self._tickets = 0
 
     def __iter__(self) -> Iterator[Incoming]:
-        """What is not answered yet."""
+        """Yield the messages that are not answered yet."""
         yield from (waiting.incoming for waiting in self._waiting.values())
         yield from (goal.incoming for goal in self.backlog)
 
     # ------------------------------------------------------------------ goals
 
     def goal(self, incoming: Incoming, user: str, goal: Goal) -> None:
-        """Take a goal, which waits for the user's others. Raises RefusedError where too many do."""
+        """Enqueue a goal behind the user's others. Raises RefusedError if too many wait."""
         self.backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
@@ -102,7 +101,7 @@ class Requests:
         self.send_goals()
 
     def send_goals(self) -> None:
-        """Pass on as many goals of each user as the loop is to have."""
+        """Send the loop as many goals of each user as it may have."""
         of = Counter(self._ahead.values())
         for user in self.backlog.users:
             if len(self._ahead) >= AHEAD_OF_ALL:
@@ -119,9 +118,9 @@ class Requests:
     # ------------------------------------------------------------------ commands
 
     def command(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> int:
-        """Give a command to the loop; return its ticket.
+        """Send a command to the loop; return its ticket.
 
-        Raises RefusedError where it has too many, or the user's role forbids it.
+        Raises RefusedError if the loop has too many, or the user's role forbids it.
         """
         if not name.stops:
             self._check_under_way(user)
@@ -139,7 +138,7 @@ class Requests:
         return request.ticket
 
     def _check_under_way(self, user: str) -> None:
-        """Raise RefusedError where the loop has as many commands of a user, or of all, as it is to have."""
+        """Raise RefusedError if the loop has the most commands that it may have, of a user or of all."""
         own = sum(sender == user for sender in self._commands.values())
         if own >= UNDER_WAY:
             raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
@@ -149,7 +148,7 @@ class Requests:
     # ------------------------------------------------------------------ answers
 
     def answer(self, ticket: int, content: msgspec.Struct) -> None:
-        """Answer what has that ticket, and give the loop the next goal."""
+        """Answer the request with that ticket, and send the loop the next goal."""
         waiting = self._waiting.pop(ticket, None)
         self._commands.pop(ticket, None)
         if waiting is not None:
@@ -158,36 +157,33 @@ class Requests:
             self.send_goals()
 
     def give_up_late(self) -> None:
-        """Answer with an error what the loop has not carried out in time."""
+        """Answer requests that the loop has not carried out in time, with an error."""
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
             self.answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))
 
 
 class CommandReader:
-    """Reads commands and has them carried out; `refuse` answers those that are not."""
+    """Reader of commands, which has them carried out; `refuse` answers the others."""
 
     def __init__(
         self,
-        robot: str,
         requests: Requests,
         replies: Replies,
         states: StateMaker,
         inbox: Inbox,
         refuse: Callable[[Incoming, RefusedError], None],
     ) -> None:
-        self._prefix = zenoh_session.key(robot, "cmd")
         self._requests = requests
         self._replies = replies
         self._states = states
         self._inbox = inbox
         self._refuse = refuse
         self._of_unread: set[int] = set()
-        """Tickets of stops of one goal before which others had come that were not read yet: that goal for one."""
+        """Tickets of stops of one goal, sent behind messages not read yet: one of these may be that goal."""
 
-    def read(self, incoming: Incoming) -> None:
-        """Have a command carried out, unless it is a copy of one that is, or was. Raises RefusedError for none."""
-        user, called = boundary.names(incoming.key, self._prefix, ("user", "command"))
+    def read(self, incoming: Incoming, user: str, called: str) -> None:
+        """Carry a command out, unless it is a copy of an earlier one. Raises RefusedError for an unknown one."""
         try:
             name = Command(called)
         except ValueError as error:
@@ -207,7 +203,7 @@ class CommandReader:
         except RefusedError as refusal:
             if name not in STOPS:
                 raise
-            # Whoever says stop, however badly, wants it to stop: it is carried out as if it had no content.
+            # A stop, however malformed, is meant as one: it is carried out as if it had no content.
             self._carry_out(incoming.unanswered(), user, name, None)
             raise RefusedError(refusal.code, f"{refusal}; the robot is told to {name} all the same") from refusal
         self._carry_out(incoming, user, name, content)
@@ -215,7 +211,7 @@ class CommandReader:
     def refused(self, ticket: int, error: ErrorReply) -> CommandReply | ErrorReply:
         """Return the answer to a command that the loop refuses.
 
-        A goal that it does not know, and that is not read yet, will not begin any more: that is what was asked for.
+        A goal that the loop does not know, and that is still unread, will not begin any more: the request is fulfilled.
         """
         unread = ticket in self._of_unread
         self._of_unread.discard(ticket)
@@ -224,12 +220,12 @@ class CommandReader:
         return error
 
     def _stopped(self) -> CommandReply:
-        """Return the answer to a stop of a goal that never came to the loop."""
+        """Return the answer to a stop of a goal that never reached the loop."""
         newest = self._states.newest()
         return CommandReply(Command.STOP, newest.mode, newest.seq)
 
     def confirmed(self, ticket: int) -> None:
-        """Note that a command has been carried out."""
+        """Record that a command has been carried out."""
         self._of_unread.discard(ticket)
 
     def _carry_out(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> None:
@@ -248,23 +244,22 @@ class CommandReader:
 
 
 class Looks:
-    """What clients tell of their alignments: `send` gives it to the loop, which makes an event of each look."""
+    """Alignment looks that clients report; `announce` has the loop make an event of each."""
 
-    def __init__(self, robot: str, send: Callable[[Looked], bool], clock: Callable[[], float] = time.monotonic) -> None:
-        self._prefix = zenoh_session.key(robot, "alignment")
-        self._send = send
+    def __init__(self, announce: Callable[[Notice], bool], clock: Callable[[], float] = time.monotonic) -> None:
+        self._announce = announce
         self._clock = clock
         self._pace = Pace(LOOKS, LOOKS_PER_SECOND)
 
-    def forward(self, incoming: Incoming) -> AlignmentLook:
-        """Pass a look on, and return it. Raises RefusedError."""
-        (user,) = boundary.names(incoming.key, self._prefix, ("user",))
-        sent: AlignmentLook = incoming.content(AlignmentLook, "not a look of an alignment")
+    def forward(self, user: str, sent: AlignmentLook) -> AlignmentLook:
+        """Forward a look, and return it. Raises RefusedError."""
         look = structs.replace(sent, words=quoted(sent.words))
         now = self._clock()
         if self._pace.wait(user, now) > 0.0:
             raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks a second: send fewer")
         self._pace.count(user, now)
-        if not self._send(Looked(user, "info" if look.end in WELL else "warning", in_words(look), look)):
+        level: Level = "info" if look.end in WELL else "warning"
+        text = look_text(look, in_words(look))
+        if not self._announce(Notice("alignment", level, text.text, user=user, alignment=look, **text.fields)):
             raise RefusedError(RefusalCode.BUSY, "the loop takes no more now: send it again")
         return look

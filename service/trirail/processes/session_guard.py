@@ -1,7 +1,8 @@
-"""Who may open the gateway's session and what each may do there, from [zenoh] of the configuration."""
+"""Access to the gateway's session, and the rights of each user there, from [zenoh] of the configuration."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -9,11 +10,11 @@ import zenoh
 
 from trirail.config import Config
 from trirail.errors import RefusalCode, RefusedError, ServiceError
-from trirail.processes.sockets import SOCKET_MODE, disconnect
+from trirail.processes.sockets import SOCKET_MODE, connections, disconnect
 from trirail.processes.stop_door import Answer, StopDoor
 from trirail.wire import tls, zenoh_session
 from trirail.wire.access import access_control
-from trirail.wire.credentials import Credentials, with_role
+from trirail.wire.credentials import Admission, Credentials
 from trirail.wire.dialling import why_not
 from trirail.wire.endpoints import ReachableBy, reach, same_port, socket_file, tcp_address
 from trirail.wire.stop_protocol import StopRequest, command_of, stop_address
@@ -25,31 +26,33 @@ _MEANS = "who floods the service's other ports keeps new stops out; end what is 
 
 
 class Guard:
-    """The door to the robot. Raises ServiceError where its certificates cannot be used."""
+    """Guard of the session and its door. Raises ServiceError if its certificates cannot be used."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, admission: Admission | None = None) -> None:
+        """`admission` holds the credentials that a service has found at its start; without it they are read here."""
         self._robot = config.robot.name
         self._listen, self._connect, self._router = config.zenoh.listen, config.zenoh.connect, config.zenoh.router
         self._credentials: Credentials | None = None
         self.users: dict[str, Role] = {}
-        """The role of each user who has one."""
+        """Role of each user with one."""
         self._gone: list[str] = []
         telemetry = config.telemetry
         self._others = (("127.0.0.1", telemetry.live_port), (telemetry.metrics_address, telemetry.metrics_port))
         self._without_door: list[str] = []
         if config.zenoh.tls is not None:
             folder = Path(config.zenoh.tls.directory)
-            self._credentials = Credentials.read_server(folder)
+            admission = admission or Admission.read(folder, config.zenoh.users)
+            self._credentials = admission.credentials.in_memory()
             if self._connect and self._credentials.name != self._robot:
                 raise ServiceError(
                     f"{folder}: the certificate of {self._credentials.name}, and a router takes robot {self._robot} "
                     f"by its name alone: trirail keys robot {self._robot} makes its own"
                 )
-            self.users = with_role(config.zenoh.users, folder)
+            self.users = admission.users
             self._gone = [user for user in config.zenoh.users if user not in self.users]
 
     def open(self) -> zenoh.Session:
-        """Open the session. Raises ServiceError where an address cannot be listened on."""
+        """Open the session. Raises ServiceError if an address cannot be listened on."""
         if self._credentials is None:
             opened = zenoh_session.open_service(self._listen, connect=self._connect)
         else:
@@ -60,7 +63,7 @@ class Guard:
         return opened
 
     def stop_door(self, take: Callable[[StopRequest, Answer], None]) -> StopDoor:
-        """Open the door for stops beside each endpoint; `warnings` tells where none can be."""
+        """Open the door for stops beside each endpoint; `warnings` lists endpoints without one."""
 
         def ask(shown: str, request: StopRequest, answer: Answer) -> None:
             user, command = command_of(request, self._robot)
@@ -83,27 +86,33 @@ class Guard:
         return door
 
     def links(self, opened: zenoh.Session) -> dict[str, str | None]:
-        """Return the name in the certificate of each who is connected, by his address; None where he shows none."""
+        """Return the name in the certificate of each link, by address; None without a certificate."""
         return {str(link.dst): link.auth_identifier for link in opened.info.links()}
 
+    def unopened(self, linked: Iterable[str]) -> Counter[str]:
+        """Return by host the number of connections to endpoints with TLS that have opened no session; `linked` have."""
+        ports = {at[1] for at in map(tcp_address, self._listen) if at is not None} if self._credentials else set()
+        known = {at[1] for at in map(tcp_address, linked) if at is not None}
+        return Counter(host for host, port in (connections(ports) if ports else ()) if port not in known)
+
     def disconnect(self, addresses: Iterable[str]) -> None:
-        """End the sessions of these addresses. Zenoh has no word for it: their connections are shut down."""
+        """End the sessions of these addresses. Zenoh has no call for it: their connections are shut down."""
         disconnect(set(filter(None, map(tcp_address, addresses))))
 
     def linked(self, opened: zenoh.Session) -> set[str]:
-        """Return to which endpoints of `connect` a session has a link to the router that is obeyed."""
+        """Return the endpoints of `connect` to which a session has a link with the router that is obeyed."""
         return zenoh_session.linked(opened, self._connect, self._router)
 
     def why_not_linked(self, endpoint: str) -> str:
-        """Return what keeps from a link to an endpoint of `connect`, "" where nothing is seen; it may take seconds."""
+        """Return the obstacle to a link with an endpoint of `connect`, "" if none is seen; it may take seconds."""
         return why_not(endpoint, self._credentials, self._router)
 
     def role(self, user: str) -> Role | None:
-        """Return what a user may: all where nobody is asked for a certificate, nothing where he is not named."""
+        """Return a user's role: the highest if no certificates are required, None for an unknown user."""
         return Role.MAINTAINER if self._credentials is None else self.users.get(user)
 
     def check(self, user: str, needed: Role, what: str) -> None:
-        """Raise RefusedError where a user's role does not allow what is asked."""
+        """Raise RefusedError if a user's role does not allow an action."""
         role = self.role(user)
         if role is None or not role.includes(needed):
             his = f"is {role}" if role is not None else "has no role"
@@ -111,7 +120,7 @@ class Guard:
             raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what people should know of the door, one line each, with the remedy."""
+        """Return warnings about the door, one line each, with the remedy."""
         insecure = [
             f"insecure: whoever reaches {endpoint} can move the robot; trirail keys init makes certificates"
             for endpoint in (*self._listen, *self._connect)
@@ -120,7 +129,7 @@ class Guard:
         return (*insecure, *self._without_door, *self.certificate_warnings())
 
     def certificate_warnings(self) -> tuple[str, ...]:
-        """Return which certificate expires soon, and who is revoked though a role is given to him."""
+        """Return warnings of a certificate that expires soon, and of revoked users with a role."""
         soon = [] if self._credentials is None else [self._credentials.warning()]
         gone = [f"{user} is revoked and has no role; take him out of [zenoh.users]" for user in self._gone]
         return (*filter(None, soon), *gone)

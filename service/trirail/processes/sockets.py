@@ -1,8 +1,9 @@
-"""The gateway's own sockets, and file descriptors: how many there may be, and some kept for what must not lack them."""
+"""The gateway's own sockets, and file descriptors: their limit, and a reserve for uses that must not lack them."""
 
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import os
 import resource
 import socket
@@ -15,29 +16,55 @@ from typing import Any
 from trirail.wire.stop_protocol import StopAddress
 
 SOCKET_MODE = 0o660
-"""Of a Unix socket: its owner and its group may connect, which takes the right to write; nobody else."""
+"""Mode of a Unix socket: its owner and its group may connect, which takes the right to write; nobody else."""
 
 
 def raise_descriptor_limit() -> None:
-    """Let this process, and those that it starts, have as many descriptors as the system's hard limit says."""
+    """Raise the descriptor limit of this process, and of those that it starts, to the system's hard limit."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(ValueError, OSError):  # an unlimited one is more than some kernels take
+    with contextlib.suppress(ValueError, OSError):  # some kernels refuse an unlimited one
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def descriptor_limit() -> int:
-    """Return how many descriptors this process may have."""
+    """Return the descriptor limit of this process."""
     return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 def descriptors_used() -> int:
-    """Return how many it has."""
+    """Return the number of its descriptors in use."""
     counted = Path("/proc/self/fd").stat().st_size  # Linux 6.2 and later; 0 before
     return counted or len(os.listdir("/proc/self/fd")) - 1  # one is that of the listing
 
 
+def connections(ports: Container[int]) -> list[tuple[str, int]]:
+    """Return the other ends of TCP connections to ports of this machine, also of those that they have closed.
+
+    proc(5), /proc/net/tcp: addresses are words of the machine's order, states those of the kernel's tcp_states.h.
+    """
+    found = []
+    for table in ("tcp", "tcp6"):
+        with contextlib.suppress(OSError):  # a machine without IPv6
+            for line in Path(f"/proc/self/net/{table}").read_text(encoding="ascii").splitlines()[1:]:
+                _, here, there, state, *_ = line.split()
+                if state in _CONNECTED and int(here.rpartition(":")[2], 16) in ports:
+                    found.append(_address(there))
+    return found
+
+
+_CONNECTED = ("01", "08")
+"""ESTABLISHED and CLOSE_WAIT."""
+
+
+def _address(written: str) -> tuple[str, int]:
+    words, _, port = written.partition(":")
+    packed = b"".join(struct.pack("=I", int(words[at : at + 8], 16)) for at in range(0, len(words), 8))
+    address = ipaddress.ip_address(packed)
+    return str(getattr(address, "ipv4_mapped", None) or address), int(port, 16)
+
+
 def disconnect(peers: Container[tuple[str, int]]) -> None:
-    """Shut every connection of this process down whose other end is one of these hosts and ports, whoever has it."""
+    """Shut down every connection of this process to one of these hosts and ports, whatever its owner."""
     for number in map(int, os.listdir("/proc/self/fd")):
         with contextlib.suppress(OSError):  # it is closed, or connected to nobody
             if not stat.S_ISSOCK(os.fstat(number).st_mode):
@@ -48,7 +75,7 @@ def disconnect(peers: Container[tuple[str, int]]) -> None:
 
 
 class Reserve:
-    """Descriptors that are held until they are needed, so that nobody else in this process uses them up."""
+    """Reserve of descriptors, so that nothing else in this process uses them up."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -60,29 +87,29 @@ class Reserve:
         return len(self._kept)
 
     def release(self) -> None:
-        """Let one go, for who opens something next. IndexError where there is none."""
+        """Close one, for the next to be opened. IndexError if there is none."""
         os.close(self._kept.pop())
 
     def close(self, descriptor: int) -> None:
-        """Close what was opened in the place of one, and keep that again: at no time is it anybody's."""
+        """Close a descriptor opened in place of one, and reserve it again in the same step."""
         os.dup2(self._null, descriptor, inheritable=False)
         self._kept.append(descriptor)
 
     def refill(self, opened: int = 0) -> None:
-        """Keep as many as there are to be, less what is opened in the place of some; fewer where the system says no."""
+        """Reserve the full number, less those opened in place of some; fewer if the system refuses."""
         with contextlib.suppress(OSError):
             while len(self._kept) < self._count - opened:
                 self._kept.append(os.dup(self._null))
 
     def end(self) -> None:
-        """Keep none."""
+        """Close all descriptors of the reserve."""
         for descriptor in (*self._kept, self._null):
             os.close(descriptor)
         self._kept = []
 
 
 def listen(address: StopAddress) -> list[socket.socket]:
-    """Listen at every address that a host's name stands for. Raises OSError where that cannot be."""
+    """Listen at every address of a host's name. Raises OSError if that is impossible."""
     if isinstance(address.where, str):
         Path(address.where).unlink(missing_ok=True)  # of a gateway that was killed: Zenoh's own lock is ours by now
         places: list[tuple[socket.AddressFamily, Any]] = [(socket.AF_UNIX, address.where)]
@@ -109,7 +136,7 @@ def listen(address: StopAddress) -> list[socket.socket]:
 
 
 def source(connected: socket.socket, address: object) -> str:
-    """Return whose share a connection is of: its address, or the process at the other end of a Unix socket."""
+    """Return the share of a connection: its address, or the process at the other end of a Unix socket."""
     if connected.family == socket.AF_UNIX:
         credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
         return str(struct.unpack("3i", credentials)[0])

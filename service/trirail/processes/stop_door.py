@@ -1,7 +1,7 @@
-"""The door for stops beside Zenoh's endpoints: a thread that does TLS and framing, and nothing that waits for anybody.
+"""Door for stops beside Zenoh's endpoints: a thread that does TLS and framing, and waits for no connection.
 
-Handshakes go on beside each other. Who connects has a share: by his address until he is known, by his name from then
-on; beyond it the oldest of the same share goes, so that whoever comes anew is served whatever the others hold.
+Handshakes run beside each other. Each connection has a share: by its address until its user is known, by the user's
+name from then on; beyond the share its oldest connection is closed, so that a new one is served whatever others hold.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answe
 from trirail.wire.text import quoted
 
 PLACES: Final = 4096
-"""Connections at once, or a quarter of the process's descriptors where that is less; so many are kept for them."""
+"""Most connections, or a quarter of the process's descriptors if that is less; they are reserved for them."""
 ASKED_WITHIN: Final = 10.0
-"""How long one may take to say what it wants [s]: who holds them for nothing opens the more the shorter it is."""
+"""Longest time to send a request [s]: the shorter it is, the more connections an idle holder has to open."""
 ANSWERED_WITHIN: Final = 20.0
-"""How long it may wait for its answer, which comes within 15 s [s]."""
+"""Longest wait for the answer, which comes within 15 s [s]."""
 TURN: Final = 0.25
-"""How often it is looked whose time is over [s]."""
+"""Interval of the checks for connections whose time is over [s]."""
 AT_ONCE: Final = 64
-"""So many connections are accepted before those that there are go on."""
+"""Connections accepted before the existing ones continue."""
 
 IN_TURN: Final = 16
-"""So many connections go on before it is looked again who has come: a step of a handshake takes a millisecond."""
+"""Connections that continue before new ones are accepted: a step of a handshake takes a millisecond."""
 
 Answer = Callable[[CommandReply | ErrorReply], None]
-"""Takes the answer to a request, from any thread."""
+"""Receiver of the answer to a request, from any thread."""
 Take = Callable[[str, StopRequest, Answer], None]
-"""Takes a request, and the name in the certificate of who sent it: "" where nobody shows one."""
+"""Receiver of a request, with the name in its sender's certificate, "" without certificates."""
 
 
 class _Stage(Enum):
@@ -57,8 +57,8 @@ class _Stage(Enum):
 
 
 _SHARES: Final = {_Stage.SILENT: 1 / 2, _Stage.TALKING: 1 / 8, _Stage.KNOWN: 1 / 8, _Stage.WAITING: 1 / 64}
-"""Of the places: connections of one address that have said nothing yet, or shake hands; of one user, before he has said
-what he wants and after."""
+"""Shares of the places: connections of one address that are silent or in a handshake; of one user, before the request
+and after it."""
 
 
 class _Caller:
@@ -75,7 +75,7 @@ class _Caller:
 
 
 class StopDoor:
-    """Takes stops at addresses, from `start` until it is closed."""
+    """Server for stops at addresses, from `start` until it is closed."""
 
     def __init__(self, secured: ssl.SSLContext | None, take: Take) -> None:
         self._secured = secured
@@ -94,17 +94,17 @@ class StopDoor:
         self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
 
     def listen(self, address: StopAddress) -> None:
-        """Listen at an address, before the start. Raises OSError where that cannot be."""
+        """Listen at an address, before the start. Raises OSError if that is impossible."""
         for listening in listen(address):
             self._listening.append(listening)
             self._selector.register(listening, selectors.EVENT_READ, partial(self._accept, listening))
 
     def start(self) -> None:
-        """Begin to take what is asked."""
+        """Begin to take requests."""
         self._thread.start()
 
     def close(self) -> None:
-        """End; what is not answered yet gets no answer here."""
+        """End; requests without an answer get none here."""
         self._closing = True
         os.eventfd_write(self._wake, 1)
         self._thread.join()
@@ -121,7 +121,7 @@ class StopDoor:
                 if not isinstance(woken, _Caller):
                     woken()
             callers = [each for each in ready if isinstance(each, _Caller)]
-            # Of hundreds that shake hands at once those first that are nearest to their end, and have come last.
+            # Of hundreds of handshakes first those nearest to their end, and of these the newest.
             callers.sort(key=lambda caller: (caller.stage.value, caller.since), reverse=True)
             for caller in callers[:IN_TURN]:
                 self._go_on(caller)
@@ -134,7 +134,7 @@ class StopDoor:
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._wake)
 
-    # ------------------------------------------------------------------ who comes, and who has to go
+    # ------------------------------------------------------------------ accept and drop
 
     def _accept(self, listening: socket.socket) -> None:
         for _ in range(AT_ONCE):
@@ -146,14 +146,14 @@ class StopDoor:
                 connected, address = listening.accept()
             except BlockingIOError:
                 break
-            except OSError:  # somebody else was faster where descriptors are short, or the caller has gone
+            except OSError:  # another thread took the descriptor where they are short, or the caller has gone
                 continue
             connected.setblocking(False)
             caller = _Caller(connected, source(connected, address), time.monotonic())
             self._callers[caller.number] = caller
             self._shares.setdefault((caller.stage, caller.share), {})[caller] = None
             self._selector.register(caller.number, selectors.EVENT_READ, caller)
-            self._go_on(caller)  # what it says is often there already
+            self._go_on(caller)  # its request is often there already
             self._keep_to_share(caller)
         self._reserve.refill(len(self._callers))
 
@@ -175,7 +175,7 @@ class StopDoor:
             self._drop(next(iter(share)))
 
     def _drop(self, caller: _Caller) -> None:
-        """Let a connection go, unless it has gone."""
+        """Close a connection, unless that has been done."""
         if self._callers.get(caller.number) is not caller:
             return
         del self._callers[caller.number]
@@ -194,7 +194,7 @@ class StopDoor:
             if now - caller.since > within:
                 self._drop(caller)
 
-    # ------------------------------------------------------------------ what one says, and is told
+    # ------------------------------------------------------------------ read and answer
 
     def _go_on(self, caller: _Caller) -> None:
         if self._callers.get(caller.number) is not caller:
@@ -203,11 +203,11 @@ class StopDoor:
             self._listen_to(caller)
         except (BlockingIOError, ssl.SSLWantReadError):
             return
-        except (OSError, ValueError):  # it has gone, has no good certificate, or says what is no TLS
+        except (OSError, ValueError):  # it has gone, has no good certificate, or does not speak TLS
             self._drop(caller)
 
     def _listen_to(self, caller: _Caller) -> None:
-        """Go on as far as there is something to read. Raises BlockingIOError or SSLWantReadError where there is not."""
+        """Continue as far as there is data. Raises BlockingIOError or SSLWantReadError if there is none."""
         if caller.stage is _Stage.SILENT:
             if not caller.connection.recv(1, socket.MSG_PEEK):
                 raise ConnectionError
@@ -224,7 +224,7 @@ class StopDoor:
             self._enter(caller, _Stage.KNOWN, caller.user)
         while True:
             heard = caller.connection.recv(MAX_LINE)
-            if not heard or caller.stage is _Stage.WAITING:  # it has gone, or says more than it is asked to
+            if not heard or caller.stage is _Stage.WAITING:  # it has gone, or sends more than one request
                 raise ConnectionError
             caller.heard += heard
             line, ended, _ = caller.heard.partition(b"\n")

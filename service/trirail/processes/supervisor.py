@@ -1,64 +1,70 @@
-"""`trirail run`: starts the other processes, watches them, restarts those that may be, and ends them in order."""
+"""Supervisor, `trirail run`: starts the other processes, watches and restarts them, and ends them in order."""
 
 from __future__ import annotations
 
 import os
 import selectors
 import signal
-import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+from trirail_drivers import files
+
 from trirail.config import Config
 from trirail.errors import ServiceError
-from trirail.processes.child_process import Order
 from trirail.processes.compiling import Progress
 from trirail.processes.forked_processes import ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
-from trirail.processes.monitoring import LEAST_CYCLES, Health, Running, metrics_server
+from trirail.processes.monitoring import LEAST_CYCLES, Health, Running
 from trirail.processes.operating_system import Signals, Watchdog, notify
+from trirail.processes.order import Order
 from trirail.processes.realtime import give_back
 from trirail.processes.sockets import raise_descriptor_limit
 from trirail.wire import links
+from trirail.wire.credentials import Admission
 from trirail.wire.messages import Event, Level
 
 CHILDREN = ("gateway", "recorder", "loop", "planner")
-"""In the order of their start: the first two need no mathematics, and come up while that is being imported."""
+"""Processes in the order of their start: the first two need no mathematics, and come up while it is being imported."""
 CHILDREN_WITH_DRIVES = ("gateway", "recorder", "loop", "drives", "planner")
-"""The same where the drives are simulated; the loop rehearses while the drives come up, and then waits for them."""
+"""The same with simulated drives; the loop rehearses while the drives come up, and then waits for them."""
 PORTS = ("gateway", "recorder", "planner")
-"""Where the others connect to the loop, in the order of trirail.processes.loop.Ports."""
+"""Processes that connect to the loop, in the order of trirail.processes.loop.Ports."""
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
-"""Without which there is no service; the planner may be away, and is started again."""
+"""Processes without which there is no service; the planner may be away, and is restarted."""
 CONSEQUENCES = {
     "gateway": "the loop stops the robot and holds",
     "planner": "the motion under way goes on, new goals are refused",
     "recorder": "the robot is not affected",
     "drives": "the robot is in fault, and they come back with the service's next start",
 }
-"""What the death of a process means for the robot."""
+"""Consequence of a process's death for the robot."""
 START_WITHIN = 300.0
-"""How long the processes may take to come up; the very first start may for each function that it compiles [s]."""
+"""Longest time for the processes to come up, and for each function that the very first start compiles [s]."""
 FORKS_WITHIN = 5.0
-"""How long the fork server, once the service is up, may take for a child: it does nothing else [s]."""
+"""Longest time for the fork server, once the service is up, to fork a child: it does nothing else [s]."""
 END_WITHIN = 6.0
-"""How long they may take to end before they are killed [s]."""
+"""Longest time for processes to end before they are killed [s]."""
+RESTART_DURING_START = 1.0
+"""Pause before the restart of a process that ended by itself before the service was up [s]: long enough to notice
+that the loop has ended."""
 RESTARTS = 5
-"""So many restarts of one process within a minute come at once."""
+"""Restarts of one process within a minute that follow without a pause."""
 TURN = 0.1
-"""How often the supervisor looks whether the others are alive [s]."""
+"""Interval at which the supervisor checks that the others are alive [s]."""
 SILENT = 0.7
-"""A process that could have given signs of life for so long and gave none hangs, and is killed [s]."""
+"""Longest silence of a process able to give a sign of life; beyond it the process hangs, and is killed [s]."""
 RECORDER_SILENT = 5.0
-"""The same of the recorder, which may wait for a disk: nothing that moves depends on it [s]."""
+"""The same of the recorder, which may wait for a disk: no motion depends on it [s]."""
 RETRY = 10.0
-"""How long it is waited before any more, for recorder and planner; the gateway's are the service's end [s]."""
+"""Pause before any further restart of recorder or planner [s]; further ones of the gateway end the service."""
 
 
 class Supervisor:
-    """Runs the service in the foreground; `say` takes what it has to say of the processes, `tell` every event."""
+    """Supervisor of the service, in the foreground; `say` takes messages about the processes, `tell` every event."""
 
     def __init__(
         self,
@@ -67,7 +73,7 @@ class Supervisor:
         say: Callable[[str, Level], None],
         tell: Callable[[Event], None] = lambda _: None,
     ) -> None:
-        self._order = Order(config, str(record) if record else None)
+        self._order = Order(config, str(record) if record else None, _admission(config))
         self._record = self._order.record
         self._say = say
         self._tell = tell
@@ -98,20 +104,19 @@ class Supervisor:
         self._up = False
 
     def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
-        """Run until a signal or a process that must not be missing ends it; return the exit code.
+        """Run until a signal or the end of an essential process; return the exit code.
 
-        `up` is called once with what each process said when it was ready.
+        `up` is called once with the ready message of each process.
         """
         raise_descriptor_limit()
-        runtime = _runtime_folder()
-        with runtime as folder, Signals() as signals:
-            self._listening = [links.listen(Path(folder, name)) for name in PORTS]
+        with _runtime_folder() as folder, Signals() as signals:
+            self._listening = [links.listen(folder / name) for name in PORTS]
             self._selector.register(signals.reader, selectors.EVENT_READ, None)
             sockets = [listening.fileno() for listening in self._listening]
-            self._parent = ForkServerLink(self._order, Path(folder), self._heartbeats, sockets)
+            self._parent = ForkServerLink(self._order, folder, self._heartbeats, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
-                with metrics_server(self._order.config, self._health):  # it may have a thread
+                with _metrics_server(self._order.config, self._health):  # it may have a thread
                     self._run_children(up, signals)
             finally:
                 self._parent.close()
@@ -131,7 +136,8 @@ class Supervisor:
         if name in PROCESSES:
             self._heartbeats.of(name).rest()
         self._started[name] += 1
-        child = ChildProcess(self._parent, name, self._record if name == "recorder" else None)
+        record = self._record if name == "recorder" else None
+        child = ChildProcess(self._parent, name, record, again=self._started[name] > 1)
         self._children[name] = child
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
@@ -173,7 +179,7 @@ class Supervisor:
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
 
     def _look_after(self) -> None:
-        """Once a turn, kill who should give signs of life and gives none: its end is then dealt with as any other."""
+        """Once a turn, kill processes that should give signs of life and do not; their end is handled as any other."""
         now = time.monotonic()
         if now < self._next_turn:
             return
@@ -198,11 +204,15 @@ class Supervisor:
         return Running(child.pid, child.ready_with is not None, restarts)
 
     def _on_end(self, child: ChildProcess) -> None:
-        """Decide what the end of a process means."""
+        """Decide on the consequence of a process's end."""
         self._forget(child)
         child.wait(time.monotonic() + END_WITHIN)
         if child.name != "loop" and self._loop_is_ending():
             return  # so it has ended as well, as it should
+        if not self._up and child.name != "loop" and child.returncode == 0:
+            # Most likely the loop could not start, which it has reported, and this one has lost its connection to it.
+            self._due[child.name] = time.monotonic() + RESTART_DURING_START
+            return
         said_why = child.returncode == os.EX_CONFIG
         name, restarts = child.name, self._restarts[child.name]
         if name == "loop":
@@ -219,7 +229,7 @@ class Supervisor:
             self._fail("" if said_why else f"the {name} could not start ({child.how})")
             return
         if name == "drives":
-            if child.returncode:  # else the loop has let go of them, and its own end is what is told
+            if child.returncode:  # else the loop has released them, and its own end is reported
                 self._say(f"the simulated drives have died ({child.how}): {CONSEQUENCES[name]}", "error")
             return
         now = time.monotonic()
@@ -235,7 +245,7 @@ class Supervisor:
         self._due[name] = now + wait
 
     def _loop_is_ending(self) -> bool:
-        """Whether the loop has turned and does not any more: its end is what is told, and not that of the others."""
+        """Return whether the loop has turned and does not any more: its end is reported, and not that of the others."""
         loop = self._children.get("loop")
         return loop is None or (loop.ready_with is not None and not self._heartbeats.of("loop").count)
 
@@ -250,7 +260,7 @@ class Supervisor:
             self._say(reason, "error")
 
     def _hear_parent(self) -> None:
-        """Take what the parent of the others says; without it there is no service."""
+        """Process messages of the others' parent; without it there is no service."""
         self._parent.hear()
         if self._parent.gone and not self._ending:
             loop = self._children.get("loop")
@@ -273,7 +283,7 @@ class Supervisor:
         del self._children[child.name]
 
     def _end(self) -> None:
-        """End the loop first, so that the others can tell of it; then those. Planner and drives have nothing to say."""
+        """End the loop first, so that the others can report it; then those. Planner and drives report nothing."""
         notify("STOPPING=1")
         self._health.end({name: self._running(name) for name in self._names})
         for child in self._children.values():
@@ -288,8 +298,8 @@ class Supervisor:
             if left := self._children.get(name):
                 self._kill(left)
                 self._forget(left)
-        # The others end by themselves once the loop has gone and what it said is published and on disk; one that has
-        # never turned has said nothing.
+        # The others end by themselves once the loop has gone and its messages are published and on disk; one that has
+        # never turned has sent none.
         by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)
         asked = by_itself + END_WITHIN
         for child in list(self._children.values()):
@@ -299,7 +309,7 @@ class Supervisor:
             if not child.wait(asked):
                 self._kill_unwilling(child)
                 self._failed = True
-            # In a start that is interrupted, the SIGTERM may come before they have said what it is to do.
+            # If the start is interrupted, SIGTERM may arrive before they have installed its handler.
             up = self._turned and child.ready_with is not None
             self._failed = self._failed or (up and child.returncode != 0)
             self._forget(child)
@@ -313,14 +323,32 @@ class Supervisor:
         child.wait(time.monotonic() + END_WITHIN)
 
 
-def _runtime_folder() -> tempfile.TemporaryDirectory[str]:
-    """Return a new folder for sockets. Raises ServiceError where none can be made."""
+def _admission(config: Config) -> Admission | None:
+    """Return the content of [zenoh.tls] now, for all starts of the gateway. Raises ServiceError if it is invalid."""
+    zenoh = config.zenoh
+    return Admission.read(Path(zenoh.tls.directory), zenoh.users) if zenoh.tls is not None else None
+
+
+@contextmanager
+def _runtime_folder() -> Iterator[Path]:
+    """Make a folder for sockets. Raises ServiceError if none can be made."""
     parent = os.environ.get("XDG_RUNTIME_DIR")
-    try:
-        return tempfile.TemporaryDirectory(prefix="trirail-", dir=parent)
-    except OSError as error:
-        where = f"{parent}, the XDG_RUNTIME_DIR" if parent else "any folder for temporary files"
-        raise ServiceError(
-            f"cannot make a folder for sockets in {where}: {error.strerror}; "
-            f"{'unset that, or ' if parent else ''}set {'it' if parent else 'TMPDIR'} to a folder of this user"
-        ) from error
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(files.temporary_folder(parent))
+        except OSError as error:
+            where = f"{parent}, the XDG_RUNTIME_DIR" if parent else "any folder for temporary files"
+            raise ServiceError(
+                f"cannot make a folder for sockets in {where}: {error.strerror}; "
+                f"{'unset that, or ' if parent else ''}set {'it' if parent else 'TMPDIR'} to a folder of this user"
+            ) from error
+        yield folder
+
+
+def _metrics_server(config: Config, health: Health) -> AbstractContextManager[object]:
+    """Serve the metrics while the context lasts, if [telemetry] metrics_port is given."""
+    if not config.telemetry.metrics_port:
+        return nullcontext()
+    from trirail.processes.metrics import MetricsServer
+
+    return MetricsServer(config, health)

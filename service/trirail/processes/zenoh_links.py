@@ -1,46 +1,49 @@
-"""The gateway's links: those of clients, told before they are used up, and those to routers, told when one lacks.
+"""Links of the gateway: those of clients, with warnings before they run out, and those to routers, if one is missing.
 
-Zenoh bounds the sessions of all, and not those of one certificate. So the gateway looks at the links, and where few
-places are left it ends the newest sessions of whom has most, those of names without a role before all. The routers of
-[zenoh] connect Zenoh dials and dials again; what is told of it is told here.
+Zenoh bounds the sessions of all, and not those of one certificate. So the gateway checks the links, and if few places
+are left it ends the newest sessions of the name with most, names without a role first. Zenoh itself dials the routers
+of [zenoh] connect, again and again; their links are reported here.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Container, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from trirail.processes import sockets
-from trirail.wire.packets import Remark
+from trirail.wire.event_codes import EventCode, EventText, coded
+from trirail.wire.messages import Notice
 from trirail.wire.text import quoted
 
 LOOK_EVERY: Final = 1.0
-"""How often it is looked [s]."""
+"""Interval between two checks [s]."""
 NEARLY: Final = 0.8
-"""Share in use from which on it is told; it is over below nine tenths of that."""
+"""Share in use that starts a warning; it ends below nine tenths of that."""
 PLACES_FREE: Final = 0.1
-"""Share of the sessions that is kept free for whoever has fewer than others."""
+"""Share of the sessions that is kept free for users with fewer than others."""
 EACH: Final = 8
-"""So many sessions of a user are never ended."""
+"""Number of a user's sessions that are never ended."""
 
 
 class InUse(NamedTuple):
-    """What is in use, and of how many."""
+    """Resources in use, and their totals."""
 
     sessions: int
     sessions_most: int
     descriptors: int
     descriptors_most: int
+    unopened: int = 0
+    """Connections to endpoints with TLS that have opened no session."""
 
 
 def surplus(links: Mapping[str, str], users: Container[str], most: int) -> set[str]:
-    """Return the addresses whose sessions are to end, that a share of `most` stays free.
+    """Return the addresses whose sessions must end so that a share of `most` stays free.
 
-    `links` has the name in the certificate of each address, the oldest first, none where nobody shows one.
+    `links` has the name in the certificate of each address, the oldest first, none without a certificate.
     """
     of: dict[str, list[str]] = {}
     for at, name in links.items():
@@ -56,8 +59,17 @@ def surplus(links: Mapping[str, str], users: Container[str], most: int) -> set[s
     return ending
 
 
+FAILED_A_SECOND: Final = 10.0
+"""Failed handshakes that Zenoh handles in a second: it pauses for 0.1 s after each, for all connections."""
+UNOPENED: Final = 20
+"""Number of connections without a session that starts a warning."""
+
+
 class Crowding:
-    """Looks once a second. `links` returns the name by address of every link, `end` ends those of some addresses."""
+    """Monitor of links, once a second. `links` returns the name by address of each link, `end` ends those of addresses.
+
+    `unopened` is given the addresses of all links, and counts by host the connections that have none.
+    """
 
     def __init__(
         self,
@@ -65,29 +77,34 @@ class Crowding:
         end: Callable[[set[str]], object],
         users: Container[str],
         most: int,
-        tell: Callable[[Remark], object],
+        announce: Callable[[Notice], object],
         clock: Callable[[], float] = time.monotonic,
+        unopened: Callable[[Iterable[str]], Counter[str]] = lambda _: Counter(),
     ) -> None:
-        self._links, self._end, self._users, self._most, self._tell, self._clock = links, end, users, most, tell, clock
+        self._unopened = unopened
+        self._links, self._end, self._users, self._most = links, end, users, most
+        self._announce, self._clock = announce, clock
         self._seen: dict[str, None] = {}
-        self._warnings: dict[str, str] = {}
+        self._warnings: dict[EventCode, str] = {}
         self._due = 0.0
         self.use = InUse(0, most, 0, sockets.descriptor_limit())
-        """As it was looked last."""
+        """Use at the last check."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what is nearly used up, one line each."""
+        """Return warnings of resources nearly used up, one line each."""
         return tuple(self._warnings.values())
 
     def poll(self) -> None:
-        """Look, when it is time."""
+        """Check the links if it is time."""
         now = self._clock()
         if now < self._due:
             return
         self._due = now + LOOK_EVERY
         links = self._links()
         self._seen = {at: None for at in (*self._seen, *links) if at in links}
-        self.use = InUse(len(links), self._most, sockets.descriptors_used(), sockets.descriptor_limit())
+        unopened = self._unopened(links)
+        descriptors = sockets.descriptors_used(), sockets.descriptor_limit()
+        self.use = InUse(len(links), self._most, *descriptors, unopened.total())
         named = {at: name for at in self._seen if (name := links[at]) is not None}
         if ending := surplus(named, self._users, self._most):
             self._end(ending)
@@ -95,43 +112,56 @@ class Crowding:
         by = f", {own} by {name}" if name else ""
         self._judge("sessions", self.use.sessions, self._most, by)
         self._judge("descriptors", self.use.descriptors, self.use.descriptors_most, "")
+        count = unopened.total()
+        by = ", ".join(f"{number} from {host}" for host, number in unopened.most_common(1))
+        wait = count / FAILED_A_SECOND
+        words = f"{count} connections to the gateway open no session ({by}): a new one waits {wait:.0f} s, no stop does"
+        text = coded(words, EventCode.CONNECTIONS_WAIT, count=count, wait=wait)
+        self._warn(count >= UNOPENED * self._less(text.code), text)
 
     def _judge(self, what: str, used: int, most: int, by: str) -> None:
-        """Warn of what is nearly used up, and tell it once."""
-        was = what in self._warnings
-        if used < most * NEARLY * (0.9 if was else 1.0):
-            self._warnings.pop(what, None)
+        """Warn if a resource is nearly used up."""
+        code = EventCode.SESSIONS_FULL if what == "sessions" else EventCode.DESCRIPTORS_FULL
+        words = f"{used} of {most} {what} of the gateway are in use{by}: soon nobody new is let in, but for stops"
+        self._warn(used >= most * NEARLY * self._less(code), coded(words, code, used=used, most=most))
+
+    def _less(self, code: EventCode) -> float:
+        """Return the factor on a warning's threshold: less than 1 once it has been given."""
+        return 0.9 if code in self._warnings else 1.0
+
+    def _warn(self, too_much: bool, text: EventText) -> None:
+        """Warn while there is too much of something, and announce it once."""
+        if not too_much:
+            self._warnings.pop(text.code, None)
             return
-        self._warnings[what] = (
-            f"{used} of {most} {what} of the gateway are in use{by}: soon nobody new is let in, but for stops"
-        )
-        if not was:
-            self._tell(Remark("warning", self._warnings[what]))
+        if text.code not in self._warnings:
+            self._announce(Notice("service", "warning", text.text, **text.fields))
+        self._warnings[text.code] = text.text
 
 
 PATIENCE = 5.0
-"""So long after the start a router may still be dialled without a word [s]."""
+"""Time after the start for which a router may be dialled without a warning [s]."""
 ASK_EVERY = 15.0
-"""How often it is asked anew why a router is not reached [s]."""
+"""Interval between two checks why a router is not reached [s]."""
 
 
 @dataclass
 class _Router:
     endpoint: str
     ask_at: float
-    """When it is asked why there is no link."""
+    """Time of the next check why there is no link."""
     linked: bool | None = None
-    """What was last told; None for nothing."""
+    """State announced last; None before."""
     asked: Future[str] | None = None
     warning: str = ""
-    """While there is no link and that has been told."""
+    """Warning while there is no link and that has been announced."""
 
 
 class RouterLinks:
-    """Tells when a link to a router comes, is lost, or does not come, each once; `warnings` lasts as long as it lacks.
+    """Monitor of router links: announces a new, lost or missing link once; `warnings` lasts as long as it is missing.
 
-    `linked` returns to which endpoints there is a link, at once; `why_not` why there is none to one, and may take
-    seconds: it is called by a thread of its own.
+    `linked` returns the linked endpoints immediately; `why_not` why there is no link to one, which may take seconds: it
+    is called by a thread of its own.
     """
 
     def __init__(
@@ -139,10 +169,10 @@ class RouterLinks:
         endpoints: Sequence[str],
         linked: Callable[[], Collection[str]],
         why_not: Callable[[str], str],
-        tell: Callable[[Remark], object],
+        announce: Callable[[Notice], object],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._linked, self._why_not, self._tell, self._clock = linked, why_not, tell, clock
+        self._linked, self._why_not, self._announce, self._clock = linked, why_not, announce, clock
         self._routers = [_Router(endpoint, clock() + PATIENCE) for endpoint in endpoints]
         self._due = 0.0
         self._asking = ThreadPoolExecutor(1, "router")
@@ -152,7 +182,7 @@ class RouterLinks:
         return tuple(router.warning for router in self._routers if router.warning)
 
     def poll(self) -> None:
-        """Look whether the links are there, when it is time."""
+        """Check the links if it is time."""
         now = self._clock()
         if not self._routers or now < self._due:
             return
@@ -165,12 +195,14 @@ class RouterLinks:
                 self._lacks(router, now)
 
     def close(self) -> None:
-        """End; what is being asked is not waited for."""
+        """End without waiting for a pending `why_not`."""
         self._asking.shutdown(wait=False, cancel_futures=True)
 
     def _is_there(self, router: _Router, now: float) -> None:
         if not router.linked:
-            self._tell(Remark("info", f"linked to the router {router.endpoint}"))
+            words = f"linked to the router {router.endpoint}"
+            text = coded(words, EventCode.ROUTER_LINKED, router=router.endpoint)
+            self._announce(Notice("service", "info", text.text, **text.fields))
         router.linked, router.asked, router.warning, router.ask_at = True, None, "", now
 
     def _lacks(self, router: _Router, now: float) -> None:
@@ -179,11 +211,12 @@ class RouterLinks:
             router.ask_at = now + ASK_EVERY
         if router.asked is None or not router.asked.done():
             return
-        error = router.asked.exception()  # whoever answers there says what he likes, and nobody here may end of it
+        error = router.asked.exception()  # an unknown peer answers there, and must not end this service
         why = quoted(f"{error!r}") if error is not None else router.asked.result()
         router.asked = None
         why = why or "it answers, but opens no session: is it a router that takes this robot?"
         router.warning = f"no link to the router {router.endpoint}: {why}; it is dialled again, local control goes on"
         if router.linked is not False:
             router.linked = False
-            self._tell(Remark("warning", router.warning))
+            text = coded(router.warning, EventCode.ROUTER_LOST, router=router.endpoint)
+            self._announce(Notice("service", "warning", text.text, **text.fields))

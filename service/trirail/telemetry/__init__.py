@@ -1,1 +1,1 @@
-"""What is recorded and drawn: Rerun's streams, files, black boxes, and reading them again."""
+"""Recording and drawing: Rerun's streams, files, black boxes, and reading them."""

@@ -1,4 +1,4 @@
-"""How the viewer is laid out: the robot large with mode and events below it, beside it the curves; or several."""
+"""Layout of the viewer: the robot large with mode and events below it, the curves beside it; or several robots."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from trirail.telemetry.shown_robot import ShownRobot
 from trirail.workspace.part_positions import Points
 
 WINDOW = 8.0
-"""How much of the past the plots show [s]."""
+"""Time span of the plots [s]."""
 MARGIN = 0.09
-"""Room around the robot, as a share of its size."""
+"""Margin around the robot, as a share of its size."""
 
 
 class Shown(NamedTuple):
@@ -24,9 +24,9 @@ class Shown(NamedTuple):
 
     robot: ShownRobot
     bounds: Points
-    """Where it lies, (2, 2): lowest and highest x and y [m]."""
+    """Bounds of its parts, (2, 2): lowest and highest x and y [m]."""
     root: str = ""
-    """The entity below which all of it is; "" for the root of all."""
+    """Entity above all of its entities; "" for the root of all."""
 
 
 def layout(shown: Shown) -> rrb.Blueprint:
@@ -53,7 +53,7 @@ def layout(shown: Shown) -> rrb.Blueprint:
 
 
 def side_by_side(several: Sequence[Shown]) -> rrb.Blueprint:
-    """Return the layout for several robots, a column each, by the wall clock: each loop has a `t` of its own."""
+    """Return the layout for several robots, a column each, by the wall clock, since each loop has its own `t`."""
     window = rrb.TimeAxis(view_range=_last(WINDOW))
     columns = [
         rrb.Vertical(
@@ -78,7 +78,7 @@ def _whole(views: rrb.Horizontal, timeline: str) -> rrb.Blueprint:
 
 
 def _situation(shown: Shown, window: rrb.TimeAxis, timeline: str) -> list[rrb.View | rrb.Tabs]:
-    """Return the robot, its numbers, its mode and its events."""
+    """Return the views of the robot, its numbers, its mode and its events."""
     events = rrb.TextLogView(
         name="Events",
         origin=f"{shown.root}{journal.EVENTS}",

@@ -1,4 +1,4 @@
-"""CAN frames as a log file in candump's format, which can-utils, python-can and Wireshark read."""
+"""Log files of CAN frames in candump's format, which can-utils, python-can and Wireshark read."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from typing import Literal
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
 from trirail.telemetry.sinks import RESERVE, identity, no_room
+from trirail.wire.event_codes import EventCode, EventText, coded
 
 
 class CandumpLog:
-    """A log of one bus's frames. It leaves RESERVE bytes of the disk free, and goes on where there is room again.
+    """A log of one bus's frames. It leaves RESERVE bytes of the disk free, and continues when there is space again.
 
-    One that is deleted is begun anew, and `warn` is told.
+    A deleted file is begun again, and `warn` receives a message.
     """
 
-    def __init__(self, path: Path, channel: str, warn: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(self, path: Path, channel: str, warn: Callable[[EventText], None] = lambda _: None) -> None:
         self.lost = 0
         """Batches that are not in the file."""
         self.trouble = ""
-        """Why the last batch is not in the file; empty if it is."""
+        """Reason why the last batch is not in the file; empty if it is."""
         self._path = path
         self._channel = channel
         self._warn = warn
@@ -36,7 +37,7 @@ class CandumpLog:
         self.lost += bool(self.trouble)
 
     def _append(self, batch: bytes) -> str:
-        """Append a batch, whole or not at all; return why it could not be, or nothing."""
+        """Append a batch, whole or not at all; return the reason of a failure, else ""."""
         if identity(self._path) != self._identity:
             try:
                 self._begin_anew()
@@ -70,13 +71,14 @@ class CandumpLog:
     def _begin_anew(self) -> None:
         deleted = self._file
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._begin("xb")  # what has its name now is somebody else's
+        self._begin("xb")  # another file of its name belongs to somebody else
         deleted.close()
-        self._warn(f"{self._path} has been deleted or moved: it is begun anew")
+        words = f"{self._path} has been deleted or moved: it is begun anew"
+        self._warn(coded(words, EventCode.CAPTURE_MOVED, file=str(self._path)))
 
 
 def _written(frame: bytes) -> str:
-    """A `struct can_frame` in candump's words: 3 digits of an 11-bit identifier, 8 of others and of error frames."""
+    """Format a `struct can_frame` as candump: 3 digits of an 11-bit identifier, 8 of others and of error frames."""
     identifier, length, data = CAN_FRAME.unpack(frame)
     if identifier & ERROR:
         name = f"{identifier & (ERROR | EXTENDED_BITS):08X}"

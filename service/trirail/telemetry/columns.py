@@ -1,4 +1,4 @@
-"""Arrays as Rerun's columns, of many entities in one go: a fraction of the cost of Rerun's call for each."""
+"""Conversion of arrays to Rerun's columns, many entities per call: a fraction of the cost of Rerun's call for each."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rerun.chunk import Chunk
 
 SECOND = 1_000_000_000  # [ns]
 RECORD, FIELDS = "/record", rr.ComponentDescriptor("fields")
-"""Where every cycle's record stands in a recording, whole: entity path and component."""
+"""Entity path and component of each cycle's whole record in a recording."""
 
 
 class Column(NamedTuple):
-    """Values of one component of one entity: a list for every time."""
+    """Values of one component of one entity: a list for each time."""
 
     path: str
     kind: rr.ComponentDescriptor
@@ -25,7 +25,7 @@ class Column(NamedTuple):
 
 
 class Timelines:
-    """The two times of everything: `t`, nominal, since the loop's start, and `wall`, the wall clock."""
+    """Timelines of all data: `t`, nominal, since the loop's start, and `wall`, the wall clock."""
 
     def __init__(self, rate_hz: int, wall_offset_ns: int) -> None:
         self._rate_hz = rate_hz
@@ -76,7 +76,7 @@ def strips(values: NDArray[np.float64]) -> pa.ListArray:
 
 
 def ragged(rows: Sequence[Sequence[NDArray[np.float64]]]) -> pa.ListArray:
-    """Return rows of so many lines, each through so many points, (k, 2), in single precision."""
+    """Return rows of any number of lines, each through any number of points, (k, 2), in single precision."""
     lines = [line for row in rows for line in row]
     points = _vectors(np.concatenate([np.empty((0, 2)), *lines]))
     ends = np.cumsum([0, *map(len, rows)], dtype=np.int32)
@@ -84,7 +84,7 @@ def ragged(rows: Sequence[Sequence[NDArray[np.float64]]]) -> pa.ListArray:
 
 
 def layout(kind: np.dtype[Any]) -> pa.StructType:
-    """Return the kind of the struct that a record of a kind is in a file."""
+    """Return the Arrow type that a record of dtype `kind` has in a file."""
     fields = []
     for name in kind.names or ():
         base, shape = kind[name].base, kind[name].shape

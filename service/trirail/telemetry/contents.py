@@ -1,91 +1,121 @@
-"""What is in a recording, for the index of sessions: robot, time, users, goals, faults; counted, or read from it."""
+"""Contents of a recording: robot, time, users, goals and faults, counted by the recorder or read from the recording.
+
+They are stored as JSON in a file beside the recording, so that sessions are found without reading recordings.
+"""
 
 from __future__ import annotations
 
 import re
-from collections import Counter
+import stat
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal
 
 import msgspec
+from trirail_drivers import files
 
 from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
-from trirail.telemetry import provenance
-from trirail.telemetry.reading import read
-from trirail.telemetry.retention import BLACK_BOX
-from trirail.wire.messages import Event, FaultDetail
-from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest, Looked, RefusedRequest
-from trirail.wire.records import DTYPE, unpack
+from trirail.telemetry.retention import BLACK_BOX, sidecar
+from trirail.wire.decoding import decoded, prepare
+from trirail.wire.messages import Event, FaultDetail, Notice
+from trirail.wire.packets import Announcement, CommandRequest, ControlInput, GoalRequest
 
 _PART = re.compile(r"-part\d+(-\d+)?$")
 STAMP = "%Y%m%d-%H%M%S"
-"""In the names of recordings: the local time at which they began; of a black box that of its fault."""
+"""Format of the local time in the names of recordings: that of their begin; for a black box, that of its fault."""
 
 
-class FaultEntry(NamedTuple):
+class FaultEntry(msgspec.Struct):
     """A fault."""
 
     time: float
-    """[s since 1970]."""
+    """Time of the fault [s since 1970]."""
     fault: FaultDetail
     message: str
 
+    @property
+    def code(self) -> str:
+        """Cause and code, as "emcy 0x8700"."""
+        return f"{self.fault.cause} 0x{self.fault.code:04X}"
+
 
 class Contents(msgspec.Struct):
-    """What is in one file; users, goals and faults come in the order of their first."""
+    """Contents of one file."""
 
     name: str
-    """The file's."""
+    """Name of the file."""
     robot: str
     began: float | None = None
-    """Of its first record [s since 1970]; None where there is none."""
+    """Time of its first record [s since 1970]; None where there is none."""
     ended: float | None = None
-    """Of its last record."""
+    """Time of its last record."""
     cycles: int = 0
-    users: dict[str, None] = msgspec.field(default_factory=dict)
-    """Who sent goals or commands."""
-    goals: Counter[tuple[str, str]] = msgspec.field(default_factory=Counter)
-    """How many of whose goals ended how: user, outcome."""
+    users: set[str] = msgspec.field(default_factory=set)
+    """Users that sent goals or commands."""
+    goals: dict[str, dict[str, int]] = msgspec.field(default_factory=dict)
+    """Number of goals by user and outcome."""
     faults: list[FaultEntry] = msgspec.field(default_factory=list)
     reason: str | None = None
-    """Of a black box: the fault for which it was kept."""
+    """Fault for which a black box was kept."""
     trouble: str | None = None
-    """Why it could not be read."""
+    """Reason why the file could not be read."""
     running: bool = False
-    """Whether it is still being written, and this is what has been so far."""
+    """Whether the file is still being written, and these are the contents until now."""
+    version: Literal[1] = 1
+    """Version of this record; those of other versions are not read."""
 
     @property
     def session(self) -> str:
-        """The session's name: that of its first file, without suffix."""
-        return _PART.sub("", Path(self.name).stem)
+        """Name of the session: that of its first file, without suffix."""
+        return _PART.sub("", self.name.removesuffix(".rrd"))
 
-    def records(self, batch: bytes, wall_offset_ns: int) -> None:
-        """Take packed records; the offset is of the wall clock from the monotonic one."""
-        rows = unpack(batch)
-        first, last = ((int(row["deadline_ns"]) + wall_offset_ns) * 1e-9 for row in (rows[0], rows[-1]))
-        self.began = first if self.began is None else self.began
-        self.ended = last
-        self.cycles += len(batch) // DTYPE.itemsize
+    def add_cycles(self, began: float, ended: float, count: int) -> None:
+        """Count cycles, with the times of the first and the last of them [s since 1970]."""
+        self.began = began if self.began is None else self.began
+        self.ended = ended
+        self.cycles += count
 
     def event(self, event: Event) -> None:
         """Take an event."""
         if event.outcome is not None:
-            self.goals[event.user or "", event.outcome] += 1
+            ended = self.goals.setdefault(event.user or "", {})
+            ended[event.outcome] = ended.get(event.outcome, 0) + 1
         if event.kind == "fault":
             self.faults.append(FaultEntry(event.time, event.fault or FaultDetail(""), event.message))
 
     def control_input(self, what: ControlInput) -> None:
-        """Take what the control was given."""
+        """Take an input of the control."""
         match what.given:
-            case GoalRequest(user=user) | CommandRequest(user=user) | RefusedRequest(user=user) | Looked(user=user) if (
-                user
-            ):
-                self.users[user] = None
+            case GoalRequest(user=user) | CommandRequest(user=user) if user:
+                self.users.add(user)
+            case Announcement(notice=Notice(kind="refused" | "alignment", user=str(user))) if user:
+                self.users.add(user)
+
+
+prepare(Contents)
+
+
+def save(recording: Path, contents: Contents) -> None:
+    """Save the contents of a recording beside it, with the recording's permissions. Raises OSError."""
+    mode = stat.S_IMODE(recording.stat().st_mode)
+    files.replace(sidecar(recording), msgspec.json.encode(contents), mode)
+
+
+def load(recording: Path) -> Contents | None:
+    """Return the contents saved beside a recording; None where they are missing, damaged or of another version."""
+    try:
+        contents = decoded(sidecar(recording).read_bytes(), Contents)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        return None
+    contents.name = recording.name  # both may have been renamed
+    return contents
 
 
 def of_file(path: Path) -> Contents:
-    """Read what is in a recording; of one that cannot be read, why."""
+    """Read the contents of a recording; for an unreadable one, return the reason in `trouble`."""
+    from trirail.telemetry import provenance  # imports Rerun, which takes most of the start-up time
+    from trirail.telemetry.reading import read
+
     found = Contents(path.name, "")
     try:
         recording = read(path)
@@ -96,10 +126,8 @@ def of_file(path: Path) -> Contents:
         found.trouble = str(error)
         return found
     found.robot = config.robot.name if config is not None else ""
-    found.cycles = len(recording.records)
-    found.began, found.ended = (
-        float(wall.astype("datetime64[ns]").astype(int)) * 1e-9 for wall in recording.wall[[0, -1]]
-    )
+    began, ended = (float(wall.astype("datetime64[ns]").astype(int)) * 1e-9 for wall in recording.wall[[0, -1]])
+    found.add_cycles(began, ended, len(recording.records))
     for line in recording.events:
         if line.event is not None:
             found.event(line.event)
@@ -111,9 +139,9 @@ def of_file(path: Path) -> Contents:
 
 
 def _reason(found: Contents) -> str | None:
-    """The fault whose time is in the name of a black box; without one, its last."""
-    for _, _, message in (fault for fault in found.faults if box_name(fault.time) in found.name):
-        return message
+    """Return the message of the fault whose time a black box has in its name; without one, of its last."""
+    for entry in (entry for entry in found.faults if box_name(entry.time) in found.name):
+        return entry.message
     return found.faults[-1].message if found.faults else None
 
 

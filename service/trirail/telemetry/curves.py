@@ -1,4 +1,4 @@
-"""The curves that people see, in millimetres, degrees and microseconds, and the limits drawn beside them."""
+"""Plotted curves, in millimetres, degrees and microseconds, and the limits drawn beside them."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ CENTRE, PHI, SINGULARITY = "/pose/centre", "/pose/phi", "/pose/singularity"
 TIMING = "/loop/timing"
 
 NEAR = 0.7
-"""Limits are drawn where a value reaches this share of them: else they would flatten the curves."""
+"""Share of a limit from which it is drawn: else it would flatten the curves."""
 
 
 class Curve(NamedTuple):
-    """A line that moves."""
+    """A moving line."""
 
     name: str
     colour: Colour
 
 
 class Limit(NamedTuple):
-    """A line that stands still."""
+    """A constant line."""
 
     name: str
     value: float
@@ -39,16 +39,16 @@ class Limit(NamedTuple):
 
 
 class Lines(NamedTuple):
-    """The lines of one plot."""
+    """Lines of one plot."""
 
     moving: tuple[Curve, ...]
     still: tuple[Limit, ...] = ()
     near: float = 0.0
-    """A limit is drawn only where a value reaches this share of it; 0 for always."""
+    """Share of a limit from which it is drawn; 0 for always."""
 
 
 def plots(robot: ShownRobot) -> dict[str, Lines]:
-    """Return what is plotted, by entity, in the units of the curves."""
+    """Return the lines of each plot, by entity, in the units of the curves."""
     slider, platform, names = robot.limits.slider, robot.limits.platform, robot.geometry.labels
     error = slider.following_error * 1e6
     margin = float(np.degrees(robot.limits.singularity_margin))
@@ -65,7 +65,7 @@ def plots(robot: ShownRobot) -> dict[str, Lines]:
 
 
 def timing(rate_hz: int, bus_load: float) -> Lines:
-    """Return the lines of the loop's timing; the bus is shown as the time that its frames take, as a share of 1."""
+    """Return the lines of the loop's timing; `bus_load`, 1 for a full bus, is shown as the time of its frames."""
     period = 1e6 / rate_hz
     return Lines(
         (Curve("cycle", palette.CYCLE), Curve("lateness", palette.LATENESS)),
@@ -81,7 +81,7 @@ def values(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the values of the moving lines, (N, lines), for N groups of records that begin at `starts`.
 
-    `newest` are the last records of the groups, `distance` theirs to a singularity [rad].
+    `newest` are the last records of the groups, `distance` their distances to a singularity [rad].
     """
     error = records["following_error"]
     highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
@@ -110,7 +110,7 @@ def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64
 
 
 def _window(x: Range, y: Range) -> tuple[Limit, ...]:
-    """Return the limits of the platform's centre, once where those of x and y are the same."""
+    """Return the limits of the platform's centre, once where x and y have the same."""
     if x == y:
         return Limit("min", x[0] * 1e3), Limit("max", x[1] * 1e3)
     ends = zip(("x min", "x max", "y min", "y max"), (*x, *y), strict=True)

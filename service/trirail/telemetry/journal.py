@@ -1,6 +1,6 @@
-"""What stands in a recording beside the records: what the control was given, and what it said of it.
+"""Logs in a recording, beside the records: the inputs of the control, and the events of the service.
 
-Both are lines of a log, for people, that carry the message itself as JSON, for programs.
+Both consist of lines for people that carry the message itself as JSON, for programs.
 """
 
 from __future__ import annotations
@@ -16,25 +16,24 @@ from rerun.chunk import Chunk
 
 from trirail.telemetry import columns
 from trirail.telemetry.columns import SECOND, Column
+from trirail.telemetry.recorded_inputs import encode_input
+from trirail.wire.goals import kind_name
 from trirail.wire.messages import Event, Level
 from trirail.wire.packets import (
+    Announcement,
     CommandRequest,
     ControlInput,
     Disturbance,
     DrivesFault,
     GoalRequest,
-    Looked,
     PlannerLost,
-    PoseChanged,
-    RefusedRequest,
-    Remark,
 )
 from trirail.wire.plan_packets import Extended, NotPlanned, Planned
 
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
 JSON, WORDS = rr.ComponentDescriptor("json"), rr.ComponentDescriptor("words")
-"""Beside the line that a viewer shows: the message itself, and the line without its time."""
+"""Components beside the line that a viewer shows: the message itself, and the line without its time."""
 LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
@@ -50,28 +49,41 @@ class Entry(NamedTuple):
     text: str
     level: Level = "info"
     message: Event | ControlInput | None = None
-    """The message itself; None for what the recorder has to say."""
+    """The message itself; None for a line of the recorder."""
+
+
+class Line(NamedTuple):
+    """A line of the log that was read: an event of the service, or a message of the recorder."""
+
+    t: float
+    """Nominal time since the loop's start [s]."""
+    wall: np.datetime64
+    level: str
+    """INFO, WARN or ERROR."""
+    text: str
+    event: Event | None = None
+    """The event itself; None for a message of the recorder."""
 
 
 def said(event: Event) -> Entry:
-    """Return an event of the service."""
+    """Return the entry of an event of the service."""
     return Entry(EVENTS, event.t, event.time, event.message, event.level, event)
 
 
 def control_input(what: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
-    """Return what the control was given, at the nominal time of its cycle."""
+    """Return the entry of an input of the control, at the nominal time of its cycle."""
     wall = (what.now_ns + wall_offset_ns) / SECOND
     return Entry(REQUESTS, what.cycle / rate_hz, wall, _words(what), message=what)
 
 
 def chunks(entries: Sequence[Entry]) -> list[Chunk]:
-    """Return lines as Rerun takes them: all of one log together."""
+    """Return entries as Rerun's chunks, one for each log."""
     logs = dict.fromkeys(entry.log for entry in entries)
     return [_chunk(log, [entry for entry in entries if entry.log == log]) for log in logs]
 
 
 def _chunk(log: str, entries: Sequence[Entry]) -> Chunk:
-    messages = [[msgspec.json.encode(entry.message).decode()] if entry.message else [] for entry in entries]
+    messages = [[_encoded(entry.message)] if entry.message else [] for entry in entries]
     parts = [
         # The viewer's own column of times is too narrow for them, and cannot be made wider.
         Column(log, TEXT, pa.array([[f"{entry.t:9.3f} s   {entry.text}"] for entry in entries])),
@@ -84,6 +96,10 @@ def _chunk(log: str, entries: Sequence[Entry]) -> Chunk:
     return chunk
 
 
+def _encoded(message: Event | ControlInput) -> str:
+    return encode_input(message) if isinstance(message, ControlInput) else msgspec.json.encode(message).decode()
+
+
 def _nanoseconds(seconds: Iterable[float]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.array([round(value * SECOND) for value in seconds])
 
@@ -91,7 +107,7 @@ def _nanoseconds(seconds: Iterable[float]) -> np.ndarray[tuple[int], np.dtype[np
 def _words(what: ControlInput) -> str:
     match what.given:
         case GoalRequest(id=name, user=user, goal=goal):
-            return f"goal {name} of {user}: {type(goal).__name__.removesuffix('Goal').lower()}"
+            return f"goal {name} of {user}: {kind_name(goal)}"
         case CommandRequest(name=name, user=user):
             return f"{name} by {user}"
         case Disturbance(event=event, reason=reason):
@@ -106,5 +122,5 @@ def _words(what: ControlInput) -> str:
             return f"plan {number}: {message}"
         case PlannerLost(reason=reason):
             return reason
-        case RefusedRequest() | PoseChanged() | Looked() | Remark() as told:
-            return told.message
+        case Announcement(notice):
+            return notice.message

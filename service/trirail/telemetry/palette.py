@@ -1,14 +1,14 @@
-"""The colours of everything shown: one for each thing, wherever it appears."""
+"""Colours of the views: one for each object, wherever it appears."""
 
 from __future__ import annotations
 
 from trirail.wire.vocabulary import Mode
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
-"""Red, green, blue and, where it shines through, opacity: 0 to 255."""
+"""Red, green, blue and, where translucent, opacity: 0 to 255."""
 
 SLIDERS: tuple[Colour, Colour, Colour] = ((242, 108, 79), (52, 190, 145), (82, 148, 255))
-"""A, B and C."""
+"""Colours of the sliders A, B and C."""
 
 PLATFORM: Colour = (236, 238, 242)
 COMMANDED: Colour = (250, 176, 64, 90)
@@ -41,7 +41,7 @@ MODES: dict[Mode, Colour] = {
     Mode.STOPPING: (196, 104, 44),
     Mode.FAULT: (200, 56, 56),
 }
-"""Every mode's colour: in the live view as it is, on paper in its pale shade, in terminals as rich's style."""
+"""Colour of each mode: unchanged in the live view, pale on paper, as rich's style in terminals."""
 
 
 OUTCOMES: dict[str, Colour] = {
@@ -54,11 +54,11 @@ OUTCOMES: dict[str, Colour] = {
     "unsettled": (168, 60, 160),
     "unknown": (123, 135, 148),
 }
-"""How goals end: the colour of each outcome, on paper and in terminals; unknown is one that was not recorded."""
+"""Colour of each outcome of goals, on paper and in terminals; "unknown" is one that was not recorded."""
 
 
 def pale(colour: Colour) -> Colour:
-    """Return the colour as it fills areas on white: halfway to it."""
+    """Return the colour for filled areas on white: halfway to white."""
     red, green, blue = colour[:3]
     return (red + 255) // 2, (green + 255) // 2, (blue + 255) // 2
 
@@ -70,6 +70,6 @@ def code(colour: Colour) -> str:
 
 
 def dark(colour: Colour) -> Colour:
-    """Return the colour as it looks in the background."""
+    """Return the colour for the background: half as bright."""
     red, green, blue = colour[:3]
     return red // 2, green // 2, blue // 2

@@ -1,4 +1,4 @@
-"""Where a recording comes from: the configuration, as a file that can be run again, and the software."""
+"""Provenance of a recording: the configuration, as a file that can be run again, and the software."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from trirail.naming import Labels
 from trirail.wire.decoding import decoded, prepare
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
-"""Where a recording has what made it, as text documents: entity paths."""
+"""Entity paths of a recording's provenance, as text documents."""
 LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
 Tables = dict[str, Any]
 _PACKAGES = (Path(__file__).parents[1], Path(trirail_drivers.__path__[0]))
 
 
 class Software(msgspec.Struct, frozen=True):
-    """What ran."""
+    """Versions of the software that made a recording."""
 
     trirail: str
     source: str
-    """Fingerprint of the packages' source files: it tells versions apart that have not been given a number."""
+    """Fingerprint of the packages' source files: it distinguishes versions without a number."""
     machine: str
     versions: dict[str, str]
 
@@ -45,7 +45,7 @@ prepare(Software)
 
 @cache
 def software() -> Software:
-    """Return what runs here."""
+    """Return the versions of the running software."""
     return Software(version("trirail"), _fingerprint(), f"{platform.system()} {platform.machine()}", versions())
 
 
@@ -55,19 +55,19 @@ def versions() -> dict[str, str]:
 
 
 def texts(config: Config) -> dict[str, str]:
-    """Return what a recording says of itself, by entity path."""
+    """Return the text documents of a recording, by entity path."""
     described = msgspec.json.format(msgspec.json.encode(software()), indent=2)
     return {CONFIGURATION: toml(config), SOFTWARE: described.decode()}
 
 
 def configuration(found: Mapping[str, str]) -> Config | None:
-    """Return the configuration among a recording's texts, None where there is none. Raises ConfigError."""
+    """Return the configuration in a recording's texts; None where there is none. Raises ConfigError."""
     text = found.get(CONFIGURATION)
     return parse(text) if text is not None else None
 
 
 def labels(found: Mapping[str, str]) -> Labels:
-    """Return what people call the sliders, by a recording's texts; their letters where these do not say it."""
+    """Return the labels of the sliders in a recording's texts; their letters where there are none."""
     try:
         config = configuration(found)
     except ConfigError:
@@ -76,7 +76,7 @@ def labels(found: Mapping[str, str]) -> Labels:
 
 
 def recorded_by(found: Mapping[str, str]) -> Software | None:
-    """Return the software among a recording's texts, None where there is none, or it is written as no version here."""
+    """Return the software in a recording's texts; None where it is missing or cannot be decoded."""
     try:
         return decoded(found.get(SOFTWARE, ""), Software)
     except msgspec.DecodeError:
@@ -90,7 +90,7 @@ def toml(config: Config) -> str:
 
 
 def toml_lines(tables: Tables, other: Tables, base: str, path: str = "") -> Iterator[str]:
-    """Write tables as TOML; a comment says where `other`, of the name `base`, has something else."""
+    """Yield tables as lines of TOML; comments mark values that differ in `other`, named `base`."""
     inner = {key: value for key, value in tables.items() if _is_tables(value)}
     plain = {key: value for key, value in tables.items() if key not in inner}
     if path and (plain or not inner):
@@ -119,7 +119,7 @@ def _is_tables(value: object) -> bool:
 
 
 def _literal(value: object) -> str:
-    """Write a value as TOML; its strings, numbers, booleans and arrays are written as in JSON."""
+    """Format a value as TOML, whose strings, numbers, booleans and arrays are written as in JSON."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -1,7 +1,7 @@
-"""Recordings read into numpy: every cycle's record bit for bit, the log of events, and the texts beside them.
+"""Reading of recordings into numpy: each cycle's record bit for bit, the log of events, and the texts beside them.
 
 from trirail import read
-recording = read(Path("recordings/demo-20260101-120000.rrd"))
+recording = read("recordings/demo-20260101-120000.rrd")
 error = recording.records["following_error"]      # (N, 3) [m]; the fields are those of trirail.wire.records
 session = join([read(path) for path in parts])    # of a session whose recording was rotated, in any order
 """
@@ -11,12 +11,11 @@ from __future__ import annotations
 import os
 import shutil
 import struct
-import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -29,110 +28,50 @@ from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.errors import EmptyRecordingError, ServiceError
-from trirail.telemetry import recorded_cycles
-from trirail.telemetry.columns import RECORD
-from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS
+from trirail.telemetry.columns import FIELDS, RECORD, SECOND, layout
+from trirail.telemetry.journal import EVENTS, JSON, REQUESTS, WORDS, Line
 from trirail.telemetry.provenance import SOFTWARE
+from trirail.telemetry.recorded_inputs import decode_input
+from trirail.telemetry.recording import Recording
 from trirail.wire.decoding import decoded, prepare
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
+from trirail.wire.records import DTYPE
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from trirail.telemetry.alignments import RecordedAlignment
-
-# What an RRD file is made of: Rerun's crate re_log_encoding, src/rrd/frames.rs.
+# Structure of an RRD file: Rerun's crate re_log_encoding, src/rrd/frames.rs.
 _MAGIC = b"RRF2"
 _FILE_HEADER = 12
-"""Magic number, version and options [bytes]."""
+"""Size of magic number, version and options [bytes]."""
 _MESSAGE_HEADER = struct.Struct("<QQ")
-"""A message's kind, and how many bytes follow."""
+"""Kind of a message, and the number of bytes that follow."""
 _END = 0
-"""The kind of the last message of a file that was closed; only a table of contents follows."""
+"""Kind of the last message of a closed file; only a table of contents follows."""
 
 _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
 _KEPT = (RECORD, EVENTS, REQUESTS)
 T = TypeVar("T", bound=msgspec.Struct)
-prepare(ControlInput, Event)
+prepare(Event)
+BY_CYCLE = "cycle"
+"""Field by which records are sorted."""
+_LAYOUT = layout(DTYPE)
+"""Fields of the records, as Arrow types of a file."""
 
 
-class Line(NamedTuple):
-    """A line of the log: an event of the service, or what the recorder had to say."""
-
-    t: float
-    """Nominal time since the loop's start [s]."""
-    wall: np.datetime64
-    level: str
-    """INFO, WARN or ERROR."""
-    text: str
-    event: Event | None = None
-    """The event itself; None for what the recorder had to say."""
+class OlderRecordingWarning(UserWarning):
+    """Warning that a recording is older than some fields of its records."""
 
 
-class Recording(NamedTuple):
-    """What a recording holds."""
-
-    name: str
-    """The robot's name and when it began; empty if the file does not say."""
-    records: NDArray[np.void]
-    """Of every cycle, (N,), of wire.records.DTYPE, by rising `cycle`. Cycles that did not reach the file lack."""
-    t: NDArray[np.float64]
-    """Nominal times of the records since the loop's start, (N,) [s]."""
-    wall: NDArray[np.datetime64]
-    """Wall-clock times of the records, (N,), UTC [ns]."""
-    events: list[Line]
-    """The log, in order."""
-    texts: dict[str, str]
-    """Text documents that hold for the whole session, by entity path: /configuration, /software."""
-    requests: tuple[ControlInput, ...] = ()
-    """What the control was given, in order: goals and commands, each with the cycle that took it, and mishaps."""
-
-    def part(
-        self,
-        begin: float | None = None,
-        end: float | None = None,
-        *,
-        goal: str | None = None,
-        every: float | None = None,
-    ) -> Recording:
-        """Return a stretch of it: from and to some time `t` [s], while a `goal` of this id lasts, a row `every` [s].
-
-        Of the rows of such a time the first is taken, none is a mean. Requests are kept, for who looks up a goal.
-        Raises ServiceError where nothing is left, or there is no such goal.
-        """
-        from trirail.telemetry import recording_table
-
-        return recording_table.part(self, begin, end, goal=goal, every=every)
-
-    @property
-    def alignments(self) -> list[RecordedAlignment]:
-        """Alignments, calibrations of cameras and checks that clients told of, in order, with every look."""
-        from trirail.telemetry import alignments
-
-        return alignments.of(self.events)
-
-    def table(self, every: float | str | None = None, columns: Sequence[str] = ()) -> pd.DataFrame:
-        """Return the records as a DataFrame of pandas, by `t` [s], a row `every` so many seconds, or as "10ms".
-
-        SI units and radians; `columns` are names of fields, or words of names, as pose or error: all if absent. A
-        pose's numbers end in _x, _y, _phi, those of sliders in _a, _b, _c. Raises ServiceError where a column is none.
-        """
-        from trirail.telemetry import recording_table
-
-        return recording_table.frame(self, every, columns)
-
-
-def read(path: Path) -> Recording:
-    """Read a recording; of one that was cut off, or is still being written, all that is whole.
+def read(path: str | os.PathLike[str]) -> Recording:
+    """Read a recording; of one that was cut off, or is still being written, all complete messages.
 
     Rerun's own format (.rrd); the file is not changed. Fields, units and frames of the records are those of
     trirail.wire.records.FIELDS: SI units and radians, sliders in the order A, B, C, poses in the base frame.
-    Fields that an older version did not write are NaN, or 0 where they are no floats, and an OlderRecordingWarning says
-    so once. Raises ServiceError if the file cannot be read, is not a recording, or is of another version, and of its
-    kinds EmptyRecordingError if it holds no records.
+    Fields that an older version did not write are NaN, or 0 where they are not floats, with one OlderRecordingWarning.
+    Raises ServiceError if the file cannot be read, is not a recording, or is of another version; its subclass
+    EmptyRecordingError if it holds no records.
     """
+    path = Path(path)
     size = path.stat().st_size if path.is_file() else 0
     try:
         with _whole(path) as whole:
@@ -146,7 +85,7 @@ def read(path: Path) -> Recording:
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
     if SOFTWARE in texts and not kept:
         raise EmptyRecordingError(f"{path}: nothing was recorded: its service ended before the first cycle reached it")
-    records, t, wall = recorded_cycles.read([chunk.to_record_batch() for chunk in kept], path)
+    records, t, wall = _cycles([chunk.to_record_batch() for chunk in kept], path)
     return Recording(
         name=next(iter(_static(chunks, "RecordingInfo:name").values()), ""),
         records=records,
@@ -159,7 +98,7 @@ def read(path: Path) -> Recording:
 
 
 def join(parts: Sequence[Recording]) -> Recording:
-    """Put the parts of a session together, in any order. Raises ServiceError if they are of different sessions."""
+    """Join the parts of a session, given in any order. Raises ServiceError if they are of different sessions."""
     first, *others = sorted(parts, key=lambda part: int(part.records["cycle"][0]))
     for other in others:
         if (other.name, other.texts) != (first.name, first.texts):
@@ -181,9 +120,9 @@ def join(parts: Sequence[Recording]) -> Recording:
 
 @contextmanager
 def _whole(path: Path, *, growing: bool = False) -> Iterator[Path]:
-    """Give the file itself or, if its last message was cut off, a copy without that: Rerun would read none of it.
+    """Yield the file itself or, if its last message was cut off, a copy without it: Rerun would read none of it.
 
-    Of one that is growing, always a copy.
+    For a `growing` file, always yield a copy.
     """
     try:
         size, length = path.stat().st_size, _whole_length(path)
@@ -194,7 +133,7 @@ def _whole(path: Path, *, growing: bool = False) -> Iterator[Path]:
     if length == size and not growing:
         yield path
         return
-    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+    with files.temporary_folder() as folder:
         try:
             copy = Path(shutil.copyfile(path, f"{folder}/{path.name}"))
             os.truncate(copy, length)
@@ -204,7 +143,7 @@ def _whole(path: Path, *, growing: bool = False) -> Iterator[Path]:
 
 
 def _whole_length(path: Path) -> int:
-    """Return how many bytes of a file end with a whole message; all of a file that was closed."""
+    """Return the length of a file up to its last whole message [bytes]; all of a closed file."""
     with files.open_regular(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
@@ -221,7 +160,7 @@ def _whole_length(path: Path) -> int:
 
 
 def _chunks(whole: Path, path: Path) -> list[Chunk]:
-    """Return what there is of the records, the log and what holds for the whole session."""
+    """Return the chunks of the records and of the logs, and the static ones."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)  # it was cut off
@@ -233,20 +172,86 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
         raise ServiceError(f"{path}: cannot be read as a recording: {error}") from error
 
 
+def _cycles(
+    batches: Sequence[pa.RecordBatch], path: Path
+) -> tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.datetime64]]:
+    """Return records by rising cycle, with their times by `_times`.
+
+    Raises ServiceError, and warns of missing fields, as documented at `read`.
+    """
+    if not any(batch.num_rows for batch in batches):
+        raise ServiceError(f"{path}: holds no records of cycles (entity {RECORD}): was it made by trirail?")
+    parts = [batch.column(FIELDS.component).flatten() for batch in batches]
+    for kind in {part.type for part in parts}:
+        _check_layout(kind, path)
+    records, end = np.zeros(sum(map(len, parts)), DTYPE), 0
+    for part in parts:  # one batch at a time stays in the processor's cache while its fields are copied
+        end += len(part)
+        _place(part, records[end - len(part) : end])
+    t, wall = _times(batches)
+    if np.all(records["cycle"][1:] >= records["cycle"][:-1]):
+        return records, t, wall
+    order = np.argsort(records["cycle"], kind="stable")
+    return records[order], t[order], wall[order]
+
+
+def _check_layout(kind: pa.StructType, path: Path) -> None:
+    """Warn of fields that records of this kind lack. Raises ServiceError for unknown fields, or no cycle number."""
+    if odd := set(kind) - set(_LAYOUT):
+        names = ", ".join(sorted({field.name for field in odd}))
+        raise ServiceError(f"{path}: written by another version: its records differ in {names}")
+    there = {field.name for field in kind}
+    if missing := [name for name in DTYPE.names or () if name not in there]:
+        if BY_CYCLE in missing:
+            raise ServiceError(f"{path}: written by another version: its records have no {BY_CYCLE}")
+        warnings.warn(
+            f"{path}: written by an older version: its records have no {', '.join(missing)}; read as NaN, or 0 where "
+            "that is none",
+            OlderRecordingWarning,
+            stacklevel=4,
+        )
+
+
+def _place(part: pa.StructArray, records: NDArray[np.void]) -> None:
+    """Copy the fields that were read into zeroed records; missing floats become NaN."""
+    there = {field.name: values for field, values in zip(part.type, part.flatten(), strict=True)}
+    for name in DTYPE.names or ():
+        values = there.get(name)
+        if values is None:
+            if np.issubdtype(DTYPE[name].base, np.floating):
+                records[name] = np.nan
+        else:
+            flat = values.flatten() if records[name].ndim > 1 else values
+            records[name] = np.from_dlpack(flat).reshape(records[name].shape)
+
+
+def _times(batches: Sequence[pa.RecordBatch]) -> tuple[NDArray[np.float64], NDArray[np.datetime64]]:
+    """Return the times of rows: nominal, since the loop's start [s], and by the wall clock, UTC [ns]."""
+    t, wall = (
+        np.concatenate([np.from_dlpack(batch.column(timeline).view(pa.int64())) for batch in batches])
+        for timeline in ("t", "wall")
+    )
+    return t / SECOND, wall.view("datetime64[ns]")
+
+
 def _events(chunks: list[Chunk], path: Path) -> list[Line]:
     lines: list[Line] = []
     for batch in (chunk.to_record_batch() for chunk in chunks):
-        t, wall = recorded_cycles.times([batch])
+        t, wall = _times([batch])
         levels, texts = (_texts(batch, name, path, "events") for name in (_LEVEL, WORDS.component))
         spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
-        events = [_decoded(content[0], Event, path, "events") if content else None for content in spoken]
+        events = [_decoded(content[0], _event, path, "events") if content else None for content in spoken]
         lines += map(Line, t.tolist(), wall, levels, texts, events)
     return sorted(lines, key=lambda line: line.t)
 
 
+def _event(text: str) -> Event:
+    return decoded(text, Event)
+
+
 def _requests(chunks: list[Chunk], path: Path) -> tuple[ControlInput, ...]:
     rows = [row for chunk in chunks for row in _texts(chunk.to_record_batch(), JSON.component, path, "requests")]
-    found = (_decoded(row, ControlInput, path, "requests") for row in rows)
+    found = (_decoded(row, decode_input, path, "requests") for row in rows)
     return tuple(sorted(found, key=lambda given: given.seq))
 
 
@@ -257,9 +262,9 @@ def _texts(batch: pa.RecordBatch, component: str, path: Path, what: str) -> list
     return texts
 
 
-def _decoded(row: str, kind: type[T], path: Path, what: str) -> T:
+def _decoded(row: str, decode: Callable[[str], T], path: Path, what: str) -> T:
     try:
-        return decoded(row, kind)
+        return decode(row)
     except msgspec.DecodeError as error:
         raise ServiceError(f"{path}: written by another version: its {what} cannot be read: {error}") from error
 

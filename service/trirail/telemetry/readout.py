@@ -1,4 +1,4 @@
-"""The numbers beside the drawing: mode and what is wrong in words, pose, goal, override, sliders."""
+"""Readout beside the drawing: mode and fault in words, pose, goal, override, sliders."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from trirail.wire.vocabulary import MODES, Mode
 
 PATH = "/readout"
 _SPECIAL = str.maketrans({letter: f"\\{letter}" for letter in "\\`*_{}[]<>()#+-.!|~$&:"})
-"""ASCII punctuation that means something in Markdown is plain behind a backslash (CommonMark 2.4)."""
+"""Escapes of Markdown's special characters, which are plain text behind a backslash (CommonMark 2.4)."""
 
 _HEAD = "| | x [mm] | y [mm] | φ [°] | | {} | {} | {} |"
 _ALIGNED = f"|---|{'--:|' * 3}---|{'--:|' * 3}"
 
 
 class Standing(NamedTuple):
-    """What holds until it is said anew, and records do not say."""
+    """State that is not in the records, and holds until its next update."""
 
     goal: str | None = None
-    """The id of the goal under way."""
+    """Id of the goal under way."""
     target: Sequence[float] | None = None
-    """The pose that the goal leads to: x, y [m], phi [rad]; None for no goal or a jog."""
+    """Pose that the goal leads to: x, y [m], phi [rad]; None for no goal or a jog."""
     override: float = 1.0
-    """The rate at which motions are to run, 0 to 2."""
+    """Rate at which motions shall run, 0 to 2."""
     fault: str | None = None
-    """Why the robot is in fault."""
+    """Reason of the robot's fault."""
 
 
 def markdown(record: np.void, standing: Standing, names: Labels = NAMES) -> str:
-    """Return what holds at a record, of wire.records.DTYPE, for people: millimetres, degrees, micrometres."""
+    """Return the readout at a record, of wire.records.DTYPE, in millimetres, degrees and micrometres."""
     head = f"**{MODES[record['mode']].upper()}**   override {standing.override:.0%}"
     if standing.goal is not None:
         share, left = float(record["progress"]), float(record["remaining"])

@@ -1,10 +1,9 @@
-"""The recorder: takes records, events and frames, and gives them to the file and to the live view."""
+"""The recorder, which writes records, events and frames to the file and to the live view."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import sqlite3
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -17,40 +16,40 @@ from trirail_drivers import files
 
 from trirail.config import Config
 from trirail.errors import ServiceError
-from trirail.telemetry import provenance, retention
+from trirail.telemetry import contents, provenance, retention
 from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.contents import STAMP, Contents
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.rotation import RotatedFiles, claim
-from trirail.telemetry.session_index import SessionIndex
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput
-from trirail.wire.records import SIZE, last_cycle
+from trirail.wire.records import SIZE, last_cycle, unpack
 
 RECORDS_HZ = 5
-"""Batches of whole records a second to the file, at least."""
+"""Least number of batches of whole records a second to the file."""
 DRAWING_HZ = 1
-"""Batches of what is drawn a second to the file: fewer are smaller, and records are enough to draw it again."""
+"""Batches of drawings a second to the file: fewer take less space, and records suffice to draw them again."""
 LOOKS_HZ = 1
-"""How often a second it is looked whether files, folder, log or live view want something."""
+"""Checks a second of files, folder, log and live view."""
 TIDY_EVERY = 10.0
-"""How often the folder is looked at, and the index gets what is in the newest file [s]."""
+"""Interval of checking the folder, and of writing the newest file's sidecar [s]."""
 MB = 1e6
 
 
 class Recorder:
     """One recording, from start to close.
 
-    Its files are `path` or `<robot>-<date>-<time>.rrd` in `directory`, and where it is rotated the same with
-    `-part2` and so on; with telemetry.capture_can, every CAN frame goes to a .log file beside the first. A black
-    box, given its `name` and `reason` and not a path, is one file, which takes what room there is. What is in each
-    file is entered into the `index` when it is complete.
+    Its files are `path` or `<robot>-<date>-<time>.rrd` in `directory`, and when rotated the same with `-part2` and
+    so on; with telemetry.capture_can, all CAN frames are written to a .log file beside the first. A black box, given
+    its `name` and `reason` and not a path, is one file, which may fill the disk. With `sidecars`, the contents of each
+    file are written beside it, for `trirail sessions`.
 
-    `warn` is told what is missing; else that stands in the log alone. Raises ServiceError if the file cannot be
-    written or the live port is taken, FileError if `path` is no regular file.
+    `warn` receives reports of missing data; without it they are in the log alone. Raises ServiceError if the file
+    cannot be written or the live port is taken, FileError if `path` is no regular file.
     """
 
     def __init__(
@@ -61,9 +60,9 @@ class Recorder:
         path: Path | None = None,
         name: str | None = None,
         reason: str | None = None,
-        index: SessionIndex | None = None,
+        sidecars: bool = False,
         live: bool = True,
-        warn: Callable[[str], None] | None = None,
+        warn: Callable[[EventText], None] | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -74,7 +73,7 @@ class Recorder:
         session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():{STAMP}}"
         telemetry = config.telemetry
         self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
-        self._warn = warn or (lambda words: streams.say("warning", words))
+        self._warn = warn or (lambda text: streams.say("warning", text.text))
         server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
         try:
             first = claim(directory, session) if path is None else _overwrite(path)
@@ -87,18 +86,18 @@ class Recorder:
                 f"cannot write a recording to {path or directory}: {error.strerror}; {_remedy(error)}"
             ) from error
         self._frames_cause = ""
-        self._index, self._reason, self._wall_offset_ns = index, reason, started_ns - monotonic_ns()
+        self._sidecars, self._reason, self._wall_offset_ns = sidecars, reason, started_ns - monotonic_ns()
         self._contents: Contents | None = None
-        self._entered = ""
-        """Why nothing could be entered into the index, when that was last tried."""
+        self._unwritten = ""
+        """Reason why the last sidecar could not be written; empty if it was."""
         reserve = 0 if self._is_black_box else RESERVE
-        self._own_files = first.parent
+        self._first, self._own_files = first, first.parent
         self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9, self._warn)
         self._records = Batches(config.loop.rate_hz // RECORDS_HZ, self._record)
         streams.attach(self._files, DRAWING_HZ)
         self._live: Relay | None = None
         self.live_url = ""
-        """Where viewers connect; empty without a live view."""
+        """Address for viewers; empty without a live view."""
         if server:
             self._live = live_relay(streams.open(server))
             streams.attach(self._live, LIVE_HZ)
@@ -112,28 +111,28 @@ class Recorder:
         self._next_entry = 0.0
         self._untidy = ""
         self._troubled = ""
-        """What was said to get into no file."""
+        """Reported loss: data that is written to no file; empty for none."""
         self._well_at = 0.0
-        """When it will have got into one for long enough that this is said."""
+        """Time at which the end of the loss may be reported [s]."""
 
     @property
     def path(self) -> Path:
-        """The newest file of the recording."""
+        """Newest file of the recording."""
         return self._files.path
 
     @property
     def lost(self) -> int:
-        """Batches of records, events or frames that the disk did not take."""
+        """Number of batches of records, events or frames that could not be written."""
         return self._files.lost + (self._frames.lost if self._frames else 0)
 
     @property
     def cause(self) -> str:
-        """Why the disk did not take the newest of them; empty if none is lost."""
+        """Reason of the newest lost batch; empty if none is lost."""
         return self._files.cause or self._frames_cause
 
     @property
     def unrecorded(self) -> tuple[str, str]:
-        """What is taken now and gets into no file, and why; empty while all does."""
+        """Data that is currently written to no file, and the reason; empty while all is written."""
         if self._files.trouble:
             return "nothing is recorded", self._files.trouble
         if self._frames and self._frames.trouble:
@@ -142,12 +141,12 @@ class Recorder:
 
     @property
     def skipped(self) -> int:
-        """Batches that the live view was too slow for."""
+        """Number of batches that the live view was too slow for."""
         return self._live.skipped if self._live else 0
 
     @property
     def missing(self) -> tuple[int, int, int]:
-        """What is missing: batches in the file, in the live view, and cycles that this recorder was too slow for."""
+        """Numbers of missing batches in the file and in the live view, and of cycles that this recorder missed."""
         return self.lost, self.skipped, self._absent
 
     def records(self, batch: bytes) -> None:
@@ -162,10 +161,12 @@ class Recorder:
         self._records.add(batch)
         self._streams.records(batch)
         if self._contents is not None:
-            self._contents.records(batch, self._wall_offset_ns)
+            rows = unpack(batch)
+            began, ended = ((int(row["deadline_ns"]) + self._wall_offset_ns) * 1e-9 for row in (rows[0], rows[-1]))
+            self._contents.add_cycles(began, ended, len(rows))
 
     def save(self) -> None:
-        """Write all records that have been taken, and what was said: they outlive this process."""
+        """Write all records and log lines taken until now, so that they outlive this process."""
         self._records.flush()
         self._streams.save()
 
@@ -176,13 +177,13 @@ class Recorder:
             self._contents.event(event)
 
     def control_input(self, what: ControlInput) -> None:
-        """Take what the control was given."""
+        """Take an input of the control."""
         self._streams.control_input(what)
         if self._contents is not None:
             self._contents.control_input(what)
 
     def stands(self, standing: Standing) -> None:
-        """Take what holds from now on and records do not say."""
+        """Take the state, beside the records, that holds from now on."""
         self._streams.stands(standing)
 
     def bus_load(self, share: float) -> None:
@@ -196,21 +197,21 @@ class Recorder:
             self._frames_cause = self._frames.trouble or self._frames_cause
 
     def close(self) -> None:
-        """Write what is left and complete the file; waits a few seconds at most for a stuck disk or viewer."""
+        """Write the rest and complete the file; wait a few seconds at most for a stuck disk or viewer."""
         self._flush()
         if words := self._missing():
             self._streams.say("warning", words)
             self._streams.save()
         self._files.close()
-        self._enter()
+        self._write_sidecar()
         if self._frames:
             self._frames.close()
         if self._live:
             self._live.close()
 
     def _open(self, path: Path) -> rr.RecordingStream:
-        """Begin a file: with all in it that it takes to be looked at by itself."""
-        self._enter()
+        """Begin a file, with all that is needed to view it by itself."""
+        self._write_sidecar()
         self._contents = Contents(path.name, self._config.robot.name, reason=self._reason)
         stream = self._streams.open(rr.FileSink(path))
         for entity, text in provenance.texts(self._config).items():
@@ -218,26 +219,21 @@ class Recorder:
         self._streams.begin_anew()
         return stream
 
-    def _enter(self, *, running: bool = False) -> None:
-        """Enter what is in the newest file into the index: all of it, or with `running` what is so far.
-
-        One that has been deleted is taken out.
-        """
-        if self._index is None or self._contents is None:
+    def _write_sidecar(self, *, running: bool = False) -> None:
+        """Write the contents of the newest file beside it: final, or with `running` those until now."""
+        if not self._sidecars or self._contents is None:
             return
         self._contents.running = running
+        words, recording = "", self._own_files / self._contents.name
         try:
-            if (self._own_files / self._contents.name).exists():
-                self._index.put([self._contents])
-            else:
-                self._index.forget([self._contents.name])
-        except (sqlite3.Error, OSError) as error:
-            words = f"the index of sessions takes no more, trirail sessions makes it anew: {error}"
-        else:
-            words = ""
-        if words and words != self._entered:
-            self._warn(words)
-        self._entered = words
+            contents.save(recording, self._contents)
+        except FileNotFoundError:  # the recording was deleted
+            retention.sidecar(recording).unlink(missing_ok=True)
+        except OSError as error:
+            words = f"{retention.sidecar(recording)} cannot be written, trirail sessions reads the recording: {error}"
+            if words != self._unwritten:
+                self._warn(coded(words, EventCode.NOT_INDEXED, error=str(error)))
+        self._unwritten = words
 
     def _record(self, records: NDArray[np.void]) -> None:
         self._files.write_chunks(self._streams.scene.complete(records))
@@ -247,7 +243,7 @@ class Recorder:
         self._streams.flush()
 
     def _look_after(self) -> None:
-        """Rotate the file, tidy the folder and say what is missing, where it is time to."""
+        """Rotate the file, tidy the folder and report missing data, each if it is due."""
         t = self._streams.t
         if not self._is_black_box:
             self._rotate()
@@ -259,29 +255,31 @@ class Recorder:
         if t >= self._next_entry and self._contents is not None and self._contents.began is not None:
             self._next_entry = t + TIDY_EVERY
             if not self._files.trouble:
-                self._enter(running=True)
+                self._write_sidecar(running=True)
         if not self._tell_trouble(t) and t >= self._next_report and (words := self._missing()):
             self._next_report = t + REPORT_EVERY
-            self._warn(words)
+            lost, skipped, absent = self.missing
+            self._warn(coded(words, EventCode.RECORDING_INCOMPLETE, lost=lost, skipped=skipped, absent=absent))
 
     def _tell_trouble(self, t: float) -> bool:
-        """Say once that something gets into no file, and once that it does again; whether that is so or has just been.
+        """Report once when data is written to no file, and once when it is again; return whether a loss is reported.
 
-        A disk that is full now and then is told to be well when it has been for REPORT_EVERY.
+        The end of a loss is reported after REPORT_EVERY without one, since a disk may be full intermittently.
         """
         what, why = self.unrecorded
         if what:
             self._well_at = t + REPORT_EVERY
             if what != self._troubled:
-                self._warn(f"{what}: {why}")
+                code = EventCode.NOT_RECORDED if self._files.trouble else EventCode.NOT_CAPTURED
+                self._warn(coded(f"{what}: {why}", code, error=why))
             self._troubled = what
         elif self._troubled and t >= self._well_at:
             self._troubled = ""
-            self._warn(f"recorded again; {self._missing()}")
+            self._warn(coded(f"recorded again; {self._missing()}", EventCode.RECORDED_AGAIN))
         return bool(self._troubled)
 
     def _rotate(self) -> None:
-        """Go on in another file where it is time to; not where the disk is full, for that has no room for it."""
+        """Continue in another file if it is due, but not on a full disk, which has no space for it."""
         telemetry, volumes = self._config.telemetry, self._files
         full = volumes.age >= telemetry.rotate_minutes * 60.0 or volumes.size >= telemetry.rotate_mb * MB
         if full and not volumes.trouble:
@@ -290,17 +288,19 @@ class Recorder:
 
     def _tidy(self, folder: Path, at_most: float) -> None:
         try:
-            deleted = retention.tidy(folder, at_most)
-            if deleted and self._index is not None:
-                self._index.forget([path.name for path in deleted])
-        except (OSError, sqlite3.Error) as error:
-            words = f"cannot delete old recordings, or their rows in the index: {error}"
+            deleted = retention.tidy(folder, at_most, self._first.stem)
+            if deleted:
+                names = ", ".join(path.name for path in deleted)
+                words = f"deleted, since all recordings take more than telemetry.keep_mb = {at_most / MB:g}: {names}"
+                self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
+        except OSError as error:
+            words = f"cannot delete old recordings: {error}"
             if words != self._untidy:
                 self._untidy = words
-                self._warn(words)
+                self._warn(coded(words, EventCode.RECORDINGS_KEPT, error=str(error)))
 
     def _missing(self) -> str:
-        """Return what is missing, in words, if that is more than was last said."""
+        """Return a text about missing data if there is more than last reported, else ""."""
         if self.missing == self._reported:
             return ""
         self._reported = self.missing
@@ -312,14 +312,14 @@ class Recorder:
 
 
 def _remedy(error: OSError) -> str:
-    """What is to be done where no file can be begun."""
+    """Return a hint for when no file can be begun."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "make room on that disk; telemetry.keep_mb bounds what recordings take of it"
     return "telemetry.directory must be a folder that can be written"
 
 
 def _overwrite(path: Path) -> Path:
-    """Create an empty file, or empty it. Raises FileError for what is no file: a FIFO would wait for a reader."""
+    """Create an empty file, or empty it. Raises FileError if it is not regular: a FIFO would wait for a reader."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         files.check(path)

@@ -1,63 +1,110 @@
-"""The folder of recordings: which are in it, and which go when they take too much room."""
+"""Retention of recordings: the search of their folder, and deletion of the oldest when they take too much space.
+
+No clock decides here. A machine without a battery clock dates files years ahead, until it has the network's time. A
+file that is being written is known by its lock, and the order of files by the dates and numbers in their names.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 BLACK_BOX = "fault-"
-"""What the name of a black box begins with."""
-_NAME = re.compile(r"[A-Za-z0-9_-]+-\d{8}-\d{6}(-part\d+)?(-\d+)?\.rrd")
-"""Names that the recorder gives. Files with other names are somebody's own, and never deleted."""
-IN_USE = 10.0
-"""A file that was written to so short a time ago is being written, by this service or another one [s]."""
+"""Prefix of the names of black boxes."""
+_NAME = re.compile(r"(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-part(?P<part>\d+))?(-(?P<again>\d+))?\.rrd")
+"""Names given by the recorder. Files with other names belong to users, and are never deleted."""
+
+
+def sidecar(recording: Path) -> Path:
+    """Return the file with the contents of a recording: demo-20260131-120000.rrd.json."""
+    return recording.with_name(f"{recording.name}.json")
 
 
 class _Kept(NamedTuple):
     path: Path
     size: int
-    written: float
-    """[s since 1970]"""
+    order: tuple[bool, bool, str, str, int, int]
+    """Sorting key: older recordings first, by date, part and number in the name, those of the running session last."""
 
     @property
     def files(self) -> list[Path]:
-        """The recording, and the log of CAN frames beside it."""
-        return [path for path in (self.path, self.path.with_suffix(".log")) if path.exists()]
+        """The recording, and the files beside it: the log of CAN frames, and the sidecar."""
+        beside = (self.path, self.path.with_suffix(".log"), sidecar(self.path))
+        return [path for path in beside if path.exists()]
 
 
-def tidy(directory: Path, at_most: float, now: float | None = None) -> list[Path]:
-    """Delete the oldest recordings until all take no more than `at_most` bytes together; return which.
+def lock(path: Path) -> int:
+    """Lock a file as being written, and return the descriptor that holds the lock; -1 where it cannot be opened."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return -1
+    with contextlib.suppress(OSError):  # a network file system may have no locks
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    return descriptor
 
-    Black boxes go last, when nothing else is left to delete; what is being written stays. OSError if a file
-    cannot be deleted.
+
+def unlock(descriptor: int) -> None:
+    """Release the descriptor that `lock` returned."""
+    if descriptor >= 0:
+        os.close(descriptor)
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a recorder, of this or another process, has the file locked. Raises FileNotFoundError."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
+    """Delete the oldest recordings until all together take no more than `at_most` bytes; return the deleted ones.
+
+    Recordings of the running `session` are deleted after all others, regardless of dates, and black boxes last, when
+    nothing else is left; files that are being written stay. Raises OSError if a file cannot be deleted.
     """
-    found = sorted(_recordings(directory), key=lambda kept: (kept.path.name.startswith(BLACK_BOX), kept.written))
+    found = sorted(_recordings(directory, session), key=lambda kept: kept.order)
     total = sum(kept.size for kept in found)
-    free_since = (time.time() if now is None else now) - IN_USE
     deleted: list[Path] = []
     for kept in found:
         if total <= at_most:
             break
-        if kept.written > free_since:
-            continue
-        for path in kept.files:
-            path.unlink()
+        try:
+            if is_being_written(kept.path):
+                continue
+            for path in kept.files:
+                path.unlink()
+        except FileNotFoundError:  # somebody else deleted it just now
+            pass
+        else:
+            deleted.append(kept.path)
         total -= kept.size
-        deleted.append(kept.path)
     return deleted
 
 
-def _recordings(directory: Path) -> Iterator[_Kept]:
+def _recordings(directory: Path, session: str) -> Iterator[_Kept]:
     for path in directory.glob("*.rrd"):
-        if not _NAME.fullmatch(path.name):
+        match = _NAME.fullmatch(path.name)
+        if match is None:
             continue
         try:
-            status = path.stat()
             log = path.with_suffix(".log")
-            beside = log.stat().st_size if log.exists() else 0
-        except FileNotFoundError:  # somebody else deleted it just now
+            size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
+        except FileNotFoundError:
             continue
-        yield _Kept(path, status.st_size + beside, status.st_mtime)
+        name, date, part, again = match["name"], match["date"], int(match["part"] or 1), int(match["again"] or 1)
+        own = session != "" and path.stem.startswith(session)
+        yield _Kept(path, size, (f"{name}-" == BLACK_BOX, own, date, name, part, again))

@@ -1,4 +1,4 @@
-"""The files of a session's recording, one after the other, each complete in itself."""
+"""Rotated files of a session's recording, one after the other, each complete in itself."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ from pathlib import Path
 import rerun as rr
 from rerun.chunk import Chunk
 
+from trirail.telemetry import retention
 from trirail.telemetry.sinks import Archive
+from trirail.wire.event_codes import EventCode, EventText, coded
 
 SOON, RETRY = 1.0, 10.0
-"""How long after a file has failed another one is tried, and how often from then on [s]."""
+"""Delay from the failure of a file to the first attempt with another one, and interval of further attempts [s]."""
 TRIAL = 1 << 19
-"""What a new file must take before it is trusted [bytes]: more than it begins with, whose writing is not watched."""
+"""Test data that a new file must take [bytes]: more than its first content, whose writing is not checked."""
 
 Open = Callable[[Path], rr.RecordingStream]
 Close = Callable[[rr.RecordingStream], None]
 
 
 class RotatedFiles:
-    """Takes batches into the newest file; `turn` begins another one, and so does a file that fails, or that is deleted.
+    """Writer of batches into the newest file; another one begins on `turn`, or if the newest fails or is deleted.
 
-    `warn` is told of the latter.
+    `warn` receives a message on the latter.
     """
 
     def __init__(
@@ -34,12 +36,12 @@ class RotatedFiles:
         end: Close,
         reserve: int,
         clock: Callable[[], float],
-        warn: Callable[[str], None] = lambda _: None,
+        warn: Callable[[EventText], None] = lambda _: None,
     ) -> None:
         self.path = path
-        """The newest file."""
+        """Newest file."""
         self.cause = ""
-        """Why the newest of the lost batches was lost."""
+        """Reason of the newest lost batch."""
         self._first = path
         self._begin = begin
         self._end = end
@@ -48,40 +50,43 @@ class RotatedFiles:
         self._warn = warn
         self._number = 1
         self._lost_before = 0
-        self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # to destroy them would wait for their disk
+        self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # destroying them would wait for their disk
         self._retry: float | None = None
+        self._lock = -1
+        """Lock that shows others that the newest file is being written."""
         self._open()
 
     @property
     def lost(self) -> int:
-        """Batches that are in no file."""
+        """Number of batches that are in no file."""
         return self._lost_before + self._archive.lost
 
     @property
     def trouble(self) -> str:
-        """Why the last batch is in no file; empty if it is in one."""
+        """Reason why the last batch is in no file; empty if it is in one."""
         return self._archive.trouble
 
     @property
     def age(self) -> float:
-        """How long ago the newest file was begun [s]."""
+        """Age of the newest file [s]."""
         return self._clock() - self._began
 
     @property
     def size(self) -> int:
-        """How large the newest file is [bytes]."""
+        """Size of the newest file [bytes]."""
         try:
             return self.path.stat().st_size
         except OSError:
             return 0
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Write a batch, or count it as lost. Waits for the disk, but not for long."""
+        """Write a batch, or count it as lost; the wait for the disk is short."""
         now = self._clock()
         if self._archive.gone and (self._retry is None or now >= self._retry):
             self._retry, deleted = now + RETRY, self.path
             if self.turn():
-                self._warn(f"{deleted} has been deleted or moved: the recording goes on in {self.path}")
+                words = f"{deleted} has been deleted or moved: the recording goes on in {self.path}"
+                self._warn(coded(words, EventCode.RECORDING_MOVED, file=str(deleted), next=str(self.path)))
         self._archive.write_chunks(chunks)
         self.cause = self.trouble or self.cause
         if self._archive.gone:
@@ -95,7 +100,7 @@ class RotatedFiles:
             self.turn()
 
     def turn(self) -> bool:
-        """Go on in another file; False, and it goes on in this one, where that cannot be written."""
+        """Continue in another file; where that cannot be written, stay in this one and return False."""
         number = self._number + 1
         try:
             path = claim(self._first.parent, f"{self._first.stem}-part{number}")
@@ -107,6 +112,7 @@ class RotatedFiles:
         else:
             self._archive.close()
         self._end(self._stream)
+        retention.unlock(self._lock)
         self.path, self._number = path, number
         self._open()
         return True
@@ -114,15 +120,18 @@ class RotatedFiles:
     def close(self) -> None:
         """Complete the newest file, unless the disk is stuck."""
         self._archive.close()
+        retention.unlock(self._lock)
+        self._lock = -1
 
     def _open(self) -> None:
+        self._lock = retention.lock(self.path)
         self._stream = self._begin(self.path)
         self._archive = Archive(self._stream, self.path, self._reserve)
         self._began = self._clock()
 
 
 def claim(directory: Path, name: str) -> Path:
-    """Create an empty file with a name that is not taken. Raises OSError where one cannot be written."""
+    """Create an empty file with an unused name. Raises OSError where it cannot be written."""
     directory.mkdir(parents=True, exist_ok=True)
     path, number = directory / f"{name}.rrd", 1
     while True:
@@ -143,7 +152,7 @@ def claim(directory: Path, name: str) -> Path:
 
 
 def _try(descriptor: int) -> None:
-    """See whether what is written to a file gets to the disk: an empty file can be made on one that is full."""
+    """Check that data reaches the disk: an empty file can be created on a full one. Raises OSError."""
     if os.write(descriptor, bytes(TRIAL)) < TRIAL:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     os.fsync(descriptor)

@@ -1,8 +1,8 @@
-"""What Rerun is given of the robot: what stands still once, then columns made from records.
+"""Drawing of the robot in Rerun: static parts once, then columns made from records.
 
-`/record` holds every field of every record as it came, in SI units. All else is drawn from it for people: in
-millimetres, degrees and microseconds, thinned to what a screen can show. Where a curve is thinned, following
-error, lateness and cycle time show their worst, the rest their newest value.
+`/record` holds every field of every record unchanged, in SI units. All else is drawn from it for people: in
+millimetres, degrees and microseconds, thinned to the resolution of a screen. In thinned curves, following error,
+lateness and cycle time show their worst value, the rest their newest.
 """
 
 from __future__ import annotations
@@ -15,18 +15,139 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from trirail.telemetry import columns, curves, drawing, palette, readout, shown_alignment
+from trirail.config import FramesTable
+from trirail.kinematics.geometry import Geometry
+from trirail.naming import Labels
+from trirail.telemetry import columns, curves, palette, readout, shown_alignment
 from trirail.telemetry.columns import FIELDS, RECORD, Column
+from trirail.telemetry.palette import Colour
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.vocabulary import MODES
-from trirail.workspace.part_positions import RobotParts
+from trirail.workspace import part_positions
+from trirail.workspace.part_positions import Points, RobotParts
 from trirail.workspace.reach import Reach
 
+ORIGIN = 0.02
+"""Arms of the cross at the base frame's origin, as a share of the robot's size."""
+POSITIONS = rr.Points2D.descriptor_positions()
+STRIPS = rr.LineStrips2D.descriptor_strips()
+TRANSLATION = rr.Transform3D.descriptor_translation()
+QUATERNION = rr.Transform3D.descriptor_quaternion()
+_CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
+
+
+def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tuple[str, rr.AsComponents]]:
+    """Yield the static parts: entity path and archetype."""
+    yield "/robot", rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # 2D views have y downwards
+    yield "/robot/rails", _lines(parts.rails, [palette.FRAME], 4.5, order=10)
+    yield "/robot/travel", _lines(parts.travel, [palette.dark(c) for c in palette.SLIDERS], 3.0, order=11)
+    yield "/robot/stops", _lines(parts.stops, [palette.LIMIT], 1.2, order=12)
+    zeros = [f"{name}₀" for name in names]
+    yield "/robot/anchors", _labelled(parts.anchors, zeros, [palette.ANCHORS], 6.0, order=13)
+    yield "/robot/names", _labelled(parts.names, list(names), palette.SLIDERS, 0.0, order=13)
+    cross = ORIGIN * np.ptp(parts.bounds)
+    yield "/robot/origin", _lines([axis * cross for axis in _CROSS], [palette.ARMS], 0.8, order=14)
+    yield from _named(frames, cross)
+    yield "/robot/commanded/outline", _lines(parts.outline, [palette.COMMANDED], 4.5, order=20)
+    yield "/robot/platform/arms", _lines(parts.arms, [palette.ARMS], 0.8, order=21)
+    yield "/robot/platform/outline", _lines(parts.outline, [palette.PLATFORM], 2.2, order=22)
+    yield "/robot/platform/stops", _lines(parts.edge_stops, [palette.LIMIT], 1.2, order=23)
+    yield "/robot/workspace", _strips([palette.WORKSPACE], 0.8, order=15)
+    yield "/robot/goal", _strips([palette.GOAL], 1.0, order=24)
+    # Sleeves in which the platform's edges slide, or the carriages' cross slides.
+    yield "/robot/passive", _strips([palette.dark(c) for c in palette.SLIDERS], 5.5, order=25)
+    yield "/robot/trace", _strips([palette.CENTRE], 1.2, order=30)
+    yield (
+        "/robot/platform/centre",
+        rr.Points2D([[0.0, 0.0]], radii=rr.Radius.ui_points(4.0), colors=[palette.CENTRE], draw_order=31),
+    )
+    yield (  # each slider, and the pivot that the platform turns on
+        "/robot/sliders",
+        rr.Points2D.from_fields(
+            radii=[-8.5] * 3 + [-3.0] * 3,  # negative: points of the screen, not metres
+            colors=[*palette.SLIDERS, *[palette.PIN] * 3],
+            draw_order=32,
+        ),
+    )
+
+
+def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
+    """Return the moving parts in `records`, (N,), and the trace of the centre to them from `before`."""
+    sliders = part_positions.slider_points(geometry, records["position"])
+    crossing = part_positions.cross_slide_lines(geometry, parts, sliders, records["pose"][:, 2])
+    pivots = part_positions.pivot_points(geometry, sliders, records["pose"])
+    steps = np.stack([before["pose"][:, :2], records["pose"][:, :2]], axis=1)[:, None]
+    return [
+        *_placed("/robot/platform", records["pose"]),
+        *_placed("/robot/commanded", records["commanded_pose"]),
+        Column("/robot/sliders", POSITIONS, columns.vectors(np.concatenate([sliders, pivots], axis=1))),
+        Column("/robot/passive", STRIPS, columns.strips(crossing)),
+        Column("/robot/trace", STRIPS, columns.strips(steps)),
+    ]
+
+
+def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
+    """Return the platform at the goal's pose, with a cross at its centre; nothing without a goal."""
+    if pose is None:
+        return Column("/robot/goal", STRIPS, columns.ragged([[]]))
+    cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _CROSS]
+    lines = part_positions.transform_lines([*parts.outline, *cross], pose)
+    return Column("/robot/goal", STRIPS, columns.ragged([lines]))
+
+
+def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsComponents]]:
+    """Yield the tools on the platform and the axes of work frames, each with its name."""
+    if frames.tool:
+        tools = np.array(list(frames.tool.values()))
+        yield "/robot/platform/tools", _labelled(tools, list(frames.tool), [palette.CENTRE], 3.0, order=31)
+    for name, frame in frames.work.items():
+        along_x, along_y = np.array([[0.0, 0.0], [size, 0.0]]), np.array([[0.0, 0.0], [0.0, size]])
+        axes = part_positions.transform_lines([along_x, along_y], frame)
+        yield (
+            f"/robot/frames/{name}",
+            rr.LineStrips2D(
+                axes,
+                colors=[palette.ARMS],
+                radii=rr.Radius.ui_points(1.2),
+                labels=[f"{name} x", f"{name} y"],
+                show_labels=True,
+                draw_order=14,
+            ),
+        )
+
+
+def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:
+    return rr.LineStrips2D(lines, colors=colours, radii=rr.Radius.ui_points(radius), draw_order=order)
+
+
+def _strips(colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:
+    """Return the style of lines that are drawn later."""
+    return rr.LineStrips2D.from_fields(colors=colours, radii=rr.Radius.ui_points(radius), draw_order=order)
+
+
+def _labelled(
+    points: Points, labels: list[str], colours: Sequence[Colour], radius: float, *, order: float
+) -> rr.Points2D:
+    look = {"colors": colours, "radii": rr.Radius.ui_points(radius), "draw_order": order}
+    return rr.Points2D(points, labels=labels, show_labels=True, **look)
+
+
+def _placed(path: str, pose: Points) -> list[Column]:
+    """Return the transforms from the platform's frame to the base frame for poses (N, 3)."""
+    translation, quaternion = np.zeros((len(pose), 1, 3)), np.zeros((len(pose), 1, 4))
+    translation[:, 0, :2] = pose[:, :2]
+    quaternion[:, 0, 2], quaternion[:, 0, 3] = np.sin(pose[:, 2] / 2.0), np.cos(pose[:, 2] / 2.0)
+    return [
+        Column(path, TRANSLATION, columns.vectors(translation)),
+        Column(path, QUATERNION, columns.vectors(quaternion)),
+    ]
+
+
 DRAWN_HZ = 100
-"""Samples a second of what is drawn."""
+"""Samples of the drawing a second."""
 OUTLINES_HZ = 10
-"""Outlines of the workspace a second, at most."""
+"""Greatest number of outlines of the workspace a second."""
 
 MARKDOWN = rr.components.MediaType.MARKDOWN
 TEXT = rr.TextDocument.descriptor_text()
@@ -35,21 +156,21 @@ STATE = rr.StateChange.descriptor_state()
 
 
 class Scene:
-    """A robot as Rerun is to show it. `wall_offset_ns` is the wall clock less the monotonic one."""
+    """A robot for Rerun. `wall_offset_ns` is the wall clock less the monotonic one."""
 
     def __init__(self, robot: ShownRobot, wall_offset_ns: int) -> None:
         self._rate_hz = robot.rate_hz
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
         self._geometry, self._frames = robot.geometry, robot.frames
-        self._parts = RobotParts.of(robot.geometry, robot.limits.slider)
+        self._parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
         self._reach = Reach(robot.geometry, robot.limits)
         self._plots = curves.plots(robot)
         self.bounds = self._parts.bounds
-        """Where the robot lies, (2, 2): lowest and highest x and y [m]."""
+        """Bounds of the robot, (2, 2): lowest and highest x and y [m]."""
 
     def still(self) -> Iterator[tuple[str, rr.AsComponents]]:
-        """Yield what is logged once, as static: entity path and archetype."""
-        yield from drawing.still(self._parts, self._frames, self._geometry.labels)
+        """Yield the static parts: entity path and archetype."""
+        yield from still(self._parts, self._frames, self._geometry.labels)
         for path, lines in self._plots.items():
             yield path, _series(lines)
         for path in (readout.PATH, shown_alignment.TABLE):
@@ -64,20 +185,20 @@ class Scene:
         )
 
     def bus_load(self, share: float) -> Iterator[tuple[str, rr.AsComponents]]:
-        """Take the bus load in, 1 for a full bus; yield what is logged as static from then on."""
+        """Set the bus load, 1 for a full bus; yield the static parts that change with it."""
         self._plots[curves.TIMING] = lines = curves.timing(self._rate_hz, share)
         yield curves.TIMING, _series(lines)
 
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return records as they are."""
+        """Return whole records, unchanged."""
         return columns.chunks(self._timelines.of(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
     def drawn(self, records: NDArray[np.void], standing: Standing) -> list[Chunk]:
-        """Return records as people see them: one at least, in order. `standing` holds at the last of them."""
+        """Return the drawing of one or more records, in order. `standing` holds at the last of them."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         newest = records[ends]
-        parts = drawing.moving(self._geometry, self._parts, records[starts], newest)
-        distance = self._reach.distance(newest["pose"])
+        parts = moving(self._geometry, self._parts, records[starts], newest)
+        distance = self._reach.singularity_distance(newest["pose"])
         for path, values in curves.values(records, newest, starts, distance).items():
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
@@ -85,28 +206,29 @@ class Scene:
         return chunks + self._status(records) + self._readout(records[-1], standing)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
-        """Return the pose that the goal leads to from the time of `record` on; None for no goal."""
-        return columns.chunks(self._timelines.of(record.reshape(1)), [drawing.goal(self._parts, pose)])
+        """Return the drawing of the goal's pose from the time of `record` on; `pose` is None without a goal."""
+        return columns.chunks(self._timelines.of(record.reshape(1)), [goal(self._parts, pose)])
 
     def _readout(self, record: np.void, standing: Standing) -> list[Chunk]:
         text = pa.array([[readout.markdown(record, standing, self._geometry.labels)]])
         return columns.chunks(self._timelines.of(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
 
     def _status(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return mode and outline of the workspace at the first record, where the mode changes, and as φ changes."""
+        """Return mode and outline of the workspace at the first record, and at changes of the mode and of φ."""
         changed = np.diff(records["mode"], prepend=len(MODES)) != 0
         some = np.arange(0, len(records), max(1, self._rate_hz // OUTLINES_HZ))
-        steps = self._reach.steps(records["pose"][some, 2])
+        steps = self._reach.outline_indices(records["pose"][some, 2])
         changed[some] |= np.diff(steps, prepend=steps[0]) != 0
         at = records[changed]
         modes = pa.array([[MODES[mode]] for mode in at["mode"]])
-        outlines = columns.ragged([[self._reach.outline(step)] for step in self._reach.steps(at["pose"][:, 2])])
-        parts = [Column("/mode", STATE, modes), Column("/robot/workspace", drawing.STRIPS, outlines)]
+        indices = self._reach.outline_indices(at["pose"][:, 2])
+        outlines = columns.ragged([[self._reach.outline(index)] for index in indices])
+        parts = [Column("/mode", STATE, modes), Column("/robot/workspace", STRIPS, outlines)]
         return columns.chunks(self._timelines.of(at), parts)
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first and the last row of every run of rows whose cycles belong to the same group of `size`."""
+    """Return the first and the last row of each run of rows whose cycles are in the same group of `size`."""
     changes = np.flatnonzero(np.diff(cycles // max(1, size))) + 1
     return np.concatenate([[0], changes]), np.concatenate([changes, [len(cycles)]]) - 1
 

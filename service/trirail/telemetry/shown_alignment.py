@@ -1,4 +1,4 @@
-"""An alignment as Rerun shows it: curves of what marks have to go, and a table of the last one."""
+"""Drawing of an alignment in Rerun: curves of the marks' residuals, and a table of the last alignment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trirail.wire.messages import Event
 
 RESIDUALS, TABLE = "/alignment/residual", "/alignment/table"
 MOST_LOOKS = 8
-"""Columns of the table, the newest."""
+"""Number of newest looks in the table, a column each."""
 _TEXT = rr.TextDocument.descriptor_text()
 _SCALARS = rr.Scalars.descriptor_scalars()
 
@@ -28,7 +28,7 @@ class ShownAlignment:
         self._looks: list[AlignmentLook] = []
 
     def drawing_of(self, event: Event, look: AlignmentLook) -> list[Chunk]:
-        """Take a look, and return what is drawn of it."""
+        """Take a look, and return its drawing."""
         if self._looks and (self._looks[0].id, self._looks[0].purpose) != (look.id, look.purpose):
             self._looks.clear()
         self._looks = [*self._looks, look][-MOST_LOOKS:]
@@ -60,5 +60,5 @@ def _cell(look: AlignmentLook, name: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text from outside without what Markdown would obey."""
+    """Return text from outside with Markdown's special characters escaped."""
     return "".join(f"\\{character}" if character in r"\`*_{}[]()<>#+-!|~" else character for character in text)

@@ -1,4 +1,4 @@
-"""What must be known of a robot to show it: of its configuration, or of what its service tells."""
+"""Data of a robot for its drawing: from its configuration, or from its service."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ prepare(GeometryTable)
 
 @dataclass(frozen=True, slots=True)
 class ShownRobot:
-    """The robot that is shown."""
+    """Data of a robot for its drawing."""
 
     name: str
     geometry: Geometry
@@ -26,7 +26,7 @@ class ShownRobot:
 
     @classmethod
     def configured(cls, settings: Config) -> ShownRobot:
-        """Take it from a configuration."""
+        """Return the robot of a configuration."""
         return cls(
             settings.robot.name,
             config.geometry(settings.geometry),
@@ -37,7 +37,7 @@ class ShownRobot:
 
     @classmethod
     def of_info(cls, info: Info) -> ShownRobot:
-        """Take it from a service's answer. msgspec.ValidationError or ConfigError where that is of another version."""
+        """Return the robot of a service's answer. Raises msgspec.ValidationError or ConfigError for other versions."""
         each = [_leg(leg) for leg in info.geometry]
         legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
         limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)

@@ -1,7 +1,7 @@
-"""Where a recording goes: a file that gets everything, and a live view that may be slow, frozen or absent.
+"""Sinks of a recording: a file for everything, and a live view that may be slow, frozen or absent.
 
-Rerun's sinks do not report their failures: they stop taking data, and then block for ever whoever sends more.
-Here each is kept from that, and what it does not get is counted.
+Rerun's sinks do not report their failures: they stop taking data, and then block every sender for ever.
+This module prevents that, and counts the data that a sink does not get.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from trirail.errors import ServiceError
 
 HOST = "127.0.0.1"
 BACKLOG = 20
-"""Batches that may wait for the live view: 2 s."""
+"""Greatest number of batches that wait for the live view: 2 s."""
 RESERVE = 64 << 20
-"""Free space left on the disk [bytes]: a file sink that once met a full disk never recovers."""
+"""Space left free on the disk [bytes]: a file sink never recovers from a full disk."""
 PATIENCE = 2.0
-"""How long to wait for the disk, or for a thread to end [s]."""
+"""Time-out for the disk, or for the end of a thread [s]."""
 
 
 def no_room(directory: Path, reserve: int) -> str:
-    """Why nothing is to be written there, where so many bytes are to stay free; empty while it is."""
+    """Return why nothing can be written there with `reserve` bytes left free; else ""."""
     try:
         free = shutil.disk_usage(directory).free
     except OSError as error:
@@ -41,7 +41,7 @@ def no_room(directory: Path, reserve: int) -> str:
 
 
 def identity(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from another one that has its name later; None where there is none."""
+    """Return the device and inode, which distinguish a file from a later one of its name; None without a file."""
     try:
         found = path.stat()
     except OSError:
@@ -50,7 +50,7 @@ def identity(path: Path) -> tuple[int, int] | None:
 
 
 class Archive:
-    """A recording file; every batch is handed to the operating system before the next.
+    """A recording file; each batch is passed to the operating system before the next.
 
     It leaves `reserve` bytes of the disk free.
     """
@@ -59,7 +59,7 @@ class Archive:
         self.lost = 0
         """Batches that are not in the file."""
         self.trouble = ""
-        """Why the last batch is not in the file; empty if it is."""
+        """Reason why the last batch is not in the file; empty if it is."""
         self._stream = stream
         self._reserve = reserve
         self._path = path
@@ -68,18 +68,18 @@ class Archive:
         self._stuck = False
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Write a batch, or count it as lost. Waits for the disk, but not for long."""
+        """Write a batch, or count it as lost; the wait for the disk is short."""
         self.trouble = self._write(chunks)
         self.lost += bool(self.trouble)
 
     @property
     def gone(self) -> bool:
-        """Whether the file has been deleted or moved: what is written gets nowhere where it would be looked for."""
+        """Whether the file has been deleted or moved: data written to it would not be found."""
         return identity(self._path) != self._identity
 
     @property
     def stuck(self) -> bool:
-        """Whether the file takes nothing any more: Rerun's sink does not recover from a disk that has failed it."""
+        """Whether the file takes no more data: Rerun's sink does not recover from a failed disk."""
         return self._stuck
 
     def close(self) -> None:
@@ -88,7 +88,7 @@ class Archive:
             self._stream.disconnect()
 
     def _write(self, chunks: list[Chunk]) -> str:
-        """Write a batch; return why it could not be, or nothing."""
+        """Write a batch; return the reason of a failure, else ""."""
         if self.gone:
             return f"{self._path} has been deleted or moved, and no other file can be begun there"
         if full := no_room(self._directory, self._reserve):
@@ -101,7 +101,7 @@ class Archive:
     def _flushed(self, within: float) -> bool:
         try:
             self._stream.flush(timeout_sec=within)
-        except RuntimeError:  # the only sign of a failing disk: what was sent is not written in time
+        except RuntimeError:  # the only sign of a failing disk: data is not written in time
             self._stuck = True
         else:
             self._stuck = False
@@ -109,11 +109,11 @@ class Archive:
 
 
 class Relay:
-    """Hands batches on in a thread of its own, and skips to the newest when the receiver falls behind."""
+    """Relay of batches in its own thread, which skips to the newest when the receiver falls behind."""
 
     def __init__(self, deliver: Callable[[list[Chunk]], None], finish: Callable[[], None]) -> None:
         self.skipped = 0
-        """Batches that were not handed on."""
+        """Number of batches that were not delivered."""
         self._deliver = deliver
         self._finish = finish
         self._waiting: deque[list[Chunk]] = deque()
@@ -123,7 +123,7 @@ class Relay:
         self._thread.start()
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Take a batch; never blocks."""
+        """Enqueue a batch without blocking."""
         with self._changed:
             if len(self._waiting) == BACKLOG:
                 self.skipped += BACKLOG
@@ -132,7 +132,7 @@ class Relay:
             self._changed.notify()
 
     def close(self) -> None:
-        """Hand on what waits, unless the receiver is stuck."""
+        """Deliver the waiting batches, unless the receiver is stuck."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -150,7 +150,7 @@ class Relay:
 
 
 def free_port() -> int:
-    """Return a port of the loopback that nobody listens on."""
+    """Return an unused port of the loopback."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         port: int = probe.getsockname()[1]
@@ -168,19 +168,19 @@ def _serves(descriptor: int, port: int) -> bool:
         if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
             return False
         with socket.socket(fileno=os.dup(descriptor)) as connection:
-            connection.getpeername()  # the one that listens has none
+            connection.getpeername()  # raises for the listening socket, which has no peer
             return connection.family == socket.AF_INET and connection.getsockname()[1] == port
     except OSError:  # closed meanwhile
         return False
 
 
 def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
-    """Return a server for viewers on this machine, that keeps so much of the past for those who connect late.
+    """Return a server for viewers on this machine, that keeps `memory_mb` of the past for those that connect late.
 
-    They get the newest first: the present is there at once, and the past fills in behind it.
+    They get the newest data first: the present is shown immediately, and the past is filled in afterwards.
     Raises ServiceError if the port is taken.
     """
-    with socket.socket() as probe:  # the sink would only log it, and discard all that it is sent
+    with socket.socket() as probe:  # the sink would only log a taken port, and discard all data
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((HOST, port))
@@ -197,6 +197,6 @@ def live_relay(stream: rr.RecordingStream) -> Relay:
 
     def deliver(chunks: list[Chunk]) -> None:
         stream.send_chunks(chunks)
-        stream.flush()  # a slow viewer is waited for here, before Rerun's own queues fill the memory
+        stream.flush()  # wait here for a slow viewer, before Rerun's own queues fill the memory
 
     return Relay(deliver, stream.disconnect)

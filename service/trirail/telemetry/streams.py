@@ -1,4 +1,4 @@
-"""What loops say, made into what sinks are given: drawings in batches, the goal, lines of the log."""
+"""Conversion of the loops' messages for sinks: drawings in batches, the goal, lines of the log."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ from trirail.wire.records import DTYPE, unpack
 
 APPLICATION = "trirail"
 LIVE_HZ = 5
-"""Batches of what is drawn a second to a live view: its picture moves as often."""
+"""Batches of drawings a second to a live view: the rate of its picture."""
 REPORT_EVERY = 10.0
-"""How often the log may say that something is missing [s]."""
+"""Least interval between reports of missing data in the log [s]."""
 
 
 class Sink(Protocol):
-    """Takes batches; what it cannot take it counts."""
+    """Receiver of batches, which counts those that it cannot take."""
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Take a batch; never waits for long."""
+        """Take a batch without a long wait."""
 
 
 class Streams:
-    """One robot's recording, with its drawing and its layout, and the sinks that it goes to.
+    """Recording of one robot, with its drawing and its layout, and its sinks.
 
-    With a `root`, an entity, all of it is below that: others may be in the same recording.
+    All its entities are below the entity `root`, if given: other robots may be in the same recording.
     """
 
     def __init__(self, robot: ShownRobot, name: str, wall_offset_ns: int, root: str = "") -> None:
         self.scene = Scene(robot, wall_offset_ns)
         self.shown = Shown(robot, self.scene.bounds, root)
-        """What a layout is made of."""
+        """Data of the robot for a layout."""
         self._name = name
         self._rate_hz = robot.rate_hz
         self._wall_offset_ns = wall_offset_ns
@@ -63,7 +63,7 @@ class Streams:
         self._alignment = ShownAlignment()
 
     def open(self, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
-        """Return a stream of this recording to a sink of Rerun's, with what stands still and the layout in it."""
+        """Return a stream of this recording to a sink of Rerun, with the static parts and the layout in it."""
         stream = rr.RecordingStream(APPLICATION, recording_id=self._recording)
         stream.set_sinks(sink, default_blueprint=blueprint.layout(self.shown))
         stream.send_recording_name(self._name)
@@ -71,15 +71,15 @@ class Streams:
         return stream
 
     def join(self, stream: rr.RecordingStream) -> None:
-        """Give a stream what stands still, now and when it changes."""
+        """Send the static parts to a stream, now and when they change."""
         for path, archetype in self.scene.still():
             stream.log(f"{self.shown.root}{path}", archetype, static=True)
         self._streams.append(stream)
 
     def attach(self, sink: Sink, drawing_hz: int) -> None:
-        """Give a sink everything that is said from now on, and so many batches of drawings a second.
+        """Pass all later messages to a sink, and `drawing_hz` batches of drawings a second.
 
-        Called anew, it changes how many. Sinks of the same pace share their drawings: to draw costs the most.
+        Another call changes the rate. Sinks of the same rate share their drawings, since drawing costs the most.
         """
         if self._paces.get(sink) == drawing_hz:
             return
@@ -102,7 +102,7 @@ class Streams:
         self._newest = batch[-DTYPE.itemsize :]
 
     def stands(self, standing: Standing) -> None:
-        """Take what holds from the next record on."""
+        """Take the state that holds from the next record on."""
         self._goal_drawn = self._goal_drawn and standing.target == self._standing.target
         self._standing = standing
 
@@ -119,7 +119,7 @@ class Streams:
             self._waiting += self._alignment.drawing_of(event, event.alignment)
 
     def control_input(self, what: ControlInput) -> None:
-        """Take what the control was given."""
+        """Take an input of the control."""
         self._entries.append(journal.control_input(what, self._rate_hz, self._wall_offset_ns))
 
     def say(self, level: Level, message: str) -> None:
@@ -128,15 +128,15 @@ class Streams:
         self._entries.append(Entry(EVENTS, self.t, wall, message, level))
 
     def begin_anew(self) -> None:
-        """Say with the next records again what else is said only when it changes: a sink has begun a new file."""
+        """Repeat with the next records the data that is otherwise sent only on change: a sink has begun a new file."""
         self._goal_drawn = self._standing.target is None
 
     def drop(self, stream: rr.RecordingStream) -> None:
-        """Let go of a stream: it is complete."""
+        """Remove a complete stream."""
         self._streams.remove(stream)
 
     def save(self) -> None:
-        """Pass on what was said: together, for a batch costs about the same with one line or ten."""
+        """Pass on the messages taken until now, together: a batch costs about the same with one line or ten."""
         chunks = self._placed(self._waiting + journal.chunks(self._entries))
         self._waiting, self._entries = [], []
         if chunks:
@@ -144,7 +144,7 @@ class Streams:
                 sink.write_chunks(chunks)
 
     def flush(self) -> None:
-        """Pass on all there is."""
+        """Pass on all messages and records."""
         self.save()
         for batches in self._batches.values():
             batches.flush()
@@ -166,7 +166,7 @@ class Streams:
 
 
 def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
-    """Return a stream to a sink of Rerun's, in which several robots are side by side, each below its root."""
+    """Return a stream to a sink of Rerun, with several robots side by side, each below its root."""
     stream = rr.RecordingStream(APPLICATION, recording_id=str(uuid.uuid4()))
     stream.set_sinks(sink, default_blueprint=blueprint.side_by_side([streams.shown for streams in several]))
     stream.send_recording_name(name)
@@ -176,7 +176,7 @@ def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.
 
 
 class Shortfall:
-    """Says in the log what is missing, when that is more than was last said, and not too often."""
+    """Report of missing data in the log, when there is more than last reported, and not too often."""
 
     def __init__(self, streams: Streams, words: str, counts: Callable[[], tuple[int, ...]]) -> None:
         self._streams = streams
@@ -186,7 +186,7 @@ class Shortfall:
         self._next = 0.0
 
     def check(self) -> None:
-        """Say it if it is time to."""
+        """Write the report if it is due."""
         missing = self._counts()
         if missing != self._said and self._streams.t >= self._next:
             self._said, self._next = missing, self._streams.t + REPORT_EVERY
@@ -194,7 +194,7 @@ class Shortfall:
 
 
 class Batches:
-    """Records, put together until there are enough to be worth passing on."""
+    """Records, collected until there are enough to pass on."""
 
     def __init__(self, size: int, deliver: Callable[[NDArray[np.void]], None]) -> None:
         self._enough = max(1, size) * DTYPE.itemsize
@@ -202,13 +202,13 @@ class Batches:
         self._pending = bytearray()
 
     def add(self, batch: bytes) -> None:
-        """Add packed records; pass all on if that makes enough."""
+        """Add packed records; pass all on if there are enough."""
         self._pending += batch
         if len(self._pending) >= self._enough:
             self.flush()
 
     def flush(self) -> None:
-        """Pass on what there is."""
+        """Pass on the collected records."""
         if self._pending:
             records = unpack(bytes(self._pending))
             self._pending.clear()

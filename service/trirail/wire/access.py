@@ -70,14 +70,15 @@ def router_access_control(
 
     Its users may with every robot what they may with one. `behind` has who dials it: a robot with itself, or another
     router with the robots behind that. Either may what robots let their router do, the other way round, and that with
-    keys of these robots only. Nobody's role is a robot's to tell: the router knows it. `router` is one that it dials
-    itself, as a robot does.
+    keys of these robots only. The robot that is asked tells a user's role. `router` is one that it dials itself, as a
+    robot does.
     """
     section = access_control("*", users, router)
     for name, robots in behind.items():
         through: list[_Rule] = []
         for robot in robots:
-            through += [_mirrored(f"{name}: {robot}", rule) for rule in (*_of_every_user(robot), *_of_router(robot))]
+            rules = (*_of_every_certificate(robot), *_of_every_user(robot), *_of_router(robot))
+            through += [_mirrored(f"{name}: {robot}", rule) for rule in rules]
         section["rules"] += through
         section["policies"].append(_policy(name, through))
         section["subjects"].append(_subject(name))

@@ -30,11 +30,20 @@ class Credentials(NamedTuple):
     """At which host names and IP addresses clients find a robot; none for a user's."""
     serves: bool = False
     """Whether it is a robot's or a router's; a user's is good for a client alone."""
+    contents: tuple[bytes, ...] = ()
+    """Contents of the three files, as they were checked."""
+    copies: tuple[Path, ...] = ()
+    """Files in this process's memory with these contents, in place of those in the folder."""
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
         """The authority's certificate, one's own, and its private key."""
-        return self.folder / AUTHORITY, self.folder / CERTIFICATE, self.folder / KEY
+        authority, certificate, key = self.copies or (self.folder / name for name in (AUTHORITY, CERTIFICATE, KEY))
+        return authority, certificate, key
+
+    def in_memory(self) -> Self:
+        """Return the same with files in this process's memory: what happens in the folder matters no more."""
+        return self._replace(copies=tuple(map(_memory_file, self.contents)))
 
     @classmethod
     def read(cls, folder: Path, now: datetime | None = None) -> Self:
@@ -69,7 +78,14 @@ class Credentials(NamedTuple):
         expires = min(certificate.not_valid_after_utc, authority.not_valid_after_utc)
         if now > expires:
             raise ServiceError(f"{certificate_file}: expired on {expires:%Y-%m-%d}; trirail keys renew makes a new one")
-        return cls(folder, common_name(certificate), expires, tuple(addresses_of(certificate)), serves(certificate))
+        return cls(
+            folder,
+            common_name(certificate),
+            expires,
+            tuple(addresses_of(certificate)),
+            serves(certificate),
+            (authority_pem, certificate_pem, key_pem),
+        )
 
     @classmethod
     def read_server(cls, folder: Path) -> Self:
@@ -88,6 +104,19 @@ class Credentials(NamedTuple):
         if left > WARNED:
             return ""
         return f"the certificate in {self.folder} expires in {left.days} days; trirail keys renew makes a new one"
+
+
+class Admission(NamedTuple):
+    """Who serves, and who may do what: read once when a service starts, for every start of its gateway."""
+
+    credentials: Credentials
+    users: dict[str, Role]
+    """The role of each user who is not revoked."""
+
+    @classmethod
+    def read(cls, folder: Path, users: Mapping[str, Role]) -> Self:
+        """Read the folder of a robot. Raises ServiceError as `Credentials.read_server` and `revoked`."""
+        return cls(Credentials.read_server(folder), with_role(users, folder))
 
 
 def check_private(key_file: Path) -> None:
@@ -126,6 +155,13 @@ def credentials_for(robot: str, locator: str, folder: Path | str | None = None) 
     if folder is not None:
         raise ServiceError(f"{locator}: credentials are for tls/HOST:PORT; nothing else is encrypted")
     return None
+
+
+def _memory_file(content: bytes) -> Path:
+    """Return the path of a new file in memory, there for as long as this process."""
+    descriptor = os.memfd_create("credentials")
+    os.write(descriptor, content)
+    return Path(f"/proc/self/fd/{descriptor}")
 
 
 def _content(file: Path) -> bytes:

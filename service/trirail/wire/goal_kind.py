@@ -8,7 +8,7 @@ import pkgutil
 from types import ModuleType
 from typing import Annotated, ClassVar, Self
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 from trirail_drivers.interface import Triple
 
 from trirail.wire.sizes import MAX_NAME
@@ -21,8 +21,6 @@ Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
 Acceleration = Annotated[float, Meta(ge=-1e6, le=1e6)]
 OwnLimit = Annotated[float, Meta(ge=1e-4, le=1e6)]
 Coordinates = tuple[Coordinate, Coordinate, Coordinate]
-Speed = Annotated[float, Meta(ge=1e-3, le=1.0)]
-Validity = Annotated[float, Meta(ge=1e-3, le=86_400.0)]
 Moment = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
 Clock = Annotated[float, Meta(ge=-1e11, le=1e11)]
 OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
@@ -55,6 +53,45 @@ class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+
+# Fields that goals of several kinds have. What they are for stands here alone: schemas, the command line and the table
+# of service/talking.md have it from here.
+OwnId = Annotated[
+    Identifier | None,
+    Meta(description="your name for the goal, used once; made by the service if absent"),
+]
+ValidFor = Annotated[
+    Annotated[float, Meta(ge=1e-3, le=86_400.0)] | None,
+    Meta(description="time within which the goal must start [s]; else it expires"),
+]
+Speed = Annotated[
+    float,
+    Meta(ge=1e-3, le=1.0, description="share of full speed"),
+]
+GoalLimits = Annotated[
+    OwnLimits | None,
+    Meta(description="its own velocity, acceleration, jerk, within the robot's"),
+]
+Blend = Annotated[
+    Annotated[float, Meta(ge=0.0, le=1e3)] | None,
+    Meta(description="radius in which the path joins that of the next goal [m]"),
+]
+ToolPoint = Annotated[
+    Tool | None,
+    Meta(description="point of the platform, [u, v] in its frame [m], or a name of [frames.tool]"),
+]
+PoseFrame = Annotated[FrameName, Meta(description="frame of the pose, of [frames.work]")]
+AxesFrame = Annotated[FrameName, Meta(description="axes of the move: base, platform, or of [frames.work]")]
+
+
+def field_description(kind: type[Struct], name: str) -> str:
+    """Return what a field of a kind of goal is for. Raises LookupError where that does not stand in its type."""
+    for field in structs.fields(kind):
+        for meta in getattr(field.type, "__metadata__", ()):
+            if field.name == name and isinstance(meta, Meta) and meta.description is not None:
+                return meta.description
+    raise LookupError(f"{kind.__name__}.{name} has no description in its type")
 
 
 class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
@@ -96,6 +133,11 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     def settle(self) -> bool:
         """Whether it is done only when the robot is measured to be in position."""
         return not self.renewed
+
+    @property
+    def lengthy(self) -> bool:
+        """Whether goals of other users are planned before it, since its planning takes long."""
+        return False
 
     @property
     def timeout(self) -> float:

@@ -13,11 +13,13 @@ from trirail.wire.kinds.sliders import SlidersGoal
 from trirail.wire.kinds.track import TrackGoal
 from trirail.wire.kinds.trajectory import SHORTEST_PIECE, TrajectoryGoal, TrajectoryPoint
 from trirail.wire.kinds.velocity import VelocityGoal
+from trirail.wire.packed_trajectory import PackedTrajectory
 
 __all__ = [
     "SHORTEST_PIECE",
     "Coordinates",
     "Goal",
+    "LoopGoal",
     "MoveGoal",
     "NamedGoal",
     "OwnLimits",
@@ -28,13 +30,25 @@ __all__ = [
     "TrajectoryGoal",
     "TrajectoryPoint",
     "VelocityGoal",
+    "kind_name",
 ]
 
 import_all(kinds)
-KINDS: tuple[type[GoalKind], ...] = tuple(sorted(GoalKind.__subclasses__(), key=lambda kind: kind.__module__))
+KINDS: tuple[type[GoalKind], ...] = tuple(
+    sorted(set(GoalKind.__subclasses__()) - {PackedTrajectory}, key=lambda kind: kind.__module__)
+)
 """All that there are: a kind is whatever has a file in trirail.wire.kinds."""
 
 if TYPE_CHECKING:
     Goal = GoalKind
+    LoopGoal = GoalKind
 else:
     Goal = Union[KINDS]  # noqa: UP007 - of as many as there are
+    LoopGoal = Union[(*KINDS, PackedTrajectory)]
+"""A goal of any kind, as it is sent; and as gateway, loop, planner and recordings have it."""
+
+
+def kind_name(goal: GoalKind) -> str:
+    """Return the name of a goal's kind, for people."""
+    kind = TrajectoryGoal if isinstance(goal, PackedTrajectory) else type(goal)
+    return kind.__name__.removesuffix("Goal").lower()

@@ -6,14 +6,17 @@ AF_UNIX sockets of type SEQPACKET keep packets whole and in order.
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
+from array import array
 from pathlib import Path
 
-from trirail.wire.sizes import MAX_PACKET
+from trirail.wire.sizes import MAX_PACKET, MAX_SHARED
 
 _BUFFER = 1 << 22
 """Bytes the kernel may hold for a peer that is slow: seconds of records, where the rights allow it."""
+_DESCRIPTOR = array("i").itemsize
 
 
 class Closed(Exception):
@@ -21,15 +24,18 @@ class Closed(Exception):
 
 
 class TooLarge(Exception):
-    """A packet that the other side would get cut."""
+    """A packet that is larger than any goal or motion."""
 
 
 class PacketLink:
-    """One side of a connection; neither sending nor receiving ever waits."""
+    """One side of a connection; neither sending nor receiving ever waits.
 
-    def __init__(self, connected: socket.socket, largest: int = MAX_PACKET) -> None:
+    A packet above MAX_PACKET is a file in memory whose descriptor is sent: the kernel's limit for a socket's buffer,
+    net.core.wmem_max, is 208 kB as a rule.
+    """
+
+    def __init__(self, connected: socket.socket) -> None:
         connected.setblocking(False)
-        self._largest = largest
         for option in (socket.SO_SNDBUF, 32):  # 32: SO_SNDBUFFORCE, beyond the system's limit, for root only
             with contextlib.suppress(PermissionError):
                 connected.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
@@ -44,16 +50,24 @@ class PacketLink:
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
         """Send a packet; False where the peer is so far behind that the kernel takes no more.
 
-        Raises Closed when the peer has gone, TooLarge for what it would get cut.
+        Raises Closed when the peer has gone, TooLarge above MAX_SHARED.
         """
-        if len(packet) > self._largest:
-            raise TooLarge(f"a packet of {len(packet)} bytes: at most {self._largest} go between these processes")
+        shared = len(packet) > MAX_PACKET
+        file = _share(packet) if shared else None
+        if shared and file is None:
+            return False
         try:
-            self._socket.send(packet)
+            if file is None:
+                self._socket.send(packet)
+            else:
+                socket.send_fds(self._socket, [_SHARED], [file])
         except BlockingIOError:
             return False
         except OSError as error:
             raise Closed from error
+        finally:
+            if file is not None:
+                os.close(file)
         return True
 
     def receive(self) -> bytes | None:
@@ -61,14 +75,14 @@ class PacketLink:
         if not self._arrivals.poll(0):  # a third of what it takes to fail at receiving: most of the loop's cycles
             return None
         try:
-            packet = self._socket.recv(self._largest)
+            packet, beside, *_ = self._socket.recvmsg(MAX_PACKET, _DESCRIPTOR_SPACE, socket.MSG_CMSG_CLOEXEC)
         except BlockingIOError:
             return None
         except OSError as error:
             raise Closed from error
         if not packet:
             raise Closed
-        return packet
+        return _read_shared(beside[0][2]) if beside else packet
 
     @property
     def ended(self) -> bool:
@@ -80,15 +94,41 @@ class PacketLink:
         self._socket.close()
 
 
-def connect(path: Path, largest: int = MAX_PACKET) -> PacketLink:
-    """Connect to a port of the loop, for packets of so many bytes at most. Raises OSError where nobody listens."""
+_DESCRIPTOR_SPACE = socket.CMSG_SPACE(_DESCRIPTOR)
+_SHARED = b"\0"
+"""Sent beside a descriptor: a packet without any byte is the end of a connection."""
+
+
+def _share(packet: bytes | bytearray | memoryview) -> int | None:
+    """Return the descriptor of a file in memory with a packet in it; None where the system has no room for one."""
+    if len(packet) > MAX_SHARED:
+        raise TooLarge(f"a packet of {len(packet)} bytes: at most {MAX_SHARED} go between the processes")
+    with contextlib.suppress(OSError):
+        file = os.memfd_create("packet")
+        if os.write(file, packet) == len(packet):
+            return file
+        os.close(file)
+    return None
+
+
+def _read_shared(descriptor: bytes) -> bytes:
+    """Return what is in the file of a descriptor that was received, and close it."""
+    (file,) = array("i", descriptor)
+    try:
+        return os.pread(file, os.fstat(file).st_size, 0)  # no larger: memory that is not written costs as much
+    finally:
+        os.close(file)
+
+
+def connect(path: Path) -> PacketLink:
+    """Connect to a port of the loop. Raises OSError where nobody listens."""
     connecting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         connecting.connect(str(path))
     except OSError:
         connecting.close()
         raise
-    return PacketLink(connecting, largest)
+    return PacketLink(connecting)
 
 
 def listen(path: Path) -> socket.socket:
@@ -102,9 +142,8 @@ def listen(path: Path) -> socket.socket:
 class Port:
     """The loop's side: listens, so that a restarted peer can come back; has one peer at most."""
 
-    def __init__(self, listening: socket.socket, largest: int = MAX_PACKET) -> None:
+    def __init__(self, listening: socket.socket) -> None:
         self._listening = listening
-        self._largest = largest
         self._listening.setblocking(False)
         self._link: PacketLink | None = None
         self._lost = False
@@ -138,7 +177,7 @@ class Port:
             connected, _ = self._listening.accept()
         except BlockingIOError:
             return False
-        self._link = PacketLink(connected, self._largest)
+        self._link = PacketLink(connected)
         return True
 
     def await_peer(self, seconds: float) -> bool:

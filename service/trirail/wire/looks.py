@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goal_kind import Coordinate, Coordinates, Identifier, check_fields
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.text import ID_RULE, is_id, quoted
@@ -21,6 +22,7 @@ LookEnd = Literal[
     "reached",
     "corrections",
     "growing",
+    "noise",
     "calibrated",
     "checked",
     "failed",
@@ -56,9 +58,9 @@ class LookError(Struct, frozen=True, forbid_unknown_fields=True):
     worst: Coordinate
     """The greatest way of a mark by the motion that aligns the part [m]."""
     shift: tuple[Coordinate, Coordinate]
-    """How far the middle of the marks has to go, x, y [m]."""
+    """Remaining distance of the centre of the marks, x, y [m]."""
     turn: Coordinate
-    """By what angle the part has to turn [rad]."""
+    """Remaining rotation of the part [rad]."""
     misfit: Coordinate
     """The greatest distance of a mark from its target that no motion takes away [m]."""
     distance: Share
@@ -107,6 +109,13 @@ def in_words(look: AlignmentLook) -> str:
     if look.end is not None:
         said += f"; {look.end} after {look.seconds:.2f} s"
     return said + (f": {look.words}" if look.words else "")
+
+
+def look_text(look: AlignmentLook, words: str) -> EventText:
+    """Return the words of a look with their code."""
+    if look.end is None:
+        return coded(words, EventCode.ALIGNMENT_LOOK, id=look.id, purpose=look.purpose, number=look.number)
+    return coded(words, EventCode.ALIGNMENT_ENDED, id=look.id, purpose=look.purpose, end=look.end, seconds=look.seconds)
 
 
 def _marks(look: AlignmentLook) -> str:

@@ -6,12 +6,14 @@ default, msgpack where the encoding says so.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from msgspec import Struct, structs
 from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode
+from trirail.wire.event_codes import EventCode, Params
 from trirail.wire.looks import AlignmentLook
 
 Level = Literal["info", "warning", "error"]
@@ -40,6 +42,10 @@ class GoalReply(Struct, frozen=True):
     """Of a track: how far a point of the platform was at most from where the target had it, when this was taken up
     [m]."""
     accepted: Literal[True] = True
+
+    def with_duration(self, duration: float) -> GoalReply:
+        """Return it with another duration [s], which may be infinite."""
+        return structs.replace(self, duration=duration if math.isfinite(duration) else None)
 
 
 class CommandReply(Struct, frozen=True):
@@ -134,6 +140,19 @@ class Notice(Struct, frozen=True, omit_defaults=True):
     """What it is about, with kind fault."""
     alignment: AlignmentLook | None = None
     """The look, with kind alignment."""
+    code: RefusalCode | None = None
+    """Reason for programs, with kind refused and with a goal that was refused."""
+    slider: str | None = None
+    """A, B or C, with a code that is about one."""
+    value: float | None = None
+    """Requested value in SI units, with a code that is about a limit."""
+    limit: float | None = None
+    """Allowed value in SI units."""
+    event_code: EventCode | None = None
+    """Content of the message for programs and translations; with kind mode and at a goal's end that of the reason.
+    None from a service older than these codes."""
+    params: Params = {}
+    """Values in the message, by the names that the event code has; SI units and radians."""
 
     def event(self, seq: int, t: float, cycle: int, time: float) -> Event:
         """Return it with its number and time."""

@@ -10,9 +10,9 @@ from trirail_drivers.interface import Counts, MissingProtection, Triple
 
 from trirail.errors import RefusalCode
 from trirail.wire.decoding import converted, decoder, prepare
-from trirail.wire.goals import Goal
-from trirail.wire.looks import AlignmentLook
-from trirail.wire.messages import Event, Level
+from trirail.wire.event_codes import EventCode, EventText, Params
+from trirail.wire.goals import LoopGoal
+from trirail.wire.messages import Event, GoalReply, Notice
 from trirail.wire.plan_packets import PlanAnswer
 from trirail.wire.sizes import MAX_PACKET
 from trirail.wire.vocabulary import Command
@@ -34,7 +34,7 @@ class GoalRequest(Struct, frozen=True, tag=True):
     user: str
     id: str
     """As it was sent, or made by the gateway."""
-    goal: Goal
+    goal: LoopGoal
     received_ns: int
     """When it came, by the monotonic clock."""
     withdrawn: str | None = None
@@ -57,48 +57,18 @@ class CommandRequest(Struct, frozen=True, forbid_unknown_fields=True, tag=True):
             structs.force_setattr(self, "content", converted(self.content or {}, self.name.content))
 
 
-class RefusedRequest(Struct, frozen=True, tag=True):
-    """Gateway to loop: something unreadable came and was refused; wants an event."""
+class Announcement(Struct, frozen=True, tag=True):
+    """Gateway or recorder to loop: a notice for everyone, which the loop numbers as an event."""
 
-    user: str
-    message: str
-
-
-class PoseChanged(Struct, frozen=True, tag=True):
-    """Gateway to loop: a named pose was taught or removed; wants an event."""
-
-    user: str
-    message: str
-
-
-class Looked(Struct, frozen=True, tag=True):
-    """Gateway to loop: a client's alignment has looked; wants an event."""
-
-    user: str
-    level: Level
-    message: str
-    look: AlignmentLook
-
-
-class Remark(Struct, frozen=True, tag=True):
-    """Gateway or recorder to loop: something that everyone is to know; wants an event."""
-
-    level: Level
-    message: str
+    notice: Notice
+    """Its kind is refused, pose, alignment or service."""
 
 
 class Accepted(Struct, frozen=True, tag=True):
     """Loop to gateway: the goal is the loop's now."""
 
     ticket: int
-    id: str
-    duration: float
-    """Expected time from now to the end of its path [s]; infinite at override 0, and where something newer is taken."""
-    slowed: float
-    """As in trirail.wire.messages.GoalReply, and the three below."""
-    stops_first: bool
-    queued: bool
-    lag: float | None = None
+    reply: GoalReply
 
 
 class Confirmed(Struct, frozen=True, tag=True):
@@ -163,6 +133,8 @@ class Status(Struct, frozen=True, tag=True):
     """Of a track, as in trirail.wire.messages.GoalReply, when it was last renewed."""
     unrecorded: str = ""
     """Why nothing is recorded now, or no CAN frames are captured; empty while all is."""
+    unready: tuple[str, ...] = ()
+    """Why drives cannot be reset yet, a line for each, with the progress of their configuration."""
 
 
 class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it
@@ -171,6 +143,13 @@ class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it
     event: str
     """Name of the trirail.control.modes.Event."""
     reason: str
+    event_code: EventCode = EventCode.OTHER
+    params: Params = {}
+
+    @property
+    def text(self) -> EventText:
+        """The reason with its code."""
+        return EventText(self.reason, self.event_code, self.params)
 
 
 class DrivesFault(Struct, frozen=True, tag=True):
@@ -178,6 +157,8 @@ class DrivesFault(Struct, frozen=True, tag=True):
 
     message: str | None
     """None when nothing is any more."""
+    unready: tuple[str, ...] = ()
+    """Names of the drives that cannot be reset yet."""
 
 
 class PlannerLost(Struct, frozen=True, tag=True):
@@ -186,7 +167,7 @@ class PlannerLost(Struct, frozen=True, tag=True):
     reason: str
 
 
-Request = GoalRequest | CommandRequest | RefusedRequest | PoseChanged | Looked | Remark
+Request = GoalRequest | CommandRequest | Announcement
 GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
 
 
@@ -214,7 +195,7 @@ class Unrecorded(Struct, frozen=True, tag=True):
     why: str
 
 
-RecorderSaid = Remark | Unrecorded
+RecorderSaid = Announcement | Unrecorded
 Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
 
 prepare(Request, Answer, RecorderSaid, *(command.content for command in Command))

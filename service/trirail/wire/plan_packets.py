@@ -11,7 +11,8 @@ from trirail_drivers.interface import Triple
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.decoding import decoder, prepare
-from trirail.wire.goals import Goal
+from trirail.wire.goals import LoopGoal
+from trirail.wire.messages import GoalReply
 
 
 class PackedPath(Struct, frozen=True, array_like=True):
@@ -55,7 +56,7 @@ class PlanRequest(Struct, frozen=True):
     """The platform's pose, velocity and acceleration now."""
     runs: tuple[PackedRun, ...]
     """The motion under way, and what follows it."""
-    goal: Goal
+    goal: LoopGoal
     """As trirail.motion.goal_planner.meant has it: its tools are points, its poses those of the base frame, its times
     the loop's."""
     blend: float | None = None
@@ -70,18 +71,12 @@ class Planned(Struct, frozen=True, tag=True):
     first: int | None
     """The cycle in whose commanded state it begins; None where the robot stands, and it may begin at any time."""
     run: PackedRun
-    duration: float | None
-    """From when it begins to its end [s]; None at override zero: recorded as JSON, which knows no infinity."""
-    slowed: float
-    """How many times slower than was asked for, for the limits' sake."""
-    stops_first: bool = False
-    """Whether the robot stops on its old path before."""
+    reply: GoalReply
+    """Reply to the goal's sender, to which the loop adds the goal's id; duration None at override zero."""
     stop: PackedPath | None = None
     """The law of that stop; None where the law that the motion under way has is the one to stand by."""
     bound: str | None = None
     """The limit before which a jog comes to rest, or beyond which a track's target is."""
-    lag: float | None = None
-    """How far a point of the platform is at most from where a track's target has it, when the run begins [m]."""
 
 
 class Extended(Struct, frozen=True, tag=True):
@@ -92,7 +87,8 @@ class Extended(Struct, frozen=True, tag=True):
     s: float
     """From which time along that path [s]."""
     path: PackedPath
-    slowed: float
+    reply: GoalReply
+    """As in Planned; the loop adds the duration as well."""
 
 
 class NotPlanned(Struct, frozen=True, tag=True):
@@ -113,8 +109,10 @@ class NotPlanned(Struct, frozen=True, tag=True):
 
 PlanAnswer = Planned | Extended | NotPlanned
 
-MAX_PLANNING = 262_144
-"""A request or an answer, as msgpack: the largest goal, and the longest motion under way, fit twice [bytes]."""
+
+class Overtaken(BaseException):
+    """Planning ends without an answer: something newer has been asked. No Exception, since those become answers."""
+
 
 prepare(PlanRequest, PlanAnswer)
 encode = msgpack.Encoder().encode

@@ -6,6 +6,8 @@ centre and its angle phi [rad], counterclockwise, in the base frame.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import msgspec
 from msgspec import Struct
 from trirail_drivers.interface import MissingProtection, Triple
@@ -13,11 +15,22 @@ from trirail_drivers.interface import MissingProtection, Triple
 from trirail.wire.vocabulary import LeasePolicy, Role
 
 
-class Commanded(Struct, frozen=True):
-    """What the robot was told: platform, then sliders."""
+class Pose(NamedTuple):
+    """A pose of the platform; on the wire an array of three numbers."""
 
-    pose: Triple
-    """x, y [m] of the platform's centre and its angle phi [rad], in the base frame."""
+    x: float
+    """[m]."""
+    y: float
+    """[m]."""
+    phi: float
+    """Counterclockwise [rad]."""
+
+
+class Commanded(Struct, frozen=True):
+    """Commanded motion of the platform and of the sliders."""
+
+    pose: Pose
+    """Pose of the platform's centre in the base frame."""
     pose_velocity: Triple
     """[m/s, m/s, rad/s]."""
     pose_acceleration: Triple
@@ -70,7 +83,7 @@ class GoalState(Struct, frozen=True):
     remaining: float
     """Time to the end of its path at the present override [s], were it not to wait, paused or at 0: there it is as at
     100 %. 0 while it settles."""
-    target: Triple | None = None
+    target: Pose | None = None
     """The pose that it leads to, of a track that its target was last told to have; None for a jog."""
     lag: float | None = None
     """Of a track: how far a point of the platform was at most from where the target had it, when it was last renewed
@@ -121,8 +134,8 @@ class State(Struct, frozen=True):
     """Nominal time since the loop's start [s]; the same as in records and events."""
     mode: str
     """A trirail.wire.vocabulary.Mode."""
-    pose: Triple
-    """Measured: x, y [m] and phi [rad] in the base frame, by the forward kinematics of the measured sliders,
+    pose: Pose
+    """Measured pose of the platform's centre in the base frame, by the forward kinematics of the measured sliders,
     with [correction] where there is one."""
     velocity: Triple
     """Measured, as a difference over a batch of records [m/s, m/s, rad/s]."""

@@ -1,1 +1,1 @@
-"""Where the robot can be: workspace, singularities, the mechanism's outline, and pictures of them."""
+"""Workspace, singularities and parts of the robot, and plots of them."""

@@ -1,6 +1,6 @@
-"""Where the robot's parts lie: points to draw it by, in metres, from its geometry and limits.
+"""Positions of the robot's parts for drawings [m], from its geometry and limits.
 
-Fixed parts are in the base frame. Those of the platform are in its own frame, with the centre G at the origin.
+Fixed parts are in the base frame, parts of the platform in the platform's frame with the centre G at the origin.
 """
 
 from __future__ import annotations
@@ -17,67 +17,68 @@ from trirail.kinematics.geometry import PARALLEL, Geometry
 from trirail.kinematics.leg import AnyLeg
 
 Points = NDArray[np.float64]
-STOP = 0.022
+STOP_LENGTH_SHARE = 0.022
 """Length of an end stop's mark, as a share of the longest rail."""
-SLEEVE = 0.035
-"""Half the length of the sleeve in which an edge of the platform slides, likewise."""
-TABLE = 0.3
-"""By what share of its size a stage's table reaches beyond the points by which it is held."""
+SLEEVE_HALF_LENGTH_SHARE = 0.035
+"""Half the length of the sleeve around an edge of the platform, as a share of the longest rail."""
+TABLE_OVERHANG_SHARE = 0.3
+"""Overhang of a stage's table beyond its supports, as a share of its size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotParts:
-    """The robot's parts; a line is an array of points, (N, 2)."""
+    """Parts of the robot; a line is an array of points (N, 2)."""
 
     anchors: Points
-    """(3, 2): where the rails begin."""
+    """Start points of the rails (3, 2)."""
     rails: list[Points]
     travel: list[Points]
-    """Where on its rail each slider may be."""
+    """Travel of each slider on its rail."""
     stops: list[Points]
     """Marks across both ends of each travel."""
     outline: list[Points]
-    """The platform: the triangle of its edges, or a table over those that form none and over pivots."""
+    """The platform: the triangle of its edges, or else a table over its edges or pivots."""
     edge_stops: list[Points]
     """Marks across both ends of the passive joints' travel along the platform's edges."""
     arms: list[Points]
-    """From the platform's centre to where it is held."""
+    """Lines from the platform's centre to its supports."""
     names: Points
-    """(3, 2): beside the middle of each rail, outside."""
+    """Positions of the sliders' labels, outside the middle of each rail (3, 2)."""
     cross_slides: Points
-    """(3, 2): where each cross slide's drawn part begins and ends, along it from the carriage [m]."""
+    """Start and end of each cross slide's drawn part, along it from the carriage (3, 2) [m]."""
     bounds: Points
-    """(2, 2): lowest and highest x and y of everything at the pose (0, 0, 0)."""
+    """Lowest and highest x and y of all parts at the pose (0, 0, 0) (2, 2)."""
 
     @classmethod
-    def of(cls, geometry: Geometry, limits: SliderLimits) -> RobotParts:
-        """Lay out a robot's parts."""
+    def from_geometry(cls, geometry: Geometry, limits: SliderLimits) -> RobotParts:
+        """Return the parts of a robot."""
         legs, ends_of = geometry.each, limits.positions
-        # a rail reaches as far beyond its slider's travel as it begins before it
+        # a rail extends equally far beyond both ends of its slider's travel
         rails = [
-            _on_rail(leg, -leg.home, high + (low + leg.home)) for leg, (low, high) in zip(legs, ends_of, strict=True)
+            _rail_points(leg, -leg.home, high + (low + leg.home))
+            for leg, (low, high) in zip(legs, ends_of, strict=True)
         ]
         longest = max(float(np.linalg.norm(rail[1] - rail[0])) for rail in rails)
-        corners = _corners(legs)
-        edges = [_on_edge(leg, *limits.passive) for leg in legs if leg.crossing.turns]
-        outline = [*edges, _table(legs)] if corners is None else [corners[[0, 1, 2, 0]]]
+        corners = _edge_intersections(legs)
+        edges = [_edge_points(leg, *limits.passive) for leg in legs if leg.crossing.turns]
+        outline = [*edges, _table_outline(legs)] if corners is None else [corners[[0, 1, 2, 0]]]
         ends = [np.array(leg.crossing.point) for leg in legs] if corners is None else list(corners)
         middles = np.array([rail.mean(axis=0) for rail in rails])
-        away = [_away(leg, middle - middles.mean(axis=0)) for leg, middle in zip(legs, middles, strict=True)]
+        away = [_outward_normal(leg, middle - middles.mean(axis=0)) for leg, middle in zip(legs, middles, strict=True)]
         everything = np.concatenate([*rails, *outline])
-        half = SLEEVE * longest
+        half = SLEEVE_HALF_LENGTH_SHARE * longest
         return cls(
             anchors=np.array([leg.anchor for leg in legs]),
             rails=rails,
-            travel=[_on_rail(leg, *own) for leg, own in zip(legs, ends_of, strict=True)],
+            travel=[_rail_points(leg, *own) for leg, own in zip(legs, ends_of, strict=True)],
             stops=[
-                _across(_on_rail(leg, position), leg.rail_angle, STOP * longest)
+                _stop_mark(_rail_points(leg, position), leg.rail_angle, STOP_LENGTH_SHARE * longest)
                 for leg, own in zip(legs, ends_of, strict=True)
                 for position in own
             ],
             outline=outline,
             edge_stops=[
-                _across(_on_edge(leg, at), leg.crossing.angle, STOP * longest)
+                _stop_mark(_edge_points(leg, at), leg.crossing.angle, STOP_LENGTH_SHARE * longest)
                 for leg in legs
                 if leg.crossing.turns
                 for at in limits.passive
@@ -89,18 +90,18 @@ class RobotParts:
         )
 
 
-def sliders(geometry: Geometry, position: Points) -> Points:
-    """Return where the sliders are, (N, 3, 2), for positions lambda_10, (N, 3)."""
+def slider_points(geometry: Geometry, position: Points) -> Points:
+    """Return the sliders' points (N, 3, 2) in the base frame for positions lambda_10 (N, 3)."""
     at = np.empty((*position.shape, 2))
     for k, leg in enumerate(geometry.each):
-        at[:, k] = np.array(leg.anchor) + np.outer(leg.home + position[:, k], _u(leg.rail_angle))
+        at[:, k] = np.array(leg.anchor) + np.outer(leg.home + position[:, k], _unit_vector(leg.rail_angle))
     return at
 
 
-def cross_slides(geometry: Geometry, parts: RobotParts, carriages: Points, phi: Points) -> Points:
-    """Return the cross slides as lines, (N, 3, 2, 2), on carriages (N, 3, 2) for angles (N,).
+def cross_slide_lines(geometry: Geometry, parts: RobotParts, carriages: Points, phi: Points) -> Points:
+    """Return the cross slides as lines (N, 3, 2, 2), for carriages (N, 3, 2) and angles of the platform (N,).
 
-    The sleeve of an edge turns with the platform; a cross slide that is fixed to its carriage does not.
+    The sleeve of an edge turns with the platform; a cross slide on its carriage does not.
     """
     crossings = [leg.crossing for leg in geometry.each]
     angles = np.outer(phi, [each.turns for each in crossings]) + [each.angle for each in crossings]
@@ -109,8 +110,8 @@ def cross_slides(geometry: Geometry, parts: RobotParts, carriages: Points, phi: 
     return lines
 
 
-def pivots(geometry: Geometry, carriages: Points, poses: Points) -> Points:
-    """Return what the platform turns on, (N, 3, 2): carriages (N, 3, 2), or points of the platform at poses (N, 3)."""
+def pivot_points(geometry: Geometry, carriages: Points, poses: Points) -> Points:
+    """Return the pivots (N, 3, 2): carriages (N, 3, 2) in 3-PRP, points of the platform at poses (N, 3) in 3-PPR."""
     at = carriages.copy()
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     for k, leg in enumerate(geometry.each):
@@ -120,36 +121,36 @@ def pivots(geometry: Geometry, carriages: Points, poses: Points) -> Points:
     return at
 
 
-def placed(lines: list[Points], pose: Sequence[float]) -> list[Points]:
-    """Return lines of the platform's frame in the base frame, for the platform at a pose."""
+def transform_lines(lines: list[Points], pose: Sequence[float]) -> list[Points]:
+    """Return lines of the platform's frame in the base frame, for a pose of the platform."""
     x, y, phi = pose
     c, s = math.cos(phi), math.sin(phi)
     return [line @ np.array([[c, s], [-s, c]]) + [x, y] for line in lines]
 
 
-def _on_rail(leg: AnyLeg, *positions: float) -> Points:
-    return np.array([np.array(leg.anchor) + (leg.home + at) * _u(leg.rail_angle) for at in positions])
+def _rail_points(leg: AnyLeg, *positions: float) -> Points:
+    return np.array([np.array(leg.anchor) + (leg.home + at) * _unit_vector(leg.rail_angle) for at in positions])
 
 
-def _on_edge(leg: AnyLeg, *positions: float) -> Points:
+def _edge_points(leg: AnyLeg, *positions: float) -> Points:
     point, angle, _ = leg.crossing
-    return np.array([np.array(point) - at * _u(angle) for at in positions])
+    return np.array([np.array(point) - at * _unit_vector(angle) for at in positions])
 
 
-def _across(place: Points, angle: float, length: float) -> Points:
-    """Return a mark across a line of an angle [rad], at a place, (1, 2)."""
-    across = length / 2.0 * _u(angle + math.pi / 2.0)
+def _stop_mark(place: Points, angle: float, length: float) -> Points:
+    """Return a mark across a line of this angle [rad], at a point (1, 2)."""
+    across = length / 2.0 * _unit_vector(angle + math.pi / 2.0)
     return np.concatenate([place - across, place + across])
 
 
-def _away(leg: AnyLeg, outward: Points) -> Points:
+def _outward_normal(leg: AnyLeg, outward: Points) -> Points:
     """Return the unit vector across the rail on the side of `outward`."""
-    across = _u(leg.rail_angle + math.pi / 2.0)
+    across = _unit_vector(leg.rail_angle + math.pi / 2.0)
     return across if across @ outward >= 0.0 else -across
 
 
-def _corners(legs: Sequence[AnyLeg]) -> Points | None:
-    """Return where each edge of the platform meets the next, (3, 2), or None where two never do, or it has none."""
+def _edge_intersections(legs: Sequence[AnyLeg]) -> Points | None:
+    """Return the intersections of neighbouring platform edges (3, 2); None for parallel or missing edges."""
     corners = []
     for one, other in zip(legs, (*legs[1:], legs[0]), strict=True):
         (point, angle, turns), (beyond, other_angle, _) = one.crossing, other.crossing
@@ -158,18 +159,18 @@ def _corners(legs: Sequence[AnyLeg]) -> Points | None:
             return None
         between = np.array(beyond) - np.array(point)
         along = (between[0] * math.sin(other_angle) - between[1] * math.cos(other_angle)) / sine
-        corners.append(np.array(point) + along * _u(angle))
+        corners.append(np.array(point) + along * _unit_vector(angle))
     return np.array(corners)
 
 
-def _table(legs: Sequence[AnyLeg]) -> Points:
-    """Return a closed rectangle over the points by which a stage's table is held, and the centre, (5, 2)."""
+def _table_outline(legs: Sequence[AnyLeg]) -> Points:
+    """Return a closed rectangle over the supports of a stage's table and its centre (5, 2)."""
     held = np.array([(0.0, 0.0), *(leg.crossing.point for leg in legs)])
     low, high = held.min(axis=0), held.max(axis=0)
-    beyond = TABLE * float((high - low).max()) / 2.0
+    beyond = TABLE_OVERHANG_SHARE * float((high - low).max()) / 2.0
     (left, bottom), (right, top) = low - beyond, high + beyond
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
 
 
-def _u(angle: float) -> Points:
+def _unit_vector(angle: float) -> Points:
     return np.array([math.cos(angle), math.sin(angle)])

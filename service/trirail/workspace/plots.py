@@ -1,4 +1,4 @@
-"""The workspace drawn: slices over phi, coloured by conditioning, and their area along phi. Needs matplotlib."""
+"""Plot of the workspace: slices over phi, coloured by conditioning, and their area along phi. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -18,45 +18,62 @@ from matplotlib.patches import Patch, Polygon
 from trirail.config import Limits
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
-from trirail.workspace.aspect import range_of_phi
+from trirail.workspace.aspect import phi_range
 from trirail.workspace.part_positions import RobotParts
 from trirail.workspace.singularity import conditioning
-from trirail.workspace.workspace import Extent, area, permitted, reachable
+from trirail.workspace.workspace import Extent, permitted_slice, polygon_area, reachable_slice
 
-__all__ = ["draw"]
+__all__ = ["draw_workspace"]
 
 INK, GREY, RAIL, PLATFORM, FORBIDDEN = "#1f2933", "#7b8794", "#d3d9e0", "#f0772b", "#c0392b"
 COLOURS, SCALE = colormaps["viridis"], Normalize(0.0, 1.0)
-BEYOND = 0.35  # opacity of what the robot reaches outside the platform's window
-PIXELS = 160  # samples of conditioning across a slice
-COLUMNS, WIDTH, STRIP = 4, 13.0, 3.4  # of the figure, in inches the last two
-AROUND = 2.5  # of a stage, whose travels are small beside its table, so many times what it reaches is shown
+OUTSIDE_OPACITY = 0.35  # opacity of the reachable slice outside the platform's limits
+SLICE_PIXELS = 160  # samples of conditioning along each side of a slice
+MAX_COLUMNS, FIGURE_WIDTH_IN, STRIP_HEIGHT_IN = 4, 13.0, 3.4
+VIEW_REACH_RATIO = 2.5  # the view shows at most this many times the reach, for stages with a large table
 DASHES = (0, (4, 3))
 MM, CM2 = 1e3, 1e4
 
 
-def draw(
+def draw_workspace(
     file: Path, title: str, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
-    """Draw slices at `angles` [rad] and the areas of two extents: of `reachable` and of `permitted`.
+    """Draw slices and their areas into a file; its suffix selects the format.
 
-    The file's suffix chooses the format. ValueError for one that matplotlib does not write, OSError if the
-    file cannot be written.
+    Parameters
+    ----------
+    file : Path
+        Output file.
+    title : str
+        Title of the figure.
+    geometry, limits
+        The robot.
+    angles : Sequence[float]
+        Angles phi of the slices [rad].
+    reach, service : Extent
+        Extents of the reachable and of the permitted workspace.
+
+    Raises
+    ------
+    ValueError
+        Matplotlib does not write this format.
+    OSError
+        The file cannot be written.
     """
-    columns = min(COLUMNS, len(angles))
+    columns = min(MAX_COLUMNS, len(angles))
     rows = math.ceil(len(angles) / columns)
-    height = rows * min(0.9 * WIDTH / columns, 5.0)
-    figure = Figure(figsize=(WIDTH, height + STRIP), dpi=150, layout="constrained")
+    height = rows * min(0.9 * FIGURE_WIDTH_IN / columns, 5.0)
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, height + STRIP_HEIGHT_IN), dpi=150, layout="constrained")
     figure.suptitle(title, x=0.008, ha="left", color=INK, fontsize=16, fontweight="bold")
-    slices, below = figure.subfigures(2, 1, height_ratios=[height, STRIP])  # type: ignore[misc]
+    slices, below = figure.subfigures(2, 1, height_ratios=[height, STRIP_HEIGHT_IN])  # type: ignore[misc]
     panels = slices.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    parts = RobotParts.of(geometry, limits.slider)
+    parts = RobotParts.from_geometry(geometry, limits.slider)
     for panel, phi in zip(panels.flat, angles, strict=False):
-        _slice(panel, geometry, limits, parts, phi)
+        _draw_slice(panel, geometry, limits, parts, phi)
     for panel in panels.flat[len(angles) :]:
         panel.set_axis_off()
     reached = float(np.abs([*reach.x, *reach.y]).max())
-    extent = MM * min(1.06 * max(reached, float(np.abs(parts.rails).max())), AROUND * reached)
+    extent = MM * min(1.06 * max(reached, float(np.abs(parts.rails).max())), VIEW_REACH_RATIO * reached)
     panels[0, 0].set(xlim=(-extent, extent), ylim=(-extent, extent))
     for panel in panels[:, 0]:
         panel.set_ylabel("y [mm]", color=GREY, fontsize=9)
@@ -67,17 +84,17 @@ def draw(
     bar = slices.colorbar(ScalarMappable(SCALE, COLOURS), ax=panels, aspect=40, pad=0.01)
     bar.set_label("conditioning of J₁⁻¹J₂   (0 singular, 1 isotropic)", color=INK, fontsize=9)
     bar.ax.tick_params(colors=GREY, labelsize=8)
-    _areas(below.subplots(), geometry, limits, angles, reach, service)
+    _draw_areas(below.subplots(), geometry, limits, angles, reach, service)
     figure.savefig(file)
 
 
-def _slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, phi: float) -> None:
-    """Draw the slice at one angle, with the rails and the platform as it is turned at the origin."""
+def _draw_slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, phi: float) -> None:
+    """Draw the slice at one angle, with the rails, and the platform at the origin turned by this angle."""
     for rail in parts.rails:
         panel.plot(*(MM * rail.T), color=RAIL, linewidth=4.0, solid_capstyle="round", zorder=1)
-    reach, service = reachable(geometry, limits, phi), permitted(geometry, limits, phi)
-    _shade(panel, geometry, reach, phi, BEYOND)
-    _shade(panel, geometry, service, phi, 1.0)
+    reach, service = reachable_slice(geometry, limits, phi), permitted_slice(geometry, limits, phi)
+    _draw_conditioning(panel, geometry, reach, phi, OUTSIDE_OPACITY)
+    _draw_conditioning(panel, geometry, service, phi, 1.0)
     panel.add_patch(Polygon(MM * reach, fill=False, edgecolor=GREY, linewidth=0.8, zorder=4))
     panel.add_patch(Polygon(MM * service, fill=False, edgecolor=INK, linewidth=1.4, joinstyle="round", zorder=5))
     (left, right), (bottom, top) = limits.platform.x, limits.platform.y
@@ -89,16 +106,16 @@ def _slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, p
     if len(reach) == 0:
         panel.text(0.5, 0.5, "out of reach", color=GREY, ha="center", va="center", transform=panel.transAxes, zorder=8)
     panel.set_aspect("equal")
-    panel.set_title(f"φ = {_degrees(phi)}", loc="left", color=INK, fontsize=11, fontweight="bold", pad=4)
-    panel.set_title(f"{CM2 * area(service):.4g} cm²", loc="right", color=GREY, fontsize=9, pad=4)
-    _quiet(panel)
+    panel.set_title(f"φ = {_format_degrees(phi)}", loc="left", color=INK, fontsize=11, fontweight="bold", pad=4)
+    panel.set_title(f"{CM2 * polygon_area(service):.4g} cm²", loc="right", color=GREY, fontsize=9, pad=4)
+    _style_axes(panel)
 
 
-def _shade(panel: Axes, geometry: Geometry, polygon: Array, phi: float, opacity: float) -> None:
+def _draw_conditioning(panel: Axes, geometry: Geometry, polygon: Array, phi: float, opacity: float) -> None:
     if len(polygon) == 0:
         return
     (left, bottom), (right, top) = polygon.min(axis=0), polygon.max(axis=0)
-    x, y = np.meshgrid(np.linspace(left, right, PIXELS), np.linspace(bottom, top, PIXELS))
+    x, y = np.meshgrid(np.linspace(left, right, SLICE_PIXELS), np.linspace(bottom, top, SLICE_PIXELS))
     poses = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, phi)])
     image = panel.imshow(
         conditioning(geometry, poses).reshape(x.shape),
@@ -113,11 +130,11 @@ def _shade(panel: Axes, geometry: Geometry, polygon: Array, phi: float, opacity:
     image.set_clip_path(Polygon(MM * polygon, transform=panel.transData))
 
 
-def _areas(
+def _draw_areas(
     strip: Axes, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
     """Draw the area of the slices along phi, with the angles near which every pose is singular."""
-    low, high = np.degrees(range_of_phi(geometry))
+    low, high = np.degrees(phi_range(geometry))
     margin = math.degrees(limits.singularity_margin)
     for wall, inward in ((low, margin), (high, -margin)):
         strip.axvspan(wall, wall + inward, color=FORBIDDEN, alpha=0.10, linewidth=0)
@@ -140,12 +157,12 @@ def _areas(
     strip.plot(shown, CM2 * service.areas, color=INK, linewidth=1.4, zorder=3)
     strip.plot(
         np.degrees(angles),
-        [CM2 * area(permitted(geometry, limits, phi)) for phi in angles],
+        [CM2 * polygon_area(permitted_slice(geometry, limits, phi)) for phi in angles],
         "o",
         color=INK,
         markersize=4,
     )
-    first, last = AROUND * np.degrees(reach.phi)
+    first, last = VIEW_REACH_RATIO * np.degrees(reach.phi)
     strip.set(xlim=(max(low - 3.0, first), min(high + 3.0, last)), ylim=(0.0, 1.12 * CM2 * reach.best_area))
     strip.set_title(
         "Area of the slices along φ, coloured by the conditioning at x = y = 0",
@@ -156,7 +173,7 @@ def _areas(
     )
     strip.set_xlabel("φ [°]", color=GREY, fontsize=9)
     strip.set_ylabel("area [cm²]", color=GREY, fontsize=9)
-    _quiet(strip)
+    _style_axes(strip)
     strip.legend(
         handles=[
             Patch(
@@ -183,12 +200,12 @@ def _areas(
     )
 
 
-def _quiet(axes: Axes) -> None:
-    """Leave the word to the data."""
+def _style_axes(axes: Axes) -> None:
+    """Make ticks and frame unobtrusive."""
     axes.tick_params(colors=GREY, labelsize=8, length=2)
     for spine in axes.spines.values():
         spine.set_color(RAIL)
 
 
-def _degrees(phi: float) -> str:
+def _format_degrees(phi: float) -> str:
     return f"{round(math.degrees(phi), 2) + 0.0:g}°".replace("-", "−")

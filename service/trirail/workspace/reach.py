@@ -1,6 +1,6 @@
-"""What the present pose leaves open: where the centre may go at this φ, and how far φ is from a singularity.
+"""Reach from the present pose: outline of the permitted centres at its φ, and distance of φ from a singularity.
 
-Both are looked up for poses rounded a little and kept, so that a recorder can afford them at any rate.
+Both are cached for rounded poses, so that a recorder can compute them at any rate.
 """
 
 from __future__ import annotations
@@ -15,52 +15,52 @@ from numpy.typing import NDArray
 from trirail.config import Limits
 from trirail.kinematics.geometry import Geometry, singular_angles
 from trirail.workspace.part_positions import Points
-from trirail.workspace.workspace import permitted
+from trirail.workspace.workspace import permitted_slice
 
-ANGLE = math.radians(0.5)
-"""Workspace outlines are those of multiples of this φ [rad]."""
-PLACE = 2e-3
-"""Singular angles are those with the centre at multiples of this, in x and y [m]."""
-_KEPT = 4096
+ANGLE_STEP_RAD = math.radians(0.5)
+"""Step to which φ is rounded for workspace outlines."""
+CENTRE_STEP_M = 2e-3
+"""Step to which x and y of the centre are rounded for singular angles."""
+_CACHE_SIZE = 4096
 
 
 class Reach:
-    """A robot's workspace and singularities."""
+    """Workspace outlines and singular angles of one robot."""
 
     def __init__(self, geometry: Geometry, limits: Limits) -> None:
-        self.outline = lru_cache(_KEPT)(lambda step: _outline(geometry, limits, int(step)))
-        """The line around the permitted centres at φ = `step` ANGLE: (V + 1, 2) [m], closed; empty for none."""
-        self._singular = lru_cache(_KEPT)(
-            lambda x, y: np.array(singular_angles(geometry, (x * PLACE, y * PLACE)))[:, np.newaxis]
+        self.outline = lru_cache(_CACHE_SIZE)(lambda step: _closed_outline(geometry, limits, int(step)))
+        """Closed outline of the permitted centres at φ = `step` ANGLE_STEP_RAD, (V + 1, 2) [m]; empty for none."""
+        self._singular = lru_cache(_CACHE_SIZE)(
+            lambda x, y: np.array(singular_angles(geometry, (x * CENTRE_STEP_M, y * CENTRE_STEP_M)))[:, np.newaxis]
         )
-        # On the symmetric robot the singular angles are the same everywhere, and need to be found only once.
-        self._everywhere = all(
+        # The singular angles of a symmetric robot do not depend on the centre, so one computation is enough.
+        self._constant_angles = all(
             singular_angles(geometry, corner) == singular_angles(geometry)
             for corner in itertools.product(limits.platform.x, limits.platform.y)
         )
 
-    def steps(self, phi: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return which outlines belong to angles [rad]."""
-        return np.rint(phi / ANGLE).astype(np.int64)
+    def outline_indices(self, phi: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the indices of the outlines for angles [rad]."""
+        return np.rint(phi / ANGLE_STEP_RAD).astype(np.int64)
 
-    def distance(self, poses: Points) -> NDArray[np.float64]:
-        """Return by what angle [rad] φ differs from the nearest singular one, (N,), for poses (N, 3)."""
-        if self._everywhere:
-            return _least(poses[:, 2], self._singular(0, 0))
-        found = np.empty(len(poses))
-        places = np.rint(poses[:, :2] / PLACE).astype(int)
-        for k, (x, y) in enumerate(places.tolist()):
-            found[k : k + 1] = _least(poses[k : k + 1, 2], self._singular(x, y))
-        return found
+    def singularity_distance(self, poses: Points) -> NDArray[np.float64]:
+        """Return the distance of φ from the nearest singular angle [rad], (N,), for poses (N, 3)."""
+        if self._constant_angles:
+            return _least_angle(poses[:, 2], self._singular(0, 0))
+        distances = np.empty(len(poses))
+        centres = np.rint(poses[:, :2] / CENTRE_STEP_M).astype(int)
+        for k, (x, y) in enumerate(centres.tolist()):
+            distances[k : k + 1] = _least_angle(poses[k : k + 1, 2], self._singular(x, y))
+        return distances
 
 
-def _least(phi: NDArray[np.float64], singular: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the least angle between phi, (N,), and any of the singular angles, (K, 1)."""
+def _least_angle(phi: NDArray[np.float64], singular: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the least angle between phi (N,) and any of the singular angles (K, 1)."""
     between = phi - singular
     least: NDArray[np.float64] = np.abs(between - math.tau * np.rint(between / math.tau)).min(axis=0)
     return least
 
 
-def _outline(geometry: Geometry, limits: Limits, step: int) -> Points:
-    polygon = permitted(geometry, limits, step * ANGLE)
+def _closed_outline(geometry: Geometry, limits: Limits, step: int) -> Points:
+    polygon = permitted_slice(geometry, limits, step * ANGLE_STEP_RAD)
     return np.concatenate([polygon, polygon[:1]])

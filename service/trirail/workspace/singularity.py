@@ -1,8 +1,8 @@
-"""How near a pose is to a singularity, and how evenly the sliders move the platform there.
+"""Distance of a pose from a singularity, and conditioning of the Jacobian.
 
 A pose is (x, y, phi): the platform's centre G [m] and its angle [rad]; arrays hold one, shape (3,), or N of
-them, (N, 3). The singular poses divide all others into aspects, which no motion connects. The robot works in
-the one of the pose (0, 0, 0): there each delta_i of J1 and det J2 have the signs that they have at that pose.
+them, (N, 3). Singular poses divide the others into aspects, which no motion connects. The robot works in the
+aspect of the pose (0, 0, 0), in which each delta_i of J1 and det J2 keep the signs that they have at that pose.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.geometry import Geometry
 from trirail.kinematics.robot import jacobians
-from trirail.workspace.aspect import det_j2_rows, walls
+from trirail.workspace.aspect import det_j2_rows, wall_angles
 
 __all__ = [
     "characteristic_length",
@@ -25,27 +25,26 @@ __all__ = [
 ]
 
 HOME = np.zeros(3)
-SAMPLES = 255  # of det J2 between two walls
-COINCIDENT = 1e-4  # two such angles that are nearer than this leave no room for a pose between them [rad]
+DET_SAMPLES = 255  # samples of det J2 between two walls
+COINCIDENT_WALLS_RAD = 1e-4  # no pose fits between walls nearer than this
 
 
 def sensitivity(geometry: Geometry, pose: ArrayLike) -> Array:
     """Return J1⁻¹ J2, (3, 3) or (N, 3, 3): slider velocity = J1⁻¹ J2 @ platform velocity, (16).
 
     Rows are the sliders A, B, C; the columns for x and y have no unit, that for phi is in m/rad.
-    KinematicsError as from inverse.
+    Raises KinematicsError as inverse.
     """
     j1, j2 = jacobians(geometry, pose)
     return j2 / np.diagonal(j1, axis1=-2, axis2=-1)[..., np.newaxis]
 
 
 def characteristic_length(geometry: Geometry) -> float:
-    """Return the length [m] that makes turning comparable with shifting.
+    """Return the length [m] that makes rotation comparable with translation.
 
-    Turning by an angle counts as shifting by this length times the angle. It is chosen so that at the pose
-    (0, 0, 0) both move the sliders alike, in the root mean square over sliders and directions. That makes
-    the symmetric robot isotropic there: the length is l0/√6. It depends on no choice of zeros or of points
-    along rails and edges.
+    A rotation by an angle counts as a translation by this length times the angle. At the pose (0, 0, 0) both move the
+    sliders equally, in the root mean square over sliders and directions. A symmetric robot is therefore isotropic
+    there, with the length l0/√6. The length does not depend on the choice of zeros or of points along rails and edges.
     """
     at_home = sensitivity(geometry, HOME)
     return float(math.sqrt(2.0) * np.linalg.norm(at_home[:, 2]) / np.linalg.norm(at_home[:, :2]))
@@ -54,8 +53,8 @@ def characteristic_length(geometry: Geometry) -> float:
 def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = None) -> NDArray[np.float64]:
     """Return the ratio of the least to the greatest singular value of J1⁻¹ J2, shape () or (N,), no unit.
 
-    1 is isotropic, 0 singular. `length` [m] makes the column for phi comparable with the others, the
-    characteristic length if not given. KinematicsError as from inverse.
+    1 is isotropic, 0 singular. `length` [m] scales the column for phi; the default is the characteristic length.
+    Raises KinematicsError as inverse.
     """
     scale = [1.0, 1.0, 1.0 / (characteristic_length(geometry) if length is None else length)]
     values = np.linalg.svd(sensitivity(geometry, pose) * scale, compute_uv=False)
@@ -63,11 +62,16 @@ def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = Non
 
 
 def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.float64]:
-    """Return by what angle [rad] the platform can turn either way before it is singular, shape () or (N,).
+    """Return the angle [rad] by which the platform can turn in either direction before it is singular, () or (N,).
 
-    That is the distance in phi to the nearest of singular_angles at the pose's G. It is negative for a pose
-    beyond: of another aspect than (0, 0, 0). Like singular_angles it can miss two zeros of det J2 nearer together
-    than its samples, which are 1.2° apart at most. KinematicsError as from inverse, so also where J1 is singular.
+    This is the distance in phi to the nearest of singular_angles at the pose's G. It is negative for a pose of another
+    aspect than that of (0, 0, 0). Like singular_angles it can miss two zeros of det J2 that are closer together than
+    its samples, which are at most 1.2° apart.
+
+    Raises
+    ------
+    KinematicsError
+        As from inverse, and therefore also if J1 is singular.
     """
     at_home, _ = jacobians(geometry, HOME)
     j1, j2 = jacobians(geometry, pose)
@@ -77,22 +81,22 @@ def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.f
     poses = np.array(pose, dtype=np.float64).reshape(-1, 3)
     turn = 2.0 * math.pi
     poses[:, 2] -= turn * np.round(poses[:, 2] / turn)
-    at_walls = np.sort(np.concatenate([walls(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
+    at_walls = np.sort(np.concatenate([wall_angles(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
     above = np.searchsorted(at_walls, poses[:, 2])
     distance = np.minimum(poses[:, 2] - at_walls[above - 1], at_walls[above] - poses[:, 2])
-    for k in np.unique(above):  # beyond the neighbouring walls there is nothing nearer
-        if at_walls[k] - at_walls[k - 1] > COINCIDENT:
+    for k in np.unique(above):  # no singular angle beyond the neighbouring walls is nearer
+        if at_walls[k] - at_walls[k - 1] > COINCIDENT_WALLS_RAD:
             rows = np.flatnonzero(above == k)
-            found, zeros = _zeros_of_det_j2(geometry, poses[rows], at_walls[k - 1], at_walls[k])
-            np.minimum.at(distance, rows[found], np.abs(zeros - poses[rows[found], 2]))
+            indices, zeros = _zeros_of_det_j2(geometry, poses[rows], at_walls[k - 1], at_walls[k])
+            np.minimum.at(distance, rows[indices], np.abs(zeros - poses[rows[indices], 2]))
     distance = distance.reshape(inside.shape)
     return np.asarray(np.where(inside, distance, -distance), dtype=np.float64)
 
 
 def _zeros_of_det_j2(geometry: Geometry, poses: Array, low: float, high: float) -> tuple[NDArray[np.intp], Array]:
-    """Return every phi between two neighbouring walls at which J2 is singular, after the row it is for."""
-    # zeros crowd there, so the samples do too
-    phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, SAMPLES + 2)[1:-1])
+    """Return rows of poses, and for each the phi between two neighbouring walls at which J2 is singular."""
+    # zeros of det J2 cluster near the walls, so the samples do as well
+    phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, DET_SAMPLES + 2)[1:-1])
     ones = np.ones(len(poses))
     negative = np.column_stack([ones, poses[:, :2]]) @ det_j2_rows(geometry, phi).T < 0.0
     rows, columns = np.nonzero(negative[:, 1:] != negative[:, :-1])

@@ -1,4 +1,4 @@
-"""Which limits of the robot's own reach a pose exceeds, and by how much."""
+"""Limits of the robot's own reach that a pose exceeds."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ __all__ = ["violations"]
 
 
 def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Violation]:
-    """Return every limit of the robot's own reach that a pose (3,) exceeds, and by its value how far.
+    """Return every limit of the robot's own reach that a pose (3,) exceeds, with the value at that pose.
 
-    They are those that bound `reachable`; which of a slider's and an edge's two ends is meant, the limit tells.
-    KinematicsError as from inverse.
+    These are the limits of `reachable_slice`. Raises KinematicsError as inverse.
     """
     motion = inverse(geometry, pose)
-    found = []
+    exceeded = []
     for quantity, values, ends in (
         ("position", motion.position, limits.slider.positions),
         ("passive position", motion.passive_position, [limits.slider.passive] * 3),
     ):
         for leg, label, value, (low, high) in zip(LEGS, geometry.labels, values.tolist(), ends, strict=True):
             if not low <= value <= high:
-                found.append(Violation(leg, quantity, value, low if value < low else high, "m", label))
+                exceeded.append(Violation(leg, quantity, value, low if value < low else high, "m", label))
     distance = float(distance_to_singularity(geometry, pose))
     if distance < limits.singularity_margin:
-        found.append(Violation("phi", "distance to singularity", distance, limits.singularity_margin, "rad"))
-    return found
+        exceeded.append(Violation("phi", "distance to singularity", distance, limits.singularity_margin, "rad"))
+    return exceeded

@@ -61,7 +61,7 @@ class CrossLeg:
 
     @property
     def arm(self) -> float:
-        """How far from G the pivot is [m]."""
+        """Distance from G to the pivot [m]."""
         return math.hypot(*self.pivot)
 
     @property
@@ -117,8 +117,8 @@ class CrossLeg:
     def lever(self, centre: tuple[float, float], phi: Array) -> Array:  # noqa: ARG002 - as of every leg
         """Return u(cross_angle) . (-R(phi) pivot), the last element of the leg's row of J2 [m], wherever G is."""
         angle = phi - self.cross_angle
-        found: Array = -(self.pivot[0] * np.cos(angle) - self.pivot[1] * np.sin(angle))
-        return found
+        element: Array = -(self.pivot[0] * np.cos(angle) - self.pivot[1] * np.sin(angle))
+        return element
 
     def corrected(self, corrections: Sequence[float]) -> CrossLeg:
         """Return the leg with corrections to its PARAMETERS."""

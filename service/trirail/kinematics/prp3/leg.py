@@ -62,7 +62,7 @@ class Leg:
 
     @property
     def arm(self) -> float:
-        """How far from G the edge point is [m]."""
+        """Distance from G to the edge point [m]."""
         return math.hypot(*self.edge_point)
 
     @property
@@ -131,8 +131,8 @@ class Leg:
         to_rail = y * math.cos(rail) - x * math.sin(rail)
         to_edge = self.edge_point[0] * math.sin(edge) - self.edge_point[1] * math.cos(edge)
         delta = phi + edge - rail
-        found: Array = -(to_rail + to_edge * np.cos(delta)) / np.sin(delta)
-        return found
+        element: Array = -(to_rail + to_edge * np.cos(delta)) / np.sin(delta)
+        return element
 
     def corrected(self, corrections: Sequence[float]) -> Leg:
         """Return the leg with corrections to its PARAMETERS."""

@@ -1,1 +1,1 @@
-"""What a goal of each kind means to the motion, and the path that leads there: a file for each, all are read in."""
+"""Planning of each kind of goal, one file per kind; goal_planner imports all of them."""

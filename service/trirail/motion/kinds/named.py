@@ -1,23 +1,23 @@
-"""To a pose that has a name: the gateway, who knows them, has put the pose in its place."""
+"""Refusal of pose names that the gateway could not replace; the gateway keeps the poses."""
 
 from __future__ import annotations
 
 from typing import NoReturn
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.goal_motion import GoalMotion, Place
+from trirail.motion.goal_motion import GoalMotion, PoseSource
 from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.kinds.named import NamedGoal
 
 
 class NamedMotion(GoalMotion[NamedGoal]):
-    """That of a name that no pose has."""
+    """Goal with an unknown pose name."""
 
     kind = NamedGoal
 
     @staticmethod
-    def meant(goal: NamedGoal, frames: NamedFrames, place: Place) -> NoReturn:
-        """Refuse what still has no pose here."""
-        del frames, place
-        text = f"no pose {goal.name!r}: `trirail poses` lists those that there are"
+    def resolve(goal: NamedGoal, frames: NamedFrames, source: PoseSource) -> NoReturn:
+        """Refuse the goal: the gateway has replaced every known name by its pose."""
+        del frames, source
+        text = f"no pose {goal.name!r}: `trirail poses` lists the saved poses"
         raise RefusedError(RefusalCode.UNKNOWN_POSE, text)

@@ -1,4 +1,4 @@
-"""To a pose, straight in pose space where the start allows."""
+"""Planning of pose goals: straight in pose space from rest."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from msgspec import structs
 
 from trirail.config import BASE, PLATFORM
 from trirail.errors import RefusalCode, RefusedError
-from trirail.motion.goal_motion import GoalMotion, Place
+from trirail.motion.goal_motion import GoalMotion, PoseSource
 from trirail.motion.path_planner import Plan
 from trirail.motion.ruckig_call import Kinodynamic
 from trirail.motion.runs import MotionState
-from trirail.motion.tool_frames import NamedFrames, point, rotated
+from trirail.motion.tool_frames import NamedFrames, rotated, tool_point
 from trirail.wire.goals import PoseGoal
 
 
 class PoseMotion(GoalMotion[PoseGoal]):
-    """A pose goal's."""
+    """Motion to a pose."""
 
     kind = PoseGoal
     examples = PoseGoal(0.02, 0.01, 0.1), PoseGoal(-0.01, 0.0, 0.0, blend=0.01)
 
     @staticmethod
-    def meant(goal: PoseGoal, frames: NamedFrames, place: Place) -> PoseGoal:
-        """Return a pose in the base frame."""
-        del place
+    def resolve(goal: PoseGoal, frames: NamedFrames, source: PoseSource) -> PoseGoal:
+        """Return the goal in the base frame, with its tool as a point of the platform."""
+        del source
         if goal.frame == PLATFORM:
             raise RefusedError(
                 RefusalCode.UNKNOWN_FRAME, "a pose in the platform's own frame is no place: send a move in that frame"
@@ -34,17 +34,16 @@ class PoseMotion(GoalMotion[PoseGoal]):
         return structs.replace(goal, **there, tool=frames.tool(goal.tool), frame=BASE)
 
     def check(self, goal: PoseGoal) -> None:
-        """Refuse a pose out of the workspace, and limits above the platform's."""
-        self._planner.check_pose((goal.x, goal.y, goal.phi), point(goal.tool))
+        """Refuse own limits above the platform's. Raises RefusedError."""
         self._limits(goal)
 
     def plan(self, goal: PoseGoal, start: MotionState, rate: float, begins: float) -> Plan:
         """Plan to rest at the pose."""
         del rate, begins
-        return self._planner.to_pose(
-            start, (goal.x, goal.y, goal.phi), goal.speed, self._limits(goal), point(goal.tool)
+        return self._planner.plan_to_pose(
+            start, (goal.x, goal.y, goal.phi), goal.speed, self._limits(goal), tool_point(goal.tool)
         )
 
     def _limits(self, goal: PoseGoal) -> Kinodynamic | None:
         own = goal.limits
-        return self._planner.lowered(own.velocity, own.acceleration, own.jerk) if own else None
+        return self._planner.lower_limits(own.velocity, own.acceleration, own.jerk) if own else None

@@ -1,4 +1,4 @@
-"""To positions of the sliders, straight in slider space where the start allows."""
+"""Planning of slider goals: straight in slider space from rest."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ from trirail.wire.kinds.sliders import SlidersGoal
 
 
 class SlidersMotion(GoalMotion[SlidersGoal]):
-    """A sliders goal's."""
+    """Motion to positions of the sliders."""
 
     kind = SlidersGoal
     examples = (SlidersGoal((0.01, 0.0, 0.0)),)
 
-    def check(self, goal: SlidersGoal) -> None:
-        """Refuse positions beyond the sliders' travel."""
-        self._planner.check_sliders(goal.position)
-
     def plan(self, goal: SlidersGoal, start: MotionState, rate: float, begins: float) -> Plan:
         """Plan to rest at the positions."""
         del rate, begins
-        return self._planner.to_sliders(start, goal.position, goal.speed)
+        return self._planner.plan_to_sliders(start, goal.position, goal.speed)

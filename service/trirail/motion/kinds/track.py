@@ -1,6 +1,8 @@
-"""After a moving target: trirail.motion.tracking."""
+"""Planning of tracks, which follow a moving target."""
 
 from __future__ import annotations
+
+from msgspec import structs
 
 from trirail.motion.goal_motion import GoalMotion
 from trirail.motion.path_planner import PathPlanner, Plan
@@ -10,7 +12,7 @@ from trirail.wire.kinds.track import TrackGoal
 
 
 class TrackMotion(GoalMotion[TrackGoal]):
-    """A track's."""
+    """Motion after a moving target."""
 
     kind = TrackGoal
     examples = (TrackGoal(0.0, 0.0, 0.0, (0.01, 0.0, 0.0), 0.0),)
@@ -20,8 +22,9 @@ class TrackMotion(GoalMotion[TrackGoal]):
         self._tracker = Tracker(planner)
 
     def plan(self, goal: TrackGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan to the target as it is when the path begins, in the path's own time."""
+        """Plan to the target's pose at the start of the path; its velocity is converted to the path's own time."""
         rate, late = rate or 1.0, begins - goal.time if goal.time is not None else 0.0
         pose = [at + late * v for at, v in zip(goal.target, goal.velocity, strict=True)]
         plan = self._tracker.follow(start, pose, [v / rate for v in goal.velocity], goal.timeout)
-        return plan._replace(lag=self._planner.nearness(start.pose, pose))
+        lag = self._planner.distance(start.pose, pose)
+        return plan._replace(reply=structs.replace(plan.reply, lag=lag))

@@ -1,21 +1,36 @@
-"""Along timed points, quintic between them."""
+"""Planning of timed trajectories."""
 
 from __future__ import annotations
 
-from trirail.motion.goal_motion import GoalMotion
+from trirail.motion.goal_motion import GoalMotion, PoseSource
 from trirail.motion.path_planner import Plan
 from trirail.motion.quintic import Point
 from trirail.motion.runs import MotionState
+from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.kinds.trajectory import TrajectoryGoal
+from trirail.wire.packed_trajectory import PackedTrajectory, packed
 
 
-class TrajectoryMotion(GoalMotion[TrajectoryGoal]):
-    """A trajectory's."""
+class PackedMotion(GoalMotion[TrajectoryGoal]):
+    """Packing of a trajectory before it is planned."""
 
     kind = TrajectoryGoal
 
-    def plan(self, goal: TrajectoryGoal, start: MotionState, rate: float, begins: float) -> Plan:
+    @staticmethod
+    def resolve(goal: TrajectoryGoal, frames: NamedFrames, source: PoseSource) -> PackedTrajectory:
+        """Return the trajectory with its points packed."""
+        del frames, source
+        return packed(goal)
+
+
+class TrajectoryMotion(GoalMotion[PackedTrajectory]):
+    """Motion along timed points, quintic between them."""
+
+    kind = PackedTrajectory
+
+    def plan(self, goal: PackedTrajectory, start: MotionState, rate: float, begins: float) -> Plan:
         """Plan through the points."""
         del rate, begins
-        points = [Point(p.t, (p.x, p.y, p.phi), p.velocity, p.acceleration) for p in goal.points]
-        return self._planner.follow(start, points, goal.stretch)
+        points = [Point(*row) for row in goal.points]
+        first = points[0].t  # a float resolves times since 1970 to 0.2 µs only; differences are exact
+        return self._planner.plan_trajectory(start, [p._replace(t=p.t - first) for p in points], goal.stretch)

@@ -1,6 +1,6 @@
-// The last alignment: what each mark had to go at each look, when, and how it ended; its button is there once there is one.
+// The last alignment: what each mark had to go at each look, when, and how it ended.
 
-import { onLanguage, quoted, say } from "./words.js";
+import { number, onLanguage, quoted, say, time } from "./words.js";
 
 const LOOKS = 5; // columns, the newest
 const KEPT = 50; // so many looks of one alignment
@@ -14,7 +14,8 @@ export class Alignment {
     this.newest = [0, 0];
     this.user = "";
     this.time = 0;
-    onLanguage(() => this.looks.length && this.show());
+    onLanguage(() => this.show());
+    this.show();
   }
 
   event({ alignment: look, user, seq, time }) {
@@ -28,11 +29,14 @@ export class Alignment {
   }
 
   show() {
+    this.button.disabled = !this.looks.length;
+    this.button.title = this.looks.length ? "" : say("bar.alignment");
+    if (!this.looks.length) return;
     const last = this.looks.at(-1);
     const seen = this.looks.filter((look) => look.marks).slice(-LOOKS);
-    const when = new Date(this.time * 1e3).toLocaleTimeString("en-GB");
+    const when = time(this.time);
     const corrections = this.looks.filter((look) => look.correction).length;
-    const values = { end: last.end && say(`alignment.${last.end}`), seconds: (last.seconds ?? 0).toFixed(2), corrections };
+    const values = { end: last.end && say(`alignment.${last.end}`), seconds: number(last.seconds ?? 0, 2), corrections };
     const how = !last.end ? "alignment.under_way" : last.purpose === "alignment" ? "alignment.corrected" : "alignment.ended";
     const names = [...new Set(seen.flatMap((look) => look.marks.map((mark) => mark.name)))];
     const table = made_of("table", [
@@ -44,8 +48,6 @@ export class Alignment {
     const title = say(`alignment.${last.purpose}`);
     const whose = made_of("small", [say("alignment.of", { id: last.id, user: this.user })]);
     this.section.replaceChildren(made_of("h2", [`${title} `, whose]), says, table);
-    this.button.textContent = `${title}: ${values.end ?? "…"}`;
-    this.button.hidden = false;
   }
 }
 
@@ -53,9 +55,9 @@ export class Alignment {
 function way({ marks }, name) {
   const mark = marks.find((each) => each.name === name);
   if (!mark) return "–";
-  if (!mark.to_go) return mark.pixel.map((value) => value.toFixed(1)).join(", ");
+  if (!mark.to_go) return mark.pixel.map((value) => number(value, 1)).join("; ");
   const microns = Math.hypot(...mark.to_go) * 1e6;
-  return `${microns.toFixed(microns < 100 ? 2 : 1)} µm`;
+  return `${number(microns, microns < 100 ? 2 : 1)} µm`;
 }
 
 function made_of(kind, children) {

@@ -1,7 +1,8 @@
 // The last minutes as curves: where the robot is, how far its sliders are behind, and how late its loop is.
 
 import uPlot from "./uplot.js";
-import { say } from "./words.js";
+import { unit } from "./units.js";
+import { number, say, time } from "./words.js";
 
 const KEPT = 180; // seconds
 const EVERY = 100; // between two points [ms]
@@ -18,18 +19,19 @@ const style = (name) => getComputedStyle(document.documentElement).getPropertyVa
 export class Charts {
   constructor() {
     this.times = [];
-    this.rows = []; // x, y [mm], φ [°], following error of each slider [µm], lateness [µs]
+    this.rows = []; // x, y in the unit of the page, φ [°], following error of each slider [µm], lateness [µs]
     this.last = -Infinity;
     this.drawn = -Infinity;
     this.plots = [];
   }
 
   // Draw anew, for this robot and in the language of now.
-  robot({ sliders, colours }) {
+  robot({ sliders, colours, resolution }) {
+    this.scale = resolution.scale;
     for (const plot of this.plots) plot.destroy();
     const [x, y, phi] = ["--accent", "--second", "--third"].map(style);
     this.plots = [
-      plot("x, y [mm]", [["x", x], ["y", y]], [0, 1]),
+      plot(`x, y [${unit()}]`, [["x", x], ["y", y]], [0, 1]),
       plot("φ [°]", [["φ", phi]], [2]),
       plot(say("chart.error"), sliders.map((name, k) => [name, colours.sliders[k]]), [3, 4, 5]),
       plot(say("chart.lateness"), [[say("chart.late"), x]], [6], true),
@@ -40,7 +42,7 @@ export class Charts {
     if (now - this.last < EVERY) return;
     this.last = now;
     this.times.push(Date.now() / 1e3);
-    this.rows.push([pose[0] * 1e3, pose[1] * 1e3, pose[2] * PHI, ...sliders.following_error.map((each) => each * 1e6), loop.lateness_us.p99]);
+    this.rows.push([pose[0] * this.scale, pose[1] * this.scale, pose[2] * PHI, ...sliders.following_error.map((each) => each * 1e6), loop.lateness_us.p99]);
     while (this.times[this.times.length - 1] - this.times[0] > KEPT) {
       this.times.shift();
       this.rows.shift();
@@ -72,9 +74,9 @@ export class Charts {
 function plot(title, lines, columns, last = false) {
   const axis = { stroke: style("--quiet"), grid: { stroke: style("--raised") }, ticks: { stroke: style("--raised") } };
   const series = lines.map(([label, stroke]) => ({ label, stroke, width: 1.5, spanGaps: false, points: { show: false } }));
-  const clock = (_, times) => times.map((time) => (last ? new Date(time * 1e3).toLocaleTimeString("en-GB") : ""));
+  const clock = (_, times) => times.map((each) => (last ? time(each) : ""));
   const made = new uPlot(
-    { title, width: 300, height: LOW, legend: { show: lines.length > 1, live: false }, cursor: { show: false }, axes: [{ ...axis, values: clock, space: 90, size: last ? 30 : 8 }, { ...axis, size: 60, space: 22 }], series: [{}, ...series] },
+    { title, width: 300, height: LOW, legend: { show: lines.length > 1, live: false }, cursor: { show: false }, axes: [{ ...axis, values: clock, space: 90, size: last ? 30 : 8 }, { ...axis, size: 60, space: 22, values: (_, values) => values.map((each) => number(each, 0, 6)) }], series: [{}, ...series] },
     [[], ...lines.map(() => [])],
     byId("charts"),
   );

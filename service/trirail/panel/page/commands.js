@@ -1,15 +1,15 @@
 // Commands, override and lease: what may be pressed now, and by whom. What a role may not do is not there.
 
-import { onLanguage, say } from "./words.js";
+import { barriers } from "./barriers.js";
+import { number, onLanguage, say, time } from "./words.js";
 
 const SETTING = 1000; // for so long the override's slider is the operator's, then it shows the robot's again [ms]
-const POWERED = ["holding", "moving", "stopping"]; // modes in which a motion may begin
 
 const byId = (id) => document.getElementById(id);
 
 export class Commands {
   // `send` says a message to the server; `now()` is the robot and its state, null without contact.
-  constructor(send, now, answer) {
+  constructor(send, now, answer, note) {
     this.now = now;
     this.users = ""; // who is connected
     this.since = null; // since when who holds the lease, as events tell
@@ -17,14 +17,16 @@ export class Commands {
     for (const button of document.querySelectorAll("[data-command]"))
       button.addEventListener("click", () => {
         const name = button.dataset.command;
-        answer(say("answer.asked", { what: say(`do.${name}`) }));
+        answer(say(`do.${name}`));
         send(name === "takeover" ? { do: name } : { do: "command", name });
       });
     byId("override").addEventListener("input", (event) => {
       this.set = performance.now();
       showOverride(event.target.value);
     });
-    byId("override").addEventListener("change", (event) => send({ do: "override", percent: Number(event.target.value) }));
+    byId("override").addEventListener("change", (event) => send({ do: "command", name: "override", content: { percent: Number(event.target.value) } }));
+    // A control that is disabled says why where it is pressed.
+    document.addEventListener("pointerdown", ({ target }) => target.closest?.("button, input")?.disabled && note(target.closest("button, input").title), true);
     onLanguage(() => this.show());
   }
 
@@ -39,29 +41,16 @@ export class Commands {
     document.querySelector("[data-command=home]").hidden ||= homes.length === 0;
   }
 
-  // Whether each button may be pressed now; what is pressed all the same is refused by the service.
-  allow(path) {
+  // Disable what cannot work now, and say why; return whether the robot may be moved. `choice` is as of barriers().
+  allow(choice) {
     const { robot, state } = this.now();
-    const { mode, goal, lease } = state ?? {};
-    const running = Boolean(mode) && mode !== "disabled" && mode !== "fault";
-    const may = {
-      enable: mode === "disabled",
-      disable: running,
-      home: mode === "holding",
-      reset: mode === "fault",
-      pause: mode === "moving",
-      acquire: Boolean(mode) && !lease,
-      takeover: Boolean(mode) && Boolean(lease) && lease !== robot?.user,
-      release: Boolean(mode) && Boolean(lease) && lease === robot?.user,
-      quick_stop: running,
-      resume: Boolean(goal) && (mode === "holding" || mode === "stopping"),
-    };
-    for (const button of document.querySelectorAll("[data-command]")) button.disabled = !may[button.dataset.command];
-    const powered = POWERED.includes(mode) && Boolean(robot?.permissions.includes("goal"));
-    for (const button of document.querySelectorAll(".hold, #poses button, #go")) button.disabled = !powered;
-    byId("file-start").disabled = byId("follow").disabled = !powered || !path;
-    byId("override").disabled = byId("here").disabled = !mode;
-    return powered;
+    const bars = barriers(robot, state, choice);
+    for (const button of document.querySelectorAll("[data-command]")) bar(button, bars[button.dataset.command]);
+    for (const control of document.querySelectorAll(".hold, #poses button, #go")) bar(control, bars.goal);
+    for (const id of ["override", "teach", "forget"]) bar(byId(id), bars[id]);
+    for (const id of ["file-start", "follow"]) bar(byId(id), bars.follow);
+    bar(byId("here"), state ? null : ["bar.contact"]);
+    return !bars.goal;
   }
 
   show() {
@@ -70,16 +59,24 @@ export class Commands {
     text(byId("people"), known && this.users ? say("people", { users: this.users }) : "");
     if (!known) return text(byId("lease"), "");
     const { lease, override } = state;
-    const since = lease && this.since?.user === lease ? say("lease.since", { time: new Date(this.since.time * 1e3).toLocaleTimeString("en-GB") }) : "";
+    const since = lease && this.since?.user === lease ? say("lease.since", { time: time(this.since.time) }) : "";
     const words = lease ? (lease === robot.user ? "lease.mine" : "lease.held") : robot.lease === "required" ? "lease.required" : "lease.nobody";
     text(byId("lease"), say(words, { user: lease, since }));
+    byId("lease").className = words === "lease.held" ? "warning" : "";
     const percent = Math.round(override * 100);
     if (performance.now() - this.set > SETTING) showOverride((byId("override").value = percent));
   }
 }
 
+// Bar a control for a reason, or let it work again and have its own title.
+function bar(control, reason) {
+  const title = reason ? say(...reason) : control.dataset.sayTitle ? say(control.dataset.sayTitle) : "";
+  if (control.disabled !== Boolean(reason)) control.disabled = Boolean(reason);
+  if (control.title !== title) control.title = title;
+}
+
 function showOverride(percent) {
-  text(byId("override-says"), `${percent} %`);
+  text(byId("override-says"), `${number(percent)} %`);
   byId("override").setAttribute("aria-valuetext", `${percent} %`);
 }
 

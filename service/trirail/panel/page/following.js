@@ -1,13 +1,14 @@
 // Following a path in a file: checked and drawn when it is chosen, followed when it is told, and how far it is meanwhile.
 
-import { onLanguage, quoted, say } from "./words.js";
+import { refusal } from "./service_words.js";
+import { rounded } from "./units.js";
+import { number, onLanguage, say } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
-const shown = (seconds) => String(Number(seconds.toPrecision(3)));
 
 export class Following {
   // `send` says a message to the server; `now()` has the robot and its drawing; `allow` looks anew what may be pressed.
-  constructor(send, now, allow, answer) {
+  constructor(send, now, allow, answer, speed) {
     this.send = send;
     this.now = now;
     this.allow = allow;
@@ -24,15 +25,22 @@ export class Following {
       byId("stretch").click();
     });
     byId("file-start").addEventListener("click", () => {
-      answer(say("answer.asked", { what: say("do.pose") }));
-      send({ do: "pose", pose: this.found.line[0] });
+      answer(say("do.pose"));
+      const [x, y, phi] = this.found.line[0];
+      send({ do: "goal", goal: { kind: "pose", x, y, phi, speed: speed() } });
     });
     byId("following").addEventListener("submit", (event) => {
       event.preventDefault();
-      answer(say("answer.asked", { what: say("do.follow", this.file) }));
+      answer(say("do.follow", this.file));
       send({ do: "follow", ...this.file, stretch: byId("stretch").checked });
     });
     onLanguage(() => this.#show());
+  }
+
+  // What bars its buttons, as of barriers().
+  get choice() {
+    if (!this.file) return "none";
+    return this.may ? "" : this.found ? "barred" : "checking";
   }
 
   // Whether there is a path that can be followed.
@@ -54,12 +62,18 @@ export class Following {
   // How far it is, where it is what the robot does; the file's words again when it has ended.
   state({ goal }) {
     const runs = goal !== null && goal.id === this.goal;
-    byId("file-progress").hidden = !runs;
+    byId("file-progress").style.visibility = runs ? "" : "hidden";
     if (!runs) return this.running && ((this.running = false), this.#show());
     this.running = true;
     byId("file-progress").value = goal.progress;
-    const words = say("file.under_way", { ...this.file, percent: Math.round(goal.progress * 100), left: goal.remaining.toFixed(1) });
+    const words = say("file.under_way", { ...this.file, percent: number(goal.progress * 100), left: number(goal.remaining, 1) });
     if (byId("file-says").textContent !== words) byId("file-says").textContent = words;
+  }
+
+  // Check it for another robot, or other limits.
+  robot() {
+    this.#check();
+    this.draw();
   }
 
   // Its drawing once more, on a robot that is drawn anew.
@@ -92,8 +106,8 @@ export class Following {
     this.allow();
     byId("following").dataset.may = found ? (this.may ? "yes" : "no") : "";
     if (!file) return;
-    const values = { name: file.name, duration: shown(found?.duration ?? 0), slowed: shown(found?.slowed ?? 1) };
+    const values = { name: file.name, duration: rounded(found?.duration ?? 0), slowed: rounded(found?.slowed ?? 1) };
     const key = !found ? "checking" : found.why ? "barred" : found.slowed > 1 ? "slowed" : "free";
-    byId("file-says").replaceChildren(say(`file.${key}`, values), ...(found?.why ? [" ", quoted(found.why)] : []));
+    byId("file-says").replaceChildren(say(`file.${key}`, values), ...(found?.why ? [" ", refusal({ ...found, message: found.why })] : []));
   }
 }

@@ -1,28 +1,35 @@
 // Going to a pose that is typed, or dragged on the drawing: checked on the way there while it is chosen, gone to when it is told.
 
 import { BASE, NO_TOOL, inBase, inFrame, ofCentre, ofTool, offer } from "./frames.js";
+import { obstacle } from "./service_words.js";
+import { typedAngle, typedLength, unit } from "./units.js";
 import { onLanguage, quoted, say } from "./words.js";
 
-const LENGTHS = { mm: 1e-3, "": 1e-3, m: 1, cm: 1e-2, um: 1e-6, "µm": 1e-6, "μm": 1e-6, in: 0.0254 };
-const ANGLES = { "°": Math.PI / 180, "": Math.PI / 180, deg: Math.PI / 180, rad: 1, mrad: 1e-3, "'": Math.PI / 10800, arcmin: Math.PI / 10800, '"': Math.PI / 648000, arcsec: Math.PI / 648000 };
+const LENGTHS = { mm: 1e-3, m: 1, cm: 1e-2, um: 1e-6, "µm": 1e-6, "μm": 1e-6, in: 0.0254 };
+const ANGLES = { "°": Math.PI / 180, deg: Math.PI / 180, rad: 1, mrad: 1e-3, "'": Math.PI / 10800, arcmin: Math.PI / 10800, '"': Math.PI / 648000, arcsec: Math.PI / 648000 };
 const AXES = ["x", "y", "phi"];
+const AGAIN = 500; // a pose is checked again after so long where the robot has moved meanwhile [ms]
 const byId = (id) => document.getElementById(id);
 
-// A number as it was typed, with its unit, in SI; null for what is none. A decimal comma is one.
+// A number as it was typed, with its unit, in SI; null for what is none. A decimal comma is one. Without a unit a length
+// is in that of the page.
 export function quantity(text, units) {
   const found = /^\s*([+\-−]?(?:\d+[.,]?\d*|[.,]\d+))\s*([^\d\s]*)\s*$/.exec(text);
-  const size = found && units[found[2]];
+  const size = found && units[found[2] || (units === LENGTHS ? unit() : "°")];
   return size ? Number(found[1].replace(",", ".").replace("−", "-")) * size : null;
 }
 
 export class Going {
   // `send` says a message to the server; `now()` is the robot, where it stands and its drawing, each null before there is one.
-  constructor(send, now, answer) {
+  // `speed()` is the share of full speed to go at.
+  constructor(send, now, answer, speed) {
     this.send = send;
+    this.speed = speed;
     this.now = now;
     this.answer = answer;
     this.fields = AXES.map((axis) => byId(`to-${axis}`));
     this.number = 0;
+    this.from = null; // where the robot stood when that was checked, and when that was
     this.pose = null; // what is chosen, if it is a pose: of the tool, in the frame
     this.fields.forEach((field) => field.addEventListener("input", () => this.#typed()));
     byId("going").addEventListener("submit", (event) => {
@@ -43,6 +50,7 @@ export class Going {
   show() {
     const { robot } = this.now();
     if (robot) offer(byId("frame"), [["base", say("frame.base")], ...Object.keys(robot.frames).map((name) => [name, name])]);
+    this.fields.slice(0, 2).forEach((field) => { field.placeholder = unit(); });
     this.#typed();
   }
 
@@ -50,17 +58,29 @@ export class Going {
   choose(centre) {
     if (!centre) return;
     const [x, y, phi] = inFrame(ofTool(centre, this.#tool), this.#frame);
-    const shown = [x * 1e3, y * 1e3, (phi * 180) / Math.PI];
-    this.fields.forEach((field, k) => { field.value = Number(shown[k].toFixed(4)); });
+    const shown = [typedLength(x), typedLength(y), typedAngle(phi)];
+    this.fields.forEach((field, k) => { field.value = shown[k]; });
     this.#typed();
   }
 
   // The server says what is in the way; nothing where it knows of nothing.
-  checked({ number, why, on_way }) {
+  checked({ number, obstacle: found }) {
     if (number !== this.number || !this.pose) return;
-    byId("going").dataset.may = why ? "no" : "yes";
-    byId("going-says").replaceChildren(...(why ? [on_way ? `${say("going.on_way")} ` : "", quoted(why)] : [say("going.free")]));
-    this.now().drawing?.wanted(this.centre, !why);
+    byId("going").dataset.may = found ? "no" : "yes";
+    byId("going-says").replaceChildren(...(found ? [found.on_way ? `${say("going.on_way")} ` : "", obstacle(found)] : [say("going.free")]));
+    this.now().drawing?.wanted(this.centre, !found);
+  }
+
+  // Check again where the robot has moved: the way from there is another one.
+  state({ pose }) {
+    const at = performance.now();
+    if (!this.pose || at - this.from.at < AGAIN || pose.every((value, k) => Math.abs(value - this.from.pose[k]) < 1e-6)) return;
+    this.#check();
+  }
+
+  #check() {
+    this.from = { pose: this.now().pose ?? [0, 0, 0], at: performance.now() };
+    this.send({ do: "check", goal: this.#goal, number: ++this.number });
   }
 
   get #tool() {
@@ -71,8 +91,9 @@ export class Going {
     return this.now().robot?.frames[byId("frame").value] ?? BASE;
   }
 
-  get #names() {
-    return { tool: byId("tool").value || null, frame: byId("frame").value || "base" };
+  get #goal() {
+    const [x, y, phi] = this.pose;
+    return { kind: "pose", x, y, phi, speed: this.speed(), tool: byId("tool").value || null, frame: byId("frame").value || "base" };
   }
 
   #typed() {
@@ -85,13 +106,13 @@ export class Going {
     byId("going-says").replaceChildren(...(wrong ? [quoted(wrong.value), `: ${say("going.wrong")}`] : []));
     this.now().drawing?.wanted(this.centre, null);
     this.now().drawing?.tool(byId("tool").value ? this.#tool : null);
-    if (this.pose) this.send({ do: "check", pose: this.pose, number: ++this.number, ...this.#names });
+    if (this.pose) this.#check();
   }
 
   #go() {
     if (!this.pose) return this.fields.find((_, k) => quantity(this.fields[k].value, k < 2 ? LENGTHS : ANGLES) === null)?.focus();
-    this.answer(say("answer.asked", { what: say("do.pose") }));
-    this.send({ do: "pose", pose: this.pose, ...this.#names });
+    this.answer(say("do.pose"));
+    this.send({ do: "goal", goal: this.#goal });
   }
 
   #grab(event) {

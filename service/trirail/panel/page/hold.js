@@ -3,8 +3,8 @@
 // All of this runs on the page's own thread, so that a page that hangs says nothing and the robot brakes. A worker
 // would go on while the page hangs.
 
-const EVERY = 50; // between two signs of the hand [ms]; the service brakes 200 ms after the last
-const HUNG = 180; // a sign so late comes from a page that has hung: what it held counts no more [ms]
+export const EVERY = 50; // between two signs of the hand [ms]; the service brakes 200 ms after the last
+export const HUNG = 180; // a sign so late comes from a page that has hung: what it held counts no more [ms]
 
 const KEYS = {
   ArrowRight: ["x", 1], ArrowLeft: ["x", -1], ArrowUp: ["y", 1], ArrowDown: ["y", -1], a: ["phi", 1], d: ["phi", -1],
@@ -12,11 +12,12 @@ const KEYS = {
 
 export class Hold {
   // `sign(direction)` is told {x, y, phi}, each -1, 0 or 1, while something is held; `release()` when nothing is any more;
-  // `press({axis, sign})` when a button is pressed, once.
-  constructor(buttons, sign, release, press) {
+  // `press({axis, sign})` when a button is pressed, once; `barred(button)` when the key of one that is disabled is.
+  constructor(buttons, sign, release, press, barred) {
     this.sign = sign;
     this.release = release;
     this.press = press;
+    this.barred = barred;
     this.held = new Map(); // which finger or key holds which button
     this.timer = null;
     this.last = 0;
@@ -44,6 +45,10 @@ export class Hold {
       button.setPointerCapture(event.pointerId);
       this.#down(`pointer ${event.pointerId}`, button);
     });
+    // It is captured so that its end is told wherever it is; off the button it holds no more, as a finger.
+    button.addEventListener("pointermove", (event) => {
+      if (!contains(button, event)) this.#up(`pointer ${event.pointerId}`);
+    });
     for (const up of ["pointerup", "pointercancel", "lostpointercapture"])
       button.addEventListener(up, (event) => this.#up(`pointer ${event.pointerId}`));
     button.addEventListener("touchcancel", () => this.end());
@@ -63,7 +68,7 @@ export class Hold {
   }
 
   #down(by, button) {
-    if (button.disabled) return; // as where the role does not allow it
+    if (button.disabled) return this.barred(button); // as where the role does not allow it
     this.held.set(by, button);
     button.classList.add("held");
     this.press(button.dataset);
@@ -95,4 +100,9 @@ export class Hold {
     if (direction.x || direction.y || direction.phi) this.sign(direction);
     else this.end(); // opposite buttons at once
   }
+}
+
+function contains(button, { clientX, clientY }) {
+  const { left, right, top, bottom } = button.getBoundingClientRect();
+  return clientX >= left && clientX <= right && clientY >= top && clientY <= bottom;
 }

@@ -1,31 +1,43 @@
-// Jogging: while a button is held, or by a step for each press; along the axes of a frame, about a tool.
+// Jogging: while a button is held, or a gamepad's shoulder, or by a step for each press; along a frame, about a tool.
 
 import { offer, rotated } from "./frames.js";
+import { Pad } from "./gamepad.js";
 import { Hold } from "./hold.js";
-import { onLanguage, say } from "./words.js";
+import { DEGREE, rounded, step, unit } from "./units.js";
+import { number, onLanguage, say } from "./words.js";
 
-const STEPS = [null, 0.01, 0.1, 1, 10]; // what a press of a jog button moves [mm]; null: while it is held
-const TURNS = [null, 0.01, 0.1, 1, 1]; // the same about φ [°]
+const STEPS = 4; // beside jogging while a button is held
 
 const byId = (id) => document.getElementById(id);
 
 export class Jogging {
   // `send` says a message to the server; `now()` is the robot, where it stands and the stamp of the newest state drawn.
-  constructor(send, now, answer) {
+  constructor(send, now, answer, barred, stop) {
     this.now = now;
-    this.step = 0; // which of STEPS is chosen
+    const sign = (direction) => this.step === 0 && send({ do: "hold", velocity: this.#velocity(direction), seen: now().seen, tool: byId("tool").value || null });
+    const release = () => send({ do: "release" });
+    this.step = 0; // which of the robot's steps is chosen, from 1; 0: a button moves while it is held
     this.hold = new Hold(
       document.querySelectorAll(".hold"),
-      (direction) => STEPS[this.step] === null && send({ do: "hold", velocity: this.#velocity(direction), seen: now().seen, tool: byId("tool").value || null }),
-      () => send({ do: "release" }),
+      sign,
+      release,
       ({ axis, sign }) => {
-        if (STEPS[this.step] === null) return;
-        const by = { x: 0, y: 0, phi: 0, [axis]: Number(sign) * (axis === "phi" ? (TURNS[this.step] * Math.PI) / 180 : STEPS[this.step] / 1e3) };
-        answer(say("answer.asked", { what: say("do.step") }));
-        send({ do: "step", by: [by.x, by.y, by.phi], seen: now().seen, tool: byId("tool").value || null, frame: byId("along").value });
+        if (this.step === 0) return;
+        const by = { x: 0, y: 0, phi: 0, [axis]: Number(sign) * (axis === "phi" ? this.#angle(this.step) * DEGREE : this.#length(this.step)) };
+        answer(say("do.move"));
+        send({ do: "goal", goal: { kind: "move", ...by, speed: this.speed, tool: byId("tool").value || null, frame: byId("along").value }, seen: now().seen });
       },
+      (button) => barred(button.title),
     );
-    byId("steps").replaceChildren(...STEPS.map((_, number) => this.#button(number)));
+    const [button] = this.hold.buttons;
+    this.pad = new Pad({
+      sign, release, stop,
+      faster: (by) => this.faster(by),
+      found: () => answer(say("jog.pad")),
+      may: () => !button.disabled && this.hold.held.size === 0,
+      barred: () => barred(button.title),
+    });
+    byId("steps").replaceChildren(...Array.from({ length: STEPS + 1 }, (_, which) => this.#button(which)));
     byId("speed").addEventListener("input", () => this.#showSpeed());
     onLanguage(() => this.show());
     this.choose(0);
@@ -33,6 +45,7 @@ export class Jogging {
 
   end() {
     this.hold.end();
+    this.pad.end();
   }
 
   choose(number) {
@@ -48,24 +61,38 @@ export class Jogging {
 
   // Show what there is to choose, for the robot and in the language of now.
   show() {
-    const words = (number) => (STEPS[number] === null ? say("jog.held") : say("jog.step", { length: STEPS[number], angle: TURNS[number] }));
-    byId("step-says").textContent = words(this.step);
-    [...byId("steps").children].forEach((button, number) => {
-      button.setAttribute("aria-pressed", String(number === this.step));
-      button.setAttribute("aria-label", words(number));
-      button.textContent = STEPS[number] ?? say("jog.hold");
-    });
     const { robot } = this.now();
     if (!robot) return;
+    const parts = (which) => [step(this.#length(which)), `${number(this.#angle(which), 0, 4)}°`];
+    const words = (which) => (which === 0 ? say("jog.held") : say("jog.step", { length: parts(which)[0], angle: parts(which)[1] }));
+    byId("step-says").textContent = words(this.step);
+    [...byId("steps").children].forEach((button, which) => {
+      button.setAttribute("aria-pressed", String(which === this.step));
+      button.setAttribute("aria-label", words(which));
+      button.textContent = which === 0 ? say("jog.hold") : parts(which).join("\n");
+    });
     offer(byId("along"), [["base", say("frame.base")], ["platform", say("frame.platform")], ...Object.keys(robot.frames).map((name) => [name, name])]);
     offer(byId("tool"), [["", say("tool.centre")], ...Object.keys(robot.tools).map((name) => [name, name])]);
     this.#showSpeed();
   }
 
-  #button(number) {
+  // The share of full speed that is chosen: of jogs, and of goals.
+  get speed() {
+    return this.now().robot?.speeds[byId("speed").value] ?? 1;
+  }
+
+  #length(which) {
+    return this.now().robot.resolution.steps[which - 1];
+  }
+
+  #angle(which) {
+    return this.now().robot.resolution.angle_steps[which - 1];
+  }
+
+  #button(which) {
     const button = document.createElement("button");
-    button.dataset.step = number;
-    button.addEventListener("click", () => this.choose(number));
+    button.dataset.step = which;
+    button.addEventListener("click", () => this.choose(which));
     return button;
   }
 
@@ -75,7 +102,7 @@ export class Jogging {
     const along = byId("along").value;
     const angle = along === "platform" ? pose[2] : (robot.frames[along]?.[2] ?? 0);
     const [x, y, phi] = robot.velocity;
-    const share = robot.speeds[byId("speed").value];
+    const share = this.speed;
     const [u, v] = rotated([direction.x * share * x, direction.y * share * y], angle);
     const most = Math.max(1, Math.abs(u) / x, Math.abs(v) / y);
     return [u / most, v / most, direction.phi * share * phi];
@@ -84,11 +111,9 @@ export class Jogging {
   #showSpeed() {
     const { robot } = this.now();
     if (!robot) return;
-    const share = robot.speeds[byId("speed").value];
     const [x, y, phi] = robot.velocity;
-    const linear = share * Math.min(x, y) * 1e3;
-    const angular = (share * phi * 180) / Math.PI;
-    const words = `${Number(linear.toPrecision(3))} mm/s, ${Number(angular.toPrecision(3))} °/s`;
+    const linear = this.speed * Math.min(x, y) * robot.resolution.scale;
+    const words = `${rounded(linear)} ${unit()}/s, ${rounded((this.speed * phi) / DEGREE)} °/s`;
     byId("speed-says").textContent = words;
     byId("speed").setAttribute("aria-valuetext", words);
   }

@@ -1,17 +1,21 @@
 // The operator's page: a WebSocket to the panel's server, buttons that say what is wanted, and what the robot says.
 
 import { Alignment } from "./alignment.js";
+import { Answer } from "./answer.js";
 import { Charts } from "./charts.js";
 import { Commands } from "./commands.js";
 import { Drawing } from "./drawing.js";
+import { Events } from "./events.js";
 import { Following } from "./following.js";
 import { Going } from "./going.js";
 import { Jogging } from "./jogging.js";
 import { Naming } from "./naming.js";
 import { Readings } from "./readings.js";
 import { Sessions } from "./sessions.js";
+import { refusal } from "./service_words.js";
 import { onLanguage, say } from "./words.js";
 
+const LEASED = { acquire: true, takeover: true, release: false }; // commands that take or give back the lease
 const SILENT = 1500; // without a state for so long, what is shown is old [ms]
 const AGAIN = 500; // after so long a lost connection is tried again [ms]
 
@@ -29,28 +33,32 @@ let drawn = true;
 let heard = 0;
 
 const now = () => ({ robot, drawing, seen, state: contact ? state : null, pose: contact ? state.pose : null });
-const answer = (words) => readings.answer(words);
-const readings = new Readings();
+const line = new Answer(byId("answer"));
+const answer = (what) => line.asked(what);
+const note = (words) => (words ? line.refused(words) : line.clear());
+const events = new Events(byId("events"));
+const readings = new Readings(events.faults);
 export const charts = new Charts();
 const alignment = new Alignment(byId("alignment"), document.querySelector("[data-view=alignment]"));
-const commands = new Commands(send, now, answer);
-const jogging = new Jogging(send, now, answer);
-const going = new Going(send, now, answer);
-const following = new Following(send, now, allow, answer);
-const naming = new Naming(send, allow, answer);
+const commands = new Commands(send, now, answer, note);
+const jogging = new Jogging(send, now, answer, note, stop);
+const speed = () => jogging.speed;
+const going = new Going(send, now, answer, speed);
+const following = new Following(send, now, allow, answer, speed);
+const naming = new Naming(send, allow, answer, speed, note);
 const sessions = new Sessions(now);
 
 // ------------------------------------------------------------------ to the server
 
 function send(message) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
-  else if (socket) readings.answer(say("not_sent"), true);
+  else if (socket) note(say("not_sent"));
 }
 
 function stop() {
   jogging.end();
+  answer(say("do.stop"));
   send({ do: "command", name: "stop" });
-  answer(say("answer.asked", { what: say("do.stop") }));
 }
 
 function connect() {
@@ -74,38 +82,40 @@ const takes = {
     commands.roles(robot);
     jogging.show();
     going.show();
-    following.draw();
+    following.robot();
     allow();
   },
   state(said) {
     state = said.state;
     state.stamp = said.stamp;
+    if (!contact) line.clear(); // as that nothing could be sent
     contact = true;
     heard = performance.now();
     if (drawn) requestAnimationFrame(draw); // a hidden page draws nothing, and is sent no more
     drawn = false;
   },
   event({ event }) {
-    readings.event(event);
+    events.add(event);
+    line.event(event);
     alignment.event(event);
     commands.event(event);
   },
   silent() {
     lost("service");
   },
-  ended({ message }) {
+  ended(told) {
     jogging.end();
-    readings.answer("", true, message);
+    line.refused("", refusal(told));
   },
-  refused({ to, name, message }) {
-    readings.answer(say("answer.refused", { what: what(to, name) }), true, message);
+  refused({ to, name, ...told }) {
+    line.refused(say("answer.refused", { what: what(to, name) }), refusal(told));
   },
-  done({ to, name }) {
-    answer(say("answer.done", { what: what(to, name) }));
+  done({ to, name, seq }) {
+    line.done(what(to, name), seq, ({ lease }) => !(to in LEASED) || LEASED[to] === (lease === robot.user));
   },
   accepted({ to, name, id }) {
     if (to === "follow") following.accepted(id);
-    answer(say("answer.accepted", { what: what(to, name) }));
+    line.accepted(what(to, name), id);
   },
   poses(said) {
     naming.poses(said);
@@ -136,6 +146,8 @@ function draw() {
   drawing.show(state);
   charts.state(state, performance.now());
   readings.state(state);
+  line.state(state);
+  going.state(state);
   commands.show();
   following.state(state);
   allow();
@@ -151,6 +163,7 @@ function lost(why) {
   document.body.dataset.contact = "none";
   readings.lost(say(`lost.${why}`));
   charts.lost();
+  line.clear();
   commands.show();
   allow();
 }
@@ -158,8 +171,8 @@ function lost(why) {
 // ------------------------------------------------------------------ buttons and keys
 
 function allow() {
-  naming.show(contact);
-  if (!commands.allow(following.may)) jogging.end(); // a button that is disabled is not told that the finger leaves it
+  const choice = { file: following.choice, name: naming.name, names: naming.names, taught: naming.taught };
+  if (!commands.allow(choice)) jogging.end(); // a button that is disabled is not told that the finger leaves it
 }
 
 // A slider's colour, dark enough for letters where the page is light.
@@ -202,7 +215,7 @@ addEventListener("keyup", (event) => event.key === " " && event.preventDefault()
 
 const again = () => {
   if (told) takes.robot(told);
-  answer("");
+  line.clear();
 };
 LIGHT.addEventListener("change", again);
 onLanguage(again);

@@ -1,6 +1,6 @@
 // The recorded sessions: when, whose goals ended how, faults; a report of each, and its files to download.
 
-import { onLanguage, quoted, say } from "./words.js";
+import { date, onLanguage, quoted, say } from "./words.js";
 
 const HEADS = ["began", "lasted", "goals", "faults", "files"];
 const byId = (id) => document.getElementById(id);
@@ -43,7 +43,7 @@ function row(made, { session, began, ended, goals, faults, files, reason, troubl
   const counts = Object.entries(goals).map(([outcome, times]) => `${times} ${outcome}`).join(", ");
   const wrong = [trouble ?? reason ?? faults[0] ?? "", !reason && faults.length > 1 ? ` (+${faults.length - 1})` : ""].join("");
   made.append(
-    cell("td", quoted(began === null ? "–" : new Date(began * 1e3).toLocaleString("en-GB"))),
+    cell("td", quoted(began === null ? "–" : date(began))),
     cell("td", quoted(began === null || ended === null ? "–" : lasted(ended - began)), running ? ` ${say("sessions.running")}` : ""),
     cell("td", quoted(counts || "–")),
     cell("td", reason && !trouble ? `${say("sessions.black_box")} ` : "", quoted(wrong || "–")),

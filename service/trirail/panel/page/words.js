@@ -3,12 +3,29 @@
 const KEPT = "trirail language";
 const ATTRIBUTES = { sayLabel: "aria-label", sayTitle: "title", sayPlaceholder: "placeholder" };
 let words = {};
+let language = "en";
+const formats = new Map();
 const listeners = [];
 
 // What stands for a key, with values in it; for a key that there is not, `otherwise`.
 export function say(key, values = {}, otherwise = key) {
   return (words[key] ?? otherwise).replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
 }
+
+// Whether the language has words of its own for a key.
+export const has = (key) => key in words;
+
+// A number with the decimal mark of the language, with `digits` decimals, or as many as it needs up to `most`.
+export function number(value, digits = 0, most = digits) {
+  const key = `${digits} ${most}`;
+  if (!formats.has(key))
+    formats.set(key, new Intl.NumberFormat(language, { minimumFractionDigits: digits, maximumFractionDigits: most, useGrouping: false, signDisplay: "negative" }));
+  return formats.get(key).format(value).replace("-", "−");
+}
+
+const clock = () => (language === "en" ? "en-GB" : language); // 24 hours
+export const time = (seconds) => new Date(seconds * 1e3).toLocaleTimeString(clock(), { hour12: false });
+export const date = (seconds) => new Date(seconds * 1e3).toLocaleString(clock(), { hour12: false });
 
 // Call it whenever the language has changed.
 export function onLanguage(listener) {
@@ -33,7 +50,8 @@ async function fetched(name) {
 
 async function show(code) {
   words = await fetched(`${code}.json`);
-  document.documentElement.lang = code;
+  document.documentElement.lang = language = code;
+  formats.clear();
   for (const element of document.querySelectorAll("[data-say]")) element.textContent = say(element.dataset.say);
   for (const [name, attribute] of Object.entries(ATTRIBUTES))
     for (const element of document.querySelectorAll(`[data-${name.replace(/[A-Z]/, (letter) => `-${letter.toLowerCase()}`)}]`))

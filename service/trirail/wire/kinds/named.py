@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from msgspec import Meta
-
-from trirail.wire.goal_kind import GoalKind, Identifier, OwnLimits, PoseName, Speed, Validity
+from trirail.wire.goal_kind import Blend, GoalKind, GoalLimits, OwnId, PoseName, Speed, ValidFor
 
 
 class NamedGoal(GoalKind, frozen=True, tag="named"):
@@ -14,13 +10,8 @@ class NamedGoal(GoalKind, frozen=True, tag="named"):
 
     name: PoseName
     """One of those that are answered on …/poses."""
-    id: Identifier | None = None
-    """As of a pose goal."""
+    id: OwnId = None
     speed: Speed = 1.0
-    """As of a pose goal."""
-    valid_for: Validity | None = None
-    """As of a pose goal [s]."""
-    limits: OwnLimits | None = None
-    """As of a pose goal."""
-    blend: Annotated[float, Meta(ge=0.0, le=1e3)] | None = None
-    """As of a pose goal [m]."""
+    valid_for: ValidFor = None
+    limits: GoalLimits = None
+    blend: Blend = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trirail.wire.goal_kind import Coordinates, GoalKind, Identifier, Speed, Validity
+from trirail.wire.goal_kind import Coordinates, GoalKind, OwnId, Speed, ValidFor
 
 
 class SlidersGoal(GoalKind, frozen=True, tag="sliders"):
@@ -10,9 +10,6 @@ class SlidersGoal(GoalKind, frozen=True, tag="sliders"):
 
     position: Coordinates
     """lambda_10 of the sliders A, B, C [m]."""
-    id: Identifier | None = None
-    """As of a pose goal."""
+    id: OwnId = None
     speed: Speed = 1.0
-    """As of a pose goal."""
-    valid_for: Validity | None = None
-    """As of a pose goal [s]."""
+    valid_for: ValidFor = None

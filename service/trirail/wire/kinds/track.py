@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from msgspec import Meta, structs
 from trirail_drivers.interface import Triple
 
-from trirail.wire.goal_kind import Clock, Coordinate, Coordinates, GoalKind, Identifier, Validity
+from trirail.wire.goal_kind import Clock, Coordinate, Coordinates, GoalKind, OwnId, ValidFor
 
 
 class TrackGoal(GoalKind, frozen=True, tag="track"):
@@ -32,12 +32,10 @@ class TrackGoal(GoalKind, frozen=True, tag="track"):
     time: Clock | None = None
     """When that is so, by the wall clock of the service's machine [s since 1970]: clocks of two machines must agree to
     a millisecond or so. At most half a second ago or ahead; without it, when the message comes."""
-    id: Identifier | None = None
-    """The same for every renewal of one track."""
+    id: OwnId = None
     timeout: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.25
     """Real time, at every override, after which a track that is not renewed brakes [s]."""
-    valid_for: Validity | None = None
-    """As of a pose goal [s]."""
+    valid_for: ValidFor = None
 
     @property
     def target(self) -> Triple:

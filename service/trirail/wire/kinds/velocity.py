@@ -7,7 +7,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.goal_kind import Coordinate, GoalKind, Identifier, Tool, Validity
+from trirail.wire.goal_kind import Coordinate, GoalKind, OwnId, ToolPoint, ValidFor
 
 
 class VelocityGoal(GoalKind, frozen=True, tag="velocity"):
@@ -21,14 +21,11 @@ class VelocityGoal(GoalKind, frozen=True, tag="velocity"):
     """Along y [m/s]."""
     phi: Coordinate
     """Rate of the platform's angle, counterclockwise, about that point [rad/s]."""
-    id: Identifier | None = None
-    """The same for every renewal of one jog."""
+    id: OwnId = None
     timeout: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.1
     """Real time, at every override, after which a jog that is not renewed brakes [s]."""
-    valid_for: Validity | None = None
-    """As of a pose goal [s]."""
-    tool: Tool | None = None
-    """The point that moves at x, y and about which the platform turns; the centre where there is none."""
+    valid_for: ValidFor = None
+    tool: ToolPoint = None
 
     def check_beginning(self) -> None:
         """Raise RefusedError for a jog that would begin at rest."""

@@ -1,0 +1,93 @@
+"""Set-up of a returning CiA 402 drive in the background: see trirail_drivers.driver.recovery."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, Final
+
+from trirail_drivers.bus.frames import FrameSender
+from trirail_drivers.cia402.axis import Cia402Axis
+from trirail_drivers.cia402.duplicate_node import ANSWERS_AFTER
+from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, SetupTask, Start
+from trirail_drivers.cia402.sdo import Remote
+from trirail_drivers.cia402.sdo_client import Client
+from trirail_drivers.cia402.setup import check_identifiers, configure_one
+from trirail_drivers.driver.recovery import ReturningDrive
+from trirail_drivers.driver.refusals import replacement_refusal
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import Clock
+
+SETTLED_AFTER: Final = 2 * ANSWERS_AFTER
+"""SYNCs after a boot-up in which another node with that id shows itself by its answers."""
+_NUMBERS: Final = {"vendor": "vendor", "product": "product code", "revision": "revision", "serial": "serial number"}
+"""Fields of an Identity, and their names in CiA 301 (1018h)."""
+_MAY_DIFFER: Final = ("revision", "serial")
+"""Fields in which an allowed replacement may differ."""
+
+
+class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
+    """One CiA 402 drive; its set-up is `setup.configure_one`."""
+
+    work, counted = "configuring", "objects"
+
+    def __init__(
+        self,
+        axis: Cia402Axis,
+        one: SetupTask,
+        fastest: float | None,
+        configured: Callable[[SetUp, Start], None],
+        setups: Callable[[], Sequence[SetUp]],
+    ) -> None:
+        """`configured` lets the drive take part in the cycle, and may raise DriveError; `setups` are those of all."""
+        super().__init__(axis)
+        self.one = one
+        self._fastest = fastest
+        self._configured = configured
+        self._setups = setups
+
+    def start_setup(self, sender: FrameSender, clock: Clock) -> tuple[Coroutine[Any, Any, tuple[SetUp, Start]], Client]:
+        """Return a new set-up over SDO, and its client."""
+        before = self.one.remote.client
+        client = Client(sender, before.node, before.od, before.timeout, clock)
+        remote = Remote(self.axis.name, client)
+        remote.logs = False
+        return configure_one(self.one._replace(remote=remote), self._fastest, self._check), client
+
+    def accept(self, made: SetUp, begun: Start) -> str:
+        """Let the drive take part in the cycle; it is not homed if its home offset has changed."""
+        self._configured(made, begun)
+        if self.setup is None or made.home_offset == self.setup.home_offset:
+            return ""
+        self.axis.homed = False
+        return (
+            f"drive {self.axis.name}: object 607C:00 (home offset) is {made.home_offset}, was "
+            f"{self.setup.home_offset}: home it, or restore the offset and restart the service"
+        )
+
+    def may_have_power(self, *, stopping: bool) -> bool:
+        """Whether its statusword shows power; while drives stop, a silent one may have it too."""
+        axis = self.axis
+        if axis.restarted:
+            return False
+        unheard = axis.silent or axis.left_operational
+        return (axis.state in HAS_POWER and (stopping or not axis.silent)) or (unheard and stopping)
+
+    @property
+    def settled(self) -> bool:
+        """Whether another node with its id would have shown itself by now."""
+        return self.axis.syncs >= self.booted_at + SETTLED_AFTER
+
+    def has_answered(self, now: float) -> bool:
+        """Whether the cycle's SDO request is answered or timed out: a server takes one at a time (CiA 301)."""
+        return not self.axis.unanswered or now >= self.axis.answered_by
+
+    def _check(self, looked: SetUp) -> None:
+        """Raise DriveError for another drive than the one before, and for PDO identifiers that another drive uses."""
+        name, allowed = self.axis.name, self.one.drive.allow_replacement
+        if self.setup is not None:
+            before, now = self.setup.identity, looked.identity
+            numbers = {words: (getattr(before, field), getattr(now, field)) for field, words in _NUMBERS.items()}
+            may_differ = [_NUMBERS[field] for field in _MAY_DIFFER]
+            if text := replacement_refusal(name, numbers, may_differ, allowed=allowed):
+                raise DriveError(text)
+        check_identifiers([*(made for made in self._setups() if made.name != name), looked])

@@ -1,0 +1,139 @@
+"""Concurrent conversations with several nodes in one thread: each is a coroutine that awaits frames, or time."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Generic, TypeVar
+
+import can
+
+from trirail_drivers.errors import BusError, DriveError
+from trirail_drivers.interface import Clock
+
+LOG: Final = logging.getLogger("trirail.drives")
+"""Log of the progress of a long set-up."""
+PROGRESS_PERIOD: Final = 1.0
+"""Period of the progress log [s]."""
+_FIRST_PAUSE, _MAX_PAUSE = 0.001, 0.02
+"""Bounds of the pause between two readings of a value [s]; within them it equals the time waited already."""
+
+MAX_QUEUED_FRAMES: Final = 8
+"""Frames that a conversation in the background queues; it awaits one at a time."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Awaitable of the first frame that `accepts` accepts; its result is None after `deadline` [s]."""
+
+    accepts: Callable[[can.Message], bool]
+    """Predicate, called with every frame received meanwhile."""
+    deadline: float
+
+    def __await__(self) -> Generator[Wait, can.Message | None, can.Message | None]:
+        return (yield self)
+
+
+def run_concurrently(
+    bus: can.BusABC, clock: Clock, conversations: Sequence[Coroutine[Any, Any, T]], progress: Callable[[], str]
+) -> list[T | DriveError]:
+    """Run conversations concurrently; return the result of each, or its DriveError.
+
+    `progress` is logged every second. Raises BusError, since it concerns all of them.
+    """
+    ends: dict[int, T | DriveError] = {}
+    waits: dict[int, Wait] = {}
+
+    def resume(at: int, frame: can.Message | None) -> None:
+        waits.pop(at, None)
+        try:
+            waits[at] = conversations[at].send(frame)
+        except StopIteration as end:
+            ends[at] = end.value
+        except BusError:
+            raise
+        except DriveError as error:
+            ends[at] = error
+
+    try:
+        reported = clock()
+        for at in range(len(conversations)):
+            resume(at, None)
+        while waits:
+            due = min(reported + PROGRESS_PERIOD, *(wait.deadline for wait in waits.values()))
+            frame = _receive(bus, due - clock())
+            now = due if frame is None else clock()  # some buses return a little early
+            for at, wait in list(waits.items()):  # a copy: resume changes the waits
+                if frame is not None and wait.accepts(frame):
+                    resume(at, frame)
+                elif now >= wait.deadline:
+                    resume(at, None)
+            if now >= reported + PROGRESS_PERIOD:
+                reported = now
+                LOG.warning("%s", progress())
+    finally:
+        for conversation in conversations:
+            conversation.close()
+    return [ends[at] for at in range(len(conversations))]
+
+
+class BackgroundConversation(Generic[T]):
+    """A conversation that the cycle runs one step at a time, without waiting or receiving."""
+
+    def __init__(self, conversation: Coroutine[Any, Any, T]) -> None:
+        self._conversation = conversation
+        self._heard: deque[can.Message] = deque(maxlen=MAX_QUEUED_FRAMES)
+        self._wait: Wait | None = None
+
+    def receive(self, frame: can.Message) -> None:
+        """Queue a frame for the next step."""
+        self._heard.append(frame)
+
+    def step(self, now: float) -> T | DriveError | None:
+        """Continue if the awaited frame has come or its time is over [s]; return the result once there is one."""
+        frame = None
+        if self._wait is not None:
+            while self._heard and frame is None:
+                heard = self._heard.popleft()
+                frame = heard if self._wait.accepts(heard) else None
+            if frame is None and now < self._wait.deadline:
+                return None
+        try:
+            self._wait = self._conversation.send(frame)
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]
+        except DriveError as error:
+            return error
+        return None
+
+    def close(self) -> None:
+        """Abandon the conversation."""
+        self._conversation.close()
+
+
+def _receive(bus: can.BusABC, seconds: float) -> can.Message | None:
+    try:
+        return bus.recv(max(0.0, seconds))
+    except (can.CanError, OSError) as error:
+        raise BusError(f"cannot receive on {bus.channel_info}: {error}; is the interface up?") from error
+
+
+async def read_until(
+    read: Callable[[], Awaitable[T]],
+    accepts: Callable[[T], bool],
+    pause: Callable[[float], Awaitable[None]],
+    clock: Clock,
+    seconds: float,
+) -> tuple[T, float]:
+    """Read until a value is accepted, for up to `seconds`; return the last value and the time waited [s]."""
+    begun = clock()
+    while True:
+        value = await read()
+        waited = clock() - begun
+        if accepts(value) or waited >= seconds:
+            return value, waited
+        await pause(max(_FIRST_PAUSE, min(waited, _MAX_PAUSE, seconds - waited)))

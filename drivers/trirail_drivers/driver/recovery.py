@@ -1,0 +1,257 @@
+"""Set-up of drives in the background of the cycle, after they restarted, fell silent or were absent.
+
+It is the set-up of the start, run one step at a time so that its traffic is bounded. It sends nothing while a drive
+that answers has power.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Coroutine, Sequence
+from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
+
+import can
+
+from trirail_drivers.bus.frames import Frame, FrameSender, packed
+from trirail_drivers.bus.wire import Wire
+from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.conversations import BackgroundConversation
+from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
+from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
+from trirail_drivers.interface import Clock, Unready, UnreadyDrives
+
+STEP_BITS: Final = 2000
+"""Bit times between two steps, for all drives together: a request and its answer then take 13.5 % of a bus that the
+cycle fills to 75 %, and a drive during set-up leaves 11 % of that unused, since it sends no position."""
+RETRY_AFTER: Final = 2.0
+"""Pause before a refused drive is configured again [s]: the cause may have gone without a boot-up."""
+
+AnyAxis = TypeVar("AnyAxis", bound=Axis)
+Setup = TypeVar("Setup", bound=SetUpDrive)
+StartState = TypeVar("StartState")
+
+
+class SetupClient(Protocol):
+    """Request client of one drive."""
+
+    @property
+    def answered(self) -> int:
+        """Number of answered requests."""
+
+
+class CycleSender:
+    """Sender of set-up frames in the cycle: it does not wait, and a failure becomes a fault of the bus."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+
+    @property
+    def channel_info(self) -> str:
+        """Name of the bus."""
+        return str(self._wire.bus.channel_info)
+
+    def send(self, msg: can.Message) -> None:
+        """Send a frame."""
+        self._wire.send(Frame.from_packed(packed(msg)))
+
+
+class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
+    """A drive that may have to be set up again: its last complete set-up, and the progress of the current one.
+
+    A set-up has two results: the set-up of the drive, and its state at the start.
+    """
+
+    work: ClassVar[str]
+    """Name of the set-up, for people."""
+    counted: ClassVar[str]
+    """Name of the requested things, for people."""
+
+    def __init__(self, axis: AnyAxis) -> None:
+        self.axis = axis
+        self.setup: Setup | None = None
+        """Result of its last complete set-up."""
+        self.requests = 0
+        """Number of requests of the longest set-up."""
+        self.conversation: BackgroundConversation[tuple[Setup, StartState]] | None = None
+        self.client: SetupClient | None = None
+        """Client of that conversation."""
+        self.is_next = False
+        """Whether the conversation begins as soon as the cycle's last request is answered: it must not make another."""
+        self.refused = ""
+        """Error of the last attempt."""
+        self.retry_at = -math.inf
+        self.boots = self.booted_at = 0
+        """Number of observed restarts, and the number of the SYNC before the newest one."""
+        axis.setup_listener = self.receive
+
+    @abstractmethod
+    def start_setup(
+        self, sender: FrameSender, clock: Clock
+    ) -> tuple[Coroutine[Any, Any, tuple[Setup, StartState]], SetupClient]:
+        """Return a new set-up of the drive, and its client."""
+
+    @abstractmethod
+    def accept(self, made: Setup, begun: StartState) -> str:
+        """Let a configured drive take part in the cycle; return a warning, or "". May raise DriveError."""
+
+    @abstractmethod
+    def may_have_power(self, *, stopping: bool) -> bool:
+        """Whether the drive has power by its last message or, while drives are `stopping`, may have it."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether a restarted drive is ready for requests."""
+        return True
+
+    def has_answered(self, now: float) -> bool:  # noqa: ARG002
+        """Whether the cycle's last request is answered, or has timed out at time `now` [s]."""
+        return True
+
+    def record_setup(self, made: Setup, answered: int) -> None:
+        """Record a complete set-up, and its number of requests."""
+        self.setup, self.requests, self.refused = made, max(self.requests, answered), ""
+
+    def receive(self, identifier: int, data: bytes | bytearray) -> None:
+        """Pass a frame of the drive to the conversation."""
+        if self.conversation is not None:
+            self.conversation.receive(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
+
+    def refuse(self, error: DriveError, now: float) -> None:
+        """Record the reason for which the drive cannot take part; it is configured again later."""
+        self.refused, self.retry_at = str(error), now + RETRY_AFTER
+
+    def end(self) -> None:
+        """Abandon the conversation, if there is one."""
+        self.is_next = False
+        if self.conversation is not None:
+            self.conversation.close()
+            self.conversation = self.client = None
+
+    def unready(self, *, blocked: bool) -> Unready | None:
+        """Return the reason for which the drive cannot be reset yet; `blocked`: it waits until no drive has power."""
+        axis, name = self.axis, f"drive {self.axis.name}"
+        if axis.configured:
+            return None
+        if self.refused:
+            return Unready(self.refused)
+        answered = self.client.answered if self.client is not None else 0
+        if not answered and not axis.restarted:
+            return Unready(f"{name} does not answer")
+        reason = "restarted" if axis.restarted else "is back"
+        if blocked:
+            return Unready(f"{name} {reason}: it is configured when no drive has power")
+        return Unready(f"{name} {reason}: {self.work}", answered, self.requests, self.counted)
+
+
+class Recovery(Generic[AnyAxis, Setup, StartState]):
+    """Recovery of all drives. `step` belongs after the setpoints of each cycle."""
+
+    def __init__(self, wire: Wire, bits: float, each: Sequence[ReturningDrive[AnyAxis, Setup, StartState]]) -> None:
+        """`bits`: bit times in a cycle."""
+        self._wire = wire
+        self._sender = CycleSender(wire)
+        self._each = each
+        self._turn = 0
+        self._steps_per_cycle = min(float(len(each)), bits / STEP_BITS)
+        self._steps_due = 0.0
+        self._now = 0.0
+        self._stopping = False
+
+    @property
+    def setups(self) -> list[Setup]:
+        """Last complete set-ups, of those drives that have had one."""
+        return [each.setup for each in self._each if each.setup is not None]
+
+    @property
+    def idle(self) -> bool:
+        """Whether every drive is configured."""
+        return all(each.axis.configured for each in self._each)
+
+    @property
+    def unready(self) -> UnreadyDrives:
+        """Reason for which each drive cannot be reset yet."""
+        if self.idle:
+            return None, None, None
+        a, b, c = (each.unready(blocked=self._blocked) for each in self._each)
+        return a, b, c
+
+    @property
+    def _blocked(self) -> bool:
+        """Whether a drive may have power."""
+        return any(each.may_have_power(stopping=self._stopping) for each in self._each)
+
+    def is_configuring(self, axis: Axis) -> bool:
+        """Whether a drive is being configured, or will be next."""
+        return any(each.axis is axis and (each.is_next or each.conversation is not None) for each in self._each)
+
+    def step(self, now: float, *, stopping: bool) -> None:
+        """Continue with the drives whose turn it is; `stopping`: drives may still be on their ramp."""
+        for each in self._each:
+            _restart_after_boot(each)
+        if self.idle:
+            return
+        self._stopping = stopping
+        if self._blocked:
+            for each in self._each:
+                each.end()
+            return
+        # Bounded, so that steps that no drive could use are not saved up for a burst.
+        self._steps_due = min(self._steps_due + self._steps_per_cycle, max(1.0, self._steps_per_cycle))
+        for _ in self._each:
+            if self._steps_due < 1.0:
+                return
+            self._turn = (self._turn + 1) % len(self._each)
+            each = self._each[self._turn]
+            if not each.axis.configured and each.settled and now >= each.retry_at:
+                self._continue(each, now)
+                self._steps_due -= 1.0
+
+    def abandon(self) -> None:
+        """Abandon every conversation: a restart while the bus is lost is not received."""
+        for each in self._each:
+            each.refused, each.retry_at = "", -math.inf
+            each.end()
+
+    def _continue(self, each: ReturningDrive[AnyAxis, Setup, StartState], now: float) -> None:
+        self._now = now
+        if each.conversation is None:
+            each.is_next = True
+            if not each.has_answered(now):
+                return
+            each.axis.forget_power_state()
+            conversation, each.client = each.start_setup(self._sender, lambda: self._now)
+            each.conversation = BackgroundConversation(conversation)
+        end = each.conversation.step(now)
+        if end is None:
+            return
+        answered = each.client.answered if each.client is not None else 0
+        each.end()
+        if isinstance(end, DriveTimeout):  # it has disappeared again, or never came
+            each.refused, each.axis.silent = "", True
+            each.axis.restarted = each.axis.restarted and not isinstance(end, DriveAbsentError)
+        elif isinstance(end, DriveError):
+            each.refuse(end, now)
+        else:
+            try:
+                warning = each.accept(*end)
+            except DriveError as error:
+                each.refuse(error, now)
+                return
+            if warning:
+                self._wire.warn(warning)
+            # Only new notes: those of the previous set-up have been warned of.
+            known = each.setup.notes if each.setup is not None else ()
+            for line in merge_notes([(each.axis.name, [note for note in end[0].notes if note not in known])]):
+                self._wire.warn(line)
+            each.record_setup(end[0], answered)
+
+
+def _restart_after_boot(each: ReturningDrive[Any, Any, Any]) -> None:
+    """Start again with a drive that has booted since, and end the conversation of a configured one."""
+    if each.boots != each.axis.boots:
+        each.boots, each.refused, each.retry_at = each.axis.boots, "", -math.inf
+        each.booted_at = each.axis.syncs
+        each.end()
+    if each.axis.configured:
+        each.end()

@@ -1,0 +1,95 @@
+"""Request client of one ODrive: one message at a time, each awaited."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import can
+
+from trirail_drivers.bus.frames import Frame, FrameSender, send_in_setup
+from trirail_drivers.driver.conversations import Wait
+from trirail_drivers.errors import DriveAbsentError, DriveTimeout
+from trirail_drivers.interface import Clock
+from trirail_drivers.odrive import cansimple
+
+ATTEMPTS: Final = 3
+"""Attempts of a request within `sdo_timeout`: a frame may be lost."""
+
+
+class OdriveClient:
+    """Requests to one drive, whose answers are picked out of all received frames."""
+
+    def __init__(self, bus: FrameSender, name: str, node: int, timeout: float, clock: Clock) -> None:
+        self.name = name
+        self.timeout = timeout
+        self.clock = clock
+        self.answered = 0
+        """Number of requests that were answered."""
+        self._bus = bus
+        self._node = node
+        self._beat: bytes | None = None
+        """Data of the newest heartbeat that was not returned yet."""
+
+    def command(self, number: int, data: bytes) -> None:
+        """Send a command, which no drive answers. Raises BusError."""
+        send_in_setup(self._bus, cansimple.command(self._node, number, data))
+
+    async def request(self, number: int, message_name: str) -> bytes:
+        """Request a message by its command number and return its data.
+
+        Raises BusError, and DriveTimeout if no answer comes: DriveAbsentError if the drive has answered nothing yet.
+        """
+        data = await self.try_request(number)
+        if data is None:
+            raise self._timeout_error(message_name)
+        return data
+
+    async def try_request(self, number: int) -> bytes | None:
+        """Request a message by its command number; return its data, or None if the drive does not send it."""
+        return await self._request(cansimple.request(self._node, number), number, lambda _: True)
+
+    async def read_setting(self, endpoint: int, path: str) -> bytes:
+        """Return the bytes of the setting at a path, which has this endpoint number; raises as `request` does."""
+        question = cansimple.SDO.pack(cansimple.READ, endpoint, 0)
+        data = await self._request(
+            cansimple.command(self._node, cansimple.RX_SDO, question),
+            cansimple.TX_SDO,
+            lambda data: data[1:3] == question[1:3],  # its endpoint: a late answer to an earlier request has another
+        )
+        if data is None:
+            raise self._timeout_error(f"RxSdo of {path}")
+        return data[cansimple.SDO.size :]
+
+    async def heartbeat(self, deadline: float) -> bytes | None:
+        """Return the data of a heartbeat that was not returned yet, or None if none comes before `deadline` [s]."""
+        if self._beat is None:
+            await self._receive(cansimple.HEARTBEAT, deadline, lambda _: True)
+        beat, self._beat = self._beat, None
+        return beat
+
+    async def _request(self, question: Frame, number: int, accepts: Callable[[bytes], bool]) -> bytes | None:
+        for _ in range(ATTEMPTS):
+            send_in_setup(self._bus, question)
+            data = await self._receive(number, self.clock() + self.timeout / ATTEMPTS, accepts)
+            if data is not None:
+                self.answered += 1
+                return data
+        return None
+
+    async def _receive(self, number: int, deadline: float, accepts: Callable[[bytes], bool]) -> bytes | None:
+        identifier, beats = (cansimple.identifier(self._node, each) for each in (number, cansimple.HEARTBEAT))
+
+        def is_awaited(message: can.Message) -> bool:
+            if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+                return False
+            if message.arbitration_id == beats:
+                self._beat = bytes(message.data)
+            return message.arbitration_id == identifier and accepts(bytes(message.data))
+
+        frame = await Wait(is_awaited, deadline)
+        return None if frame is None else bytes(frame.data)
+
+    def _timeout_error(self, message_name: str) -> DriveTimeout:
+        error = DriveTimeout if self.answered else DriveAbsentError
+        return error(self.name, f"answer to {message_name}", self.timeout)

@@ -1,0 +1,62 @@
+"""Check of a returning ODrive in the background: see trirail_drivers.driver.recovery."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from trirail_drivers.bus.frames import FrameSender
+from trirail_drivers.driver.recovery import ReturningDrive
+from trirail_drivers.driver.refusals import replacement_refusal
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import Clock
+from trirail_drivers.odrive.axis import OdriveAxis
+from trirail_drivers.odrive.client import OdriveClient
+from trirail_drivers.odrive.setup import OdriveIdentity, OdriveSetup, OdriveSetupTask, OdriveStart, configure_one
+
+
+class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
+    """One ODrive; its set-up is `setup.configure_one`."""
+
+    work, counted = "checking its settings", "answers"
+
+    def __init__(self, axis: OdriveAxis, one: OdriveSetupTask, configured: Callable[[OdriveStart], None]) -> None:
+        """`configured` lets the drive take part in the cycle."""
+        super().__init__(axis)
+        self.one = one
+        self._configured = configured
+
+    def start_setup(
+        self, sender: FrameSender, clock: Clock
+    ) -> tuple[Coroutine[Any, Any, tuple[OdriveSetup, OdriveStart]], OdriveClient]:
+        """Return a new set-up and its client."""
+        one = self.one
+        client = OdriveClient(sender, self.axis.name, self.axis.node, one.drives.sdo_timeout, clock)
+        return configure_one(one._replace(client=client), self._check), client
+
+    def accept(self, made: OdriveSetup, begun: OdriveStart) -> str:
+        """Let the drive take part in the cycle; one with a relative position is not homed."""
+        self._configured(begun)
+        self.axis.homed = not made.relative
+        return ""
+
+    def may_have_power(self, *, stopping: bool) -> bool:
+        """Whether its heartbeat shows power; while drives stop, a silent one may have it too."""
+        if self.axis.silent:
+            return stopping
+        return self.axis.powered
+
+    def _check(self, identity: OdriveIdentity) -> None:
+        """Raise DriveError for another drive than the one before."""
+        if self.setup is None:
+            return
+        before = self.setup.identity
+        names = "firmware", "hardware"
+        numbers: dict[str, tuple[object, object]] = dict(
+            zip(names, zip(before.version.dotted, identity.version.dotted, strict=True), strict=True)
+        )
+        if before.serial is not None:
+            numbers["serial number"] = before.serial, identity.serial
+        allowed = self.one.drive.allow_replacement
+        if text := replacement_refusal(self.axis.name, numbers, ("firmware", "serial number"), allowed=allowed):
+            raise DriveError(text)

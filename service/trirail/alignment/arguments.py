@@ -1,0 +1,105 @@
+"""Arguments of an alignment, checked before the first motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import NoReturn
+
+from trirail.alignment.images import LENSES, Pair
+from trirail.errors import RefusalCode, RefusedError
+
+
+def parse_pixel(value: object) -> Pair | None:
+    """Return two finite numbers as Python floats, None for any other value."""
+    pair = parse_numbers(value, 2)
+    return None if pair is None else (pair[0], pair[1])
+
+
+def parse_numbers(value: object, count: int) -> tuple[float, ...] | None:
+    """Return `count` finite numbers as Python floats, None for any other value."""
+    if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
+        return None
+    numbers = [_parse_number(each) for each in value]
+    plain = tuple(each for each in numbers if each is not None and math.isfinite(each))
+    return plain if len(plain) == len(numbers) == count else None
+
+
+def check_count(value: object, name: str, minimum: int) -> None:
+    """Raise RefusedError unless `value` is a whole number of at least `minimum`."""
+    number = None if isinstance(value, float) else _parse_number(value)
+    if number is None or number < minimum:
+        _refuse(value, name, f"a whole number of at least {minimum}")
+
+
+def check_above_zero(value: object, name: str) -> None:
+    """Raise RefusedError unless `value` is a number above zero."""
+    number = _parse_number(value)
+    if number is None or not number > 0.0:
+        _refuse(value, name, "a number above 0")
+
+
+def check_wait(value: object) -> None:
+    """Raise RefusedError unless `value` is a waiting time [s]."""
+    number = _parse_number(value)
+    if number is None or not 0.0 <= number < math.inf:
+        _refuse(value, "wait", "a finite number of seconds, 0 or more")
+
+
+def check_pose_offset(value: object, name: str) -> None:
+    """Raise RefusedError unless `value` is x, y [m] and phi [rad]."""
+    if parse_numbers(value, 3) is None:
+        _refuse(value, name, "three finite numbers, x, y [m] and phi [rad]")
+
+
+def check_approach(value: object) -> None:
+    """Raise RefusedError unless `value` is an offset x, y [m], phi [rad] or None."""
+    if value is not None:
+        check_pose_offset(value, "approach")
+
+
+def check_moves(value: object) -> None:
+    """Raise RefusedError unless `value` lists moves, x, y [m] and phi [rad] each."""
+    if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
+        _refuse(value, "moves", "a list of x, y [m] and phi [rad]")
+    for each in value:
+        check_pose_offset(each, "one of moves")
+
+
+def check_views(value: object) -> None:
+    """Raise RefusedError unless `value` maps mark names to view names, or is None for one view per mark."""
+    if value is not None and not (
+        isinstance(value, Mapping) and all(isinstance(name, str) for pair in value.items() for name in pair)
+    ):
+        _refuse(value, "views", "{mark: view}")
+
+
+def check_lens(lens: object, centre: object) -> None:
+    """Raise RefusedError unless `lens` is one of LENSES and `centre` a pixel."""
+    if lens not in LENSES:
+        _refuse(lens, "lens", f"one of {', '.join(LENSES)}")
+    if parse_pixel(centre) is None:
+        _refuse(centre, "centre", "two finite pixels (u, v)")
+
+
+def check_targets(value: object) -> None:
+    """Raise RefusedError unless `value` maps mark names to target pixels."""
+    if not isinstance(value, Mapping):
+        _refuse(value, "targets", "{mark: (u, v)} in pixels")
+    for name, pixel in value.items():
+        if parse_pixel(pixel) is None:
+            _refuse(pixel, f"the target of mark {name!r:.60}", "two finite pixels (u, v)")
+
+
+def _parse_number(value: object) -> float | None:
+    """Return a number of any library as a Python float; None for truth values, texts and other objects."""
+    if isinstance(value, bool | str | bytes) or not any(hasattr(type(value), n) for n in ("__index__", "__float__")):
+        return None
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def _refuse(value: object, name: str, expected: str) -> NoReturn:
+    raise RefusedError(RefusalCode.MALFORMED, f"{name} is {value!r:.100}: expected {expected}")

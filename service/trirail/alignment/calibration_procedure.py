@@ -1,0 +1,96 @@
+"""Calibration procedures: generators that request looks and motions, as in procedure, and return a calibration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping, Sequence
+
+from trirail_drivers.interface import Triple
+
+from trirail.alignment import arguments
+from trirail.alignment.alignment_request import AlignmentRequest, LookReport, Observation, StageMotion
+from trirail.alignment.camera_calibration import CalibrationSample, CameraCalibration, calibrate
+from trirail.alignment.fresh_pictures import observe_mean
+from trirail.alignment.images import Lens, Pair
+from trirail.errors import AlignmentError, AlignmentFault
+
+DEFAULT_MOVES: tuple[Triple, ...] = tuple(
+    (x * 1e-3, y * 1e-3, math.radians(turn))
+    for x, y, turn in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+)
+"""Moves of a calibration: 1 mm and 1°, each both ways, relative to the pose at its start."""
+ZERO_OFFSET: Triple = (0.0, 0.0, 0.0)
+PLATFORM_CENTRE: Pair = (0.0, 0.0)
+
+
+def calibration_moves(lens: Lens, by: float, turn: float) -> tuple[Triple, ...]:
+    """Return moves that determine a lens: ±by along x and y [m], ±turn [rad], and into the corners unless affine."""
+    straight = ((by, 0.0), (-by, 0.0), (0.0, by), (0.0, -by))
+    corners = () if lens == "affine" else ((by, by), (-by, by), (-by, -by), (by, -by))
+    translations = tuple((x, y, 0.0) for x, y in (*straight, *corners))
+    return (*translations, (0.0, 0.0, turn), (0.0, 0.0, -turn))
+
+
+def calibrate_by_moves(
+    moves: Sequence[Triple] = DEFAULT_MOVES,
+    views: Mapping[str, str] | None = None,
+    lens: Lens = "affine",
+    centre: Pair = (0.0, 0.0),
+    looks: int = 1,
+    approach: Triple | None = None,
+) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
+    """Look at the present pose and after each move from there, return to it, and calibrate.
+
+    With an `approach`, the platform also moves to its present pose from that side first. The other parameters are those
+    of camera_calibration.calibrate.
+
+    Raises
+    ------
+    RefusedError
+        An argument is invalid.
+    AlignmentError
+        The looks do not determine the calibration.
+    """
+    arguments.check_moves(moves)
+    arguments.check_views(views)
+    arguments.check_lens(lens, centre)
+    arguments.check_count(looks, "looks", 1)
+    arguments.check_approach(approach)
+    if approach is not None:
+        yield StageMotion(ZERO_OFFSET, PLATFORM_CENTRE, approach)
+    first = yield from observe_mean(looks)
+    observations = [first]
+    yield LookReport("calibration", first)
+    # Checked after the first look, which names the marks, and before any move.
+    if views is not None and (unknown := sorted(set(first.marks) - set(views))):
+        text = f"marks without a view: {', '.join(unknown)}; name one for each, views names {', '.join(views)}"
+        yield LookReport("calibration", end=AlignmentFault.MISSING, words=text)
+        raise AlignmentError(AlignmentFault.MISSING, text)
+    for move in moves:
+        yield StageMotion(_add(first.pose, move), approach=approach)
+        observations.append((yield from observe_mean(looks)))
+        yield LookReport("calibration", observations[-1])
+    yield StageMotion(first.pose, approach=approach)
+    samples = [CalibrationSample(each.pose, each.marks) for each in observations]
+    try:
+        calibration = calibrate(samples, views, lens, centre, looks)
+    except AlignmentError as error:
+        yield LookReport("calibration", end=error.fault, words=str(error))
+        raise
+    yield LookReport("calibration", end="calibrated", noise=calibration.noise)
+    return calibration
+
+
+def repeat_calibration(
+    saved: CameraCalibration, looks: int = 1
+) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
+    """Calibrate the same views by the same moves, relative to the present pose."""
+    x, y, phi = saved.poses[0]
+    moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in saved.poses[1:]]
+    views = {name: mark.view for name, mark in saved.marks.items()}
+    view = next(iter(saved.views.values()))
+    return (yield from calibrate_by_moves(moves, views, view.lens, view.centre, looks))
+
+
+def _add(a: Triple, b: Triple) -> Triple:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]

@@ -1,0 +1,101 @@
+"""The rigid motion that takes points to their targets, by weighted least squares with the exact rotation.
+
+    q_i = m + s + R(delta) (p_i - m) + r_i,   minimal sum of r_i' W_i r_i
+
+p_i are the points, q_i their targets, m the centroid of the points, s the shift of the centroid and delta the turn
+about it. The closed solution for equal weights (Kabsch 1976, one arc tangent in the plane) starts a Gauss-Newton
+iteration.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+ITERATIONS = 8
+MAX_PERMUTED_MARKS = 6
+"""Number of marks up to which find_swap tries all permutations."""
+MAX_SWAP_SHARE = 0.25
+"""A permutation counts as a swap if it leaves less than this share of the sum of squared distances."""
+
+
+class RigidMotion(NamedTuple):
+    """Motion that takes points to their targets, with its residuals and covariance."""
+
+    centroid: Floats
+    """Centroid of the points before the motion, (2,) [m]."""
+    shift: Floats
+    """Shift of the centroid, (2,) [m]."""
+    turn: float
+    """Rotation about the centroid, counterclockwise [rad]."""
+    misfit: Floats
+    """Residual of each point, (n, 2) [m]."""
+    chi_squared: float
+    """Weighted sum of squares of the residuals; it has 2n - 3 degrees of freedom if the weights are right."""
+    covariance: Floats
+    """Covariance of shift and turn, (3, 3) [m, rad]."""
+
+    def displacements(self, points: Floats) -> Floats:
+        """Return the displacements of points by the motion, (n, 2) both [m]."""
+        arms = points - self.centroid
+        return np.asarray(self.shift + arms @ rotation_matrix(self.turn).T - arms)
+
+
+def rotation_matrix(angle: float) -> Floats:
+    """Return the (2, 2) matrix that rotates by an angle [rad], counterclockwise."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def fit_rigid_motion(points: Floats, targets: Floats, weights: Floats | None = None) -> RigidMotion:
+    """Return the rigid motion from points to targets.
+
+    Parameters
+    ----------
+    points, targets
+        Positions, (n, 2) both [m]; at least two points, at different places.
+    weights
+        Inverse covariances of targets - points, (n, 2, 2) [1/m²]; equal if None.
+    """
+    w = np.broadcast_to(np.eye(2), (len(points), 2, 2)) if weights is None else weights
+    centroid = points.mean(axis=0)
+    arms, goals = points - centroid, targets - targets.mean(axis=0)
+    turn = float(np.arctan2((arms[:, 0] * goals[:, 1] - arms[:, 1] * goals[:, 0]).sum(), (arms * goals).sum()))
+    shift = targets.mean(axis=0) - centroid
+    # The closed solution is the minimum for equal weights only; Gauss-Newton takes the full covariances into account.
+    for _ in range(ITERATIONS):
+        rotated = arms @ rotation_matrix(turn).T
+        residuals = targets - centroid - shift - rotated
+        jacobian = np.zeros((len(points), 2, 3))
+        jacobian[:, :, :2] = np.eye(2)
+        jacobian[:, 0, 2], jacobian[:, 1, 2] = -rotated[:, 1], rotated[:, 0]
+        normal = np.einsum("nai,nab,nbj->ij", jacobian, w, jacobian)
+        step = np.linalg.solve(normal, np.einsum("nai,nab,nb->i", jacobian, w, residuals))
+        shift, turn = shift + step[:2], turn + float(step[2])
+    misfit = targets - centroid - shift - arms @ rotation_matrix(turn).T
+    chi_squared = float(np.einsum("na,nab,nb->", misfit, w, misfit))
+    return RigidMotion(centroid, shift, turn, misfit, chi_squared, np.linalg.inv(normal))
+
+
+def worst_distance_error(points: Floats, targets: Floats) -> float:
+    """Return the relative error of the distance between two points, for the worst pair."""
+    pairs = list(itertools.combinations(range(len(points)), 2))
+    errors = [np.linalg.norm(points[i] - points[j]) / np.linalg.norm(targets[i] - targets[j]) - 1.0 for i, j in pairs]
+    return float(max(errors, key=abs))
+
+
+def find_swap(points: Floats, targets: Floats) -> tuple[int, ...] | None:
+    """Return the order in which the points are much nearer to their targets, None if it is their own.
+
+    The points of a part that is turned by less than 90° are nearest in their own order.
+    """
+    if len(points) > MAX_PERMUTED_MARKS:
+        return None
+    own = ((points - targets) ** 2).sum()
+    orders = itertools.permutations(range(len(points)))
+    best = min(orders, key=lambda order: float(((points[list(order)] - targets) ** 2).sum()))
+    return best if ((points[list(best)] - targets) ** 2).sum() < MAX_SWAP_SHARE * own else None

@@ -1,0 +1,252 @@
+"""An event loop in a thread of its own, and its goals, jogs, leases and tracks for callers that wait in threads."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import CancelledError, Future
+from typing import Any, Generic, Self, TypeVar
+
+from trirail.client.connection import CLOSED
+from trirail.client.goal import AsyncGoalHandle, AsyncJog, Result
+from trirail.client.lease import AsyncLease
+from trirail.client.outgoing import seconds
+from trirail.client.track import AsyncTrack
+from trirail.errors import ServiceError, TrirailError
+from trirail.wire.messages import GoalReply
+from trirail.wire.vocabulary import Command, CommandContent, Stop
+
+T = TypeVar("T")
+Held = TypeVar("Held", bound=AsyncJog | AsyncLease | AsyncTrack)
+
+
+class LoopThread:
+    """An event loop in its own thread, which runs coroutines for any other thread."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._lock = threading.Lock()
+        self._closed = False
+        self._over = asyncio.Event()
+        # A daemon, so that a program that never closes its robot still ends.
+        self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
+        self._thread.start()
+
+    def call(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """Return the result of a coroutine. It is cancelled if the waiting thread is interrupted, as by Ctrl-C.
+
+        Raises ServiceError where the loop is closed before the coroutine's end.
+        """
+        future = self._submit(coroutine)
+        try:
+            return future.result()
+        except CancelledError:
+            raise ServiceError(CLOSED) from None
+        except BaseException:
+            future.cancel()
+            raise
+
+    def start(self, coroutine: Coroutine[Any, Any, object]) -> Future[object]:
+        """Run a coroutine in the background; its errors are logged. Cancelling the future cancels it.
+
+        Raises ServiceError where the loop is closed.
+        """
+        future = self._submit(coroutine)
+        future.add_done_callback(lambda done: None if done.cancelled() else done.result())
+        return future
+
+    def iterate(self, items: AsyncGenerator[T]) -> Iterator[T]:
+        """Yield the items of a generator. The loop closes it when this one is left, as any dropped generator."""
+
+        async def next_item() -> T | None:
+            return await anext(items, None)
+
+        while (item := self.call(next_item())) is not None:
+            yield item
+
+    def close(self) -> None:
+        """End the running coroutines and the thread."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                self._loop.call_soon_threadsafe(self._over.set)
+        self._thread.join()
+
+    def _submit(self, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
+        with self._lock:  # the end of the loop also ends every call that was submitted before
+            if self._closed:
+                problem = CLOSED
+            elif threading.current_thread() is self._thread:
+                problem = "a robot was called by a function that it had called itself"
+            else:
+                return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        coroutine.close()
+        raise ServiceError(problem)
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._wait_for_end())
+
+    async def _wait_for_end(self) -> None:
+        await self._over.wait()
+
+
+class GoalHandle:
+    """A goal that the service has accepted: this object only follows it."""
+
+    def __init__(
+        self, goal: AsyncGoalHandle, loop: LoopThread, command: Callable[[str, CommandContent], object]
+    ) -> None:
+        """Set `command`, which sends a command with its content: Robot.command."""
+        self._goal = goal
+        self._loop = loop
+        self._command = command
+
+    def __repr__(self) -> str:
+        """Return class, id and, once there is one, the outcome."""
+        return repr(self._goal).replace(type(self._goal).__name__, type(self).__name__, 1)
+
+    @property
+    def id(self) -> str:
+        """Id of the goal."""
+        return self._goal.id
+
+    @property
+    def reply(self) -> GoalReply:
+        """Reply of the service."""
+        return self._goal.reply
+
+    @property
+    def result(self) -> Result | None:
+        """Result of the goal; None before its end."""
+        return self._goal.result
+
+    @property
+    def duration(self) -> float | None:
+        """Expected time from acceptance to the end of its path [s], to which settling adds; None while the override is
+        zero."""
+        return self._goal.duration
+
+    @property
+    def expected(self) -> str:
+        """Expected duration, for people."""
+        return self._goal.expected
+
+    def cancel(self) -> None:
+        """Stop it, under way or waiting for another one; return when the robot is at rest, or it no longer waits.
+
+        Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
+        ServiceError if nobody answers.
+        """
+        self._command(Command.STOP, Stop(self.id))
+
+    def wait(self, timeout: float | None = None) -> Result:
+        """Wait for its end, however it ends; look at `outcome` of the result.
+
+        Raises WaitTimeoutError, a TimeoutError, if that takes longer than `timeout` seconds; the goal itself continues.
+        """
+        within = seconds(timeout)
+        return self._goal.result or self._loop.call(self._goal.wait(within))
+
+
+class Blocking(Generic[Held]):
+    """A context of the event loop that any other thread can enter and leave; it waits meanwhile."""
+
+    def __init__(self, held: Held, loop: LoopThread) -> None:
+        self._held = held
+        self._loop = loop
+
+    def __enter__(self) -> Self:
+        self._loop.call(self._held.__aenter__())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call(self._held.__aexit__())
+
+
+class Jog(Blocking[AsyncJog]):
+    """A velocity that is kept alive while the context lasts; `result` is its end afterwards.
+
+    It is renewed three times in each time-out. A program that hangs or dies stops renewing it, and the robot brakes:
+    the time-out is real time, at every override. A jog that was paused or timed out has ended; begin a new one.
+    Entering the context raises RefusedError where the service refuses it, leaving it TimeoutError where its end is not
+    reported. Leaving brakes immediately and waits for the standstill.
+    """
+
+    @property
+    def reply(self) -> GoalReply | None:
+        """Latest reply of the service, with `slowed` for one; None before the first."""
+        return self._held.reply
+
+    @property
+    def result(self) -> Result | None:
+        """Result of the goal; None before its end."""
+        return self._held.result
+
+    @property
+    def error(self) -> Exception | None:
+        """Error of the last renewal, if it failed."""
+        return self._held.error
+
+
+class Lease(Blocking[AsyncLease]):
+    """The lease while the context lasts; `lost` is the error if it was taken over, released or timed out before.
+
+    Entering raises RefusedError where another holds it, and returns when the motions of others have stopped.
+    A program that hangs or dies gives no more signs of life: the robot stops and the lease is free. Leaving releases
+    it, and returns when the robot is at rest.
+    """
+
+    @property
+    def lost(self) -> TrirailError | None:
+        """Error that ended the lease; None while it is held."""
+        return self._held.lost
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it is lost, for `timeout` seconds at most; return whether it is."""
+        return self._loop.call(self._held.wait(timeout))
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(ServiceError):  # the connection is closed: then it ends by its time-out
+            super().__exit__()
+
+
+class Track(Blocking[AsyncTrack]):
+    """Updates of a target's pose, 10 to 200 times a second; the robot follows it.
+
+    Only `update` sends anything: where its calls cease, for whatever reason, the robot brakes on its path after the
+    time-out.
+    """
+
+    @property
+    def id(self) -> str:
+        """Id of its goal."""
+        return self._held.id
+
+    @property
+    def lag(self) -> float | None:
+        """Greatest distance of a point of the platform from its target, in the latest reply [m]."""
+        return self._held.lag
+
+    @property
+    def result(self) -> Result | None:
+        """Result of the goal; None before its end."""
+        return self._held.result
+
+    def update(
+        self, pose: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), time: float | None = None
+    ) -> None:
+        """Send the target's pose and velocity at a time: x, y [m], phi [rad], and per second.
+
+        `time` is that of the wall clock [s since 1970], now if absent; on another machine than the service's the
+        clocks must agree. Until the next call the robot keeps that velocity. The first call returns when the track is
+        accepted, the others immediately: the next call raises a refusal. Raises RefusedError, also once the track has
+        ended (a stop, a pause, another goal, a time-out), and ServiceError where nobody answers.
+        """
+        self._loop.call(self._held.update(pose, velocity, time))
+
+    def close(self) -> None:
+        """Brake on the path, if the robot still follows; return when it is at rest."""
+        self._loop.call(self._held.close())

@@ -1,0 +1,43 @@
+"""Robot, locator, user and credentials of a client: as given, else from the environment."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import re
+from pathlib import Path
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.wire.credentials import Credentials, credentials_for
+from trirail.wire.endpoints import DEFAULT_LOCATOR, ReachableBy, reach
+from trirail.wire.sizes import MAX_NAME
+from trirail.wire.text import check_name, quoted
+
+
+def identity(
+    robot: str | None, connect: str | None, user: str | None, tls: Path | str | None
+) -> tuple[str, str, str, Credentials | None]:
+    """Return robot, locator, user and credentials of a client.
+
+    Defaults come from the environment, as in a shell. Raises RefusedError, ServiceError.
+    """
+    robot = check_name(robot or os.environ.get("TRIRAIL_ROBOT") or "demo", "robot")
+    connect = connect or os.environ.get("TRIRAIL_CONNECT") or DEFAULT_LOCATOR
+    if tls is None and reach(connect) is ReachableBy.CERTIFICATE:
+        tls = os.environ.get("TRIRAIL_TLS") or None
+    credentials = credentials_for(robot, connect, tls)
+    known_as = credentials.name if credentials is not None else ""
+    name = check_name(user or known_as or _user(), "user")
+    if credentials is not None and known_as != name:
+        whose = f"in the name of {quoted(known_as)}" if known_as else "without a common name"
+        problem = f"the certificate in {credentials.folder} is {whose}: {name} cannot send with it"
+        raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
+    return robot, connect, name, credentials
+
+
+def _user() -> str:
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):
+        return "anonymous"
+    return re.sub(r"[^A-Za-z0-9_-]", "-", name)[:MAX_NAME] or "anonymous"

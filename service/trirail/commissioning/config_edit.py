@@ -1,0 +1,95 @@
+"""Edits of a configuration file that keep the user's comments, order and spelling."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+import tomlkit
+from tomlkit.items import Table
+from trirail_drivers.config import Drives
+from trirail_drivers.interface import NAMES
+
+from trirail.config import Config, parse
+from trirail.errors import ConfigError
+
+
+def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
+    """Return a configuration's text with new values for the keys in `changes`, each by its whole path.
+
+    Raises ConfigError if the result is not a valid configuration, or differs in any other value.
+    """
+    document = tomlkit.parse(text)
+    for path, value in changes.items():
+        *tables, key = path.split(".")
+        table: object = document
+        for name in tables:
+            table = table[name]  # type: ignore[index]
+        if not isinstance(table, Table) or key in table:
+            table[key] = value  # type: ignore[index]
+        else:
+            table.add(key, value)
+    result = tomlkit.dumps(document)
+    # tomlkit edits text: only the parsed result shows that nothing else has changed with it.
+    if parse(result) != replace_values(parse(text), changes):
+        raise ConfigError(f"changes {dict(changes)}: cannot be written into this file; edit it by hand")
+    return result
+
+
+def replace_values(config: Config, changes: Mapping[str, int | float]) -> Config:
+    """Return a configuration with new values for keys of [drives.A], [drives.B] and [drives.C]."""
+    drives = config.drives
+    for path, value in changes.items():
+        _, name, key = path.split(".")
+        drive = msgspec.structs.replace(getattr(drives, name), **{key: value})
+        drives = msgspec.structs.replace(drives, **{name: drive})
+    return msgspec.structs.replace(config, drives=drives)
+
+
+def add_simulated_build(text: str, drives: Drives) -> str:
+    """Return a configuration's text with `can.simulated.built` set to the node, scale and direction of `drives`.
+
+    A fault on demand is relative to the simulated robot: a correction in [drives] must not move that reference.
+    """
+    document = tomlkit.parse(text)
+    rows = tomlkit.array().multiline(True)
+    for drive in drives.each:
+        row = tomlkit.inline_table()
+        row.update({"node": drive.node, "counts_per_metre": drive.counts_per_metre, "direction": drive.direction})
+        rows.append(row)
+    can = document["can"]
+    if "simulated" not in can:
+        can["simulated"] = tomlkit.table()
+    can["simulated"]["built"] = rows
+    return tomlkit.dumps(document)
+
+
+def resolve_eds_paths(text: str, folder: Path) -> str:
+    """Return a configuration's text with the drives' EDS paths, relative to `folder`, made absolute."""
+    document = tomlkit.parse(text)
+    for name in NAMES:
+        drive = document["drives"][name]
+        if "eds" in drive:
+            drive["eds"] = str((folder / str(drive["eds"])).resolve())
+    return tomlkit.dumps(document)
+
+
+def find_free_path(path: Path) -> Path:
+    """Return an unused path beside a configuration, for the corrected one."""
+    number, free = 1, path.with_name(f"{path.stem}-commissioned.toml")
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.stem}-commissioned-{number}.toml")
+    return free
+
+
+def write_new_file(path: Path, text: str) -> None:
+    """Write a new file. Raises ConfigError if it exists."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise ConfigError(f"{path} exists already; name another file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error

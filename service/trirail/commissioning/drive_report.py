@@ -1,0 +1,37 @@
+"""Lines for people about an inspected drive: its identity, and what its set-up changes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from trirail import naming
+from trirail.naming import Labels
+
+
+def format_identity(drive: dict[str, Any], labels: Labels) -> list[str]:
+    """Return lines with a drive's identity, modes and units; `drive` is an entry of the protocol's `inspect`."""
+    lines = [f"{naming.drive(drive['name'], labels)}, node {drive['node']}"]
+    if "device_type" in drive:
+        numbers = ", ".join(f"{key} {drive[key]}" for key in ("vendor", "product", "revision", "serial"))
+        lines += [
+            f"  device type {drive['device_type']}h, {numbers}",
+            f"  modes {drive['modes'] or 'not reported'}: {drive['way']}",
+            f"  velocities in {drive['velocity_unit'] or '?'}, accelerations in {drive['acceleration_unit'] or '?'}",
+        ]
+    return lines
+
+
+def format_differences(drive: dict[str, Any], *, applied: bool) -> list[str]:
+    """Return lines with the values that its set-up writes, or has written (`applied`), missing objects and refusals."""
+    lines = []
+    if "device_type" in drive:
+        verb = "written" if applied else "would be written"
+        lines += [
+            f"  {verb}: {each['object']} {each['name']}: {each['found'] or '?'} -> {each['wanted']}, for {each['why']}"
+            for each in drive["differences"]
+        ] or ["  nothing differs"]
+        lines += [f"  lacks {each}" for each in drive["lacking"]]
+        lines += [f"  {note}" for note in drive["notes"]]
+    if drive["refused"]:
+        lines.append(f"  refused: {drive['refused']}")
+    return lines

@@ -1,0 +1,58 @@
+"""Events of drives that restart or disappear, and of their sliders when they are back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from trirail_drivers.interface import Feedback, Triple, Unready
+
+from trirail.wire.event_codes import EventCode, EventText, coded
+from trirail.wire.messages import Level
+
+
+class ReturningDrives:
+    """Comparison of each feedback with the one before, for drives that are not configured."""
+
+    def __init__(self, labels: tuple[str, str, str], windows: Triple) -> None:
+        """Set the `windows`: changes of the sliders' positions that are not reported [m]."""
+        self._labels = labels
+        self._windows = windows
+        self._before: tuple[Unready | None, ...] = (None, None, None)
+        self._last: list[float | None] = [None, None, None]
+        """Positions of the drives when they were lost [m]; None where they were not homed."""
+
+    def update(self, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
+        """Yield messages for people, with their levels."""
+        if feedback.unready == self._before:
+            return
+        reported = {feedback.fault.message} if feedback.fault is not None else set()
+        for i, (now, before) in enumerate(zip(feedback.unready, self._before, strict=True)):
+            if now is not None and before is None:
+                self._last[i] = feedback.position[i] if feedback.homed[i] else None
+            if now is not None and (before is None or now.reason != before.reason):
+                if now.reason not in reported:  # where the bus is lost, it is one reason for all
+                    name = self._labels[i]
+                    yield "warning", coded(now.reason, EventCode.DRIVE_NOT_READY, drive=name, reason=now.reason)
+                reported.add(now.reason)
+            elif now is None and before is not None:
+                yield from self._back(i, feedback)
+        self._before = feedback.unready
+
+    def _back(self, i: int, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
+        """Yield messages about a drive that is configured again, and whether its slider has moved."""
+        label, position, last = self._labels[i], feedback.position[i], self._last[i]
+        waiting = any(each is not None for each in feedback.unready)
+        if waiting:
+            words = f"drive {label} is configured; when every drive is, send reset"
+            yield "info", coded(words, EventCode.DRIVE_READY, drive=label)
+        else:
+            words = f"drive {label} is configured; every drive is: send reset, then enable"
+            yield "info", coded(words, EventCode.DRIVES_READY, drive=label)
+        if not feedback.homed[i]:
+            words = f"slider {label}: its position is not known since its drive was off: send home"
+            yield "warning", coded(words, EventCode.POSITION_UNKNOWN, slider=label)
+        elif last is not None and abs(position - last) > self._windows[i]:
+            moved = (
+                f"slider {label}: moved while its drive was off, from {last * 1e3:.3f} mm to {position * 1e3:.3f} mm"
+            )
+            yield "warning", coded(moved, EventCode.SLIDER_MOVED, slider=label, position_before=last, position=position)

@@ -1,0 +1,53 @@
+// The events, newest first: one line for each goal, which is under way, then has ended.
+
+import { event as worded } from "./service_words.js";
+import { onLanguage, time } from "./words.js";
+
+const KEPT = 200; // so many lines are shown
+
+export class Events {
+  constructor(list) {
+    this.list = list;
+    this.rank = [0, 0];
+    this.mode = "";
+    this.goalEnded = -1; // in which cycle
+    this.faults = new Map(); // the events of faults, by their messages
+    onLanguage(() => {
+      for (const item of list.children) fill(item);
+    });
+  }
+
+  add(event) {
+    const { seq, time: at, kind, message } = event;
+    if (seq <= this.rank[0] && at <= this.rank[1]) return; // told again, on a new connection
+    this.rank = [seq, at];
+    if (kind === "fault") this.faults.set(message, event);
+    if (this.#isPartOfGoal(event)) return;
+    const goal = kind === "goal" ? event.id : kind === "mode" ? event.goal : undefined;
+    if (goal) [...this.list.children].find((each) => each.dataset.goal === goal)?.remove();
+    const item = document.createElement("li");
+    if (goal) item.dataset.goal = goal;
+    item.event = event;
+    fill(item);
+    this.list.prepend(item);
+    while (this.list.childElementCount > KEPT) this.list.lastChild.remove();
+  }
+
+  // Whether a mode follows from a goal's end, which has its line.
+  #isPartOfGoal({ kind, mode, cycle }) {
+    if (kind === "goal") this.goalEnded = cycle;
+    if (kind !== "mode") return false;
+    const before = this.mode;
+    this.mode = mode;
+    return (mode === "holding" && (before === "moving" || before === "stopping")) || (mode === "stopping" && cycle === this.goalEnded);
+  }
+}
+
+function fill(item) {
+  const { time: seconds, level, outcome } = item.event;
+  item.className = level;
+  if (outcome) item.dataset.outcome = outcome;
+  const at = document.createElement("time");
+  at.textContent = time(seconds);
+  item.replaceChildren(at, worded(item.event));
+}

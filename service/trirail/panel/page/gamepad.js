@@ -1,0 +1,87 @@
+// A gamepad of the browser's: its sticks move the robot while a shoulder button is held.
+//
+// It has the rules of hold.js, whose page's thread it shares: a page that hangs, is hidden or has no focus says nothing,
+// and the robot brakes. Buttons and sticks are those of the standard mapping, https://w3c.github.io/gamepad/#remapping.
+
+import { EVERY, HUNG } from "./hold.js";
+
+const [EAST, SHOULDERS, UP, DOWN] = [1, [4, 5], 12, 13];
+const DEAD = 0.15; // share of a stick's way in which it counts as let go: no stick comes back to its middle exactly
+// A pad that has said nothing for so long is taken for gone until it says something [ms]: of a wireless one whose link
+// is lost the system keeps the last state, for seconds. A stick in a hand is never still, but at its end.
+const QUIET = 2000;
+
+export class Pad {
+  // `sign(direction)` is told {x, y, phi}, -1 to 1 each, while the pad moves the robot; `release()` when it does no more;
+  // `stop()` and `faster(by)` when their buttons are pressed; `found()` when a pad is there; `may()` is whether it may
+  // move the robot, and `barred()` is called when a shoulder button is pressed though it may not.
+  constructor({ sign, release, stop, faster, found, may, barred }) {
+    Object.assign(this, { sign, release, stop, faster, found, may, barred });
+    this.moves = false; // whether the pad moves the robot
+    this.armed = false; // whether a shoulder button counts: only one that is pressed after the last end
+    this.pressed = new Set(); // which buttons are
+    this.last = 0;
+    addEventListener("gamepadconnected", () => {
+      clearInterval(this.timer);
+      this.last = performance.now();
+      this.timer = setInterval(() => this.#look(), EVERY);
+      this.found();
+    });
+    for (const gone of ["blur", "pagehide", "freeze", "gamepaddisconnected"]) addEventListener(gone, () => this.end());
+    document.addEventListener("visibilitychange", () => document.hidden && this.end());
+  }
+
+  // End the jog; a shoulder button must be let go and pressed again.
+  end() {
+    this.armed = false;
+    this.#rest();
+  }
+
+  #look() {
+    const now = performance.now();
+    const late = now - this.last > HUNG;
+    this.last = now;
+    const pad = [...navigator.getGamepads()].find((each) => each?.connected && each.mapping === "standard");
+    if (!pad) return this.end();
+    if (this.#presses(pad, EAST)) this.stop();
+    if (late || document.hidden || !document.hasFocus()) return this.end();
+    if (this.#presses(pad, UP)) this.faster(1);
+    if (this.#presses(pad, DOWN)) this.faster(-1);
+    const begins = SHOULDERS.map((each) => this.#presses(pad, each)).includes(true);
+    if (!SHOULDERS.some((each) => this.pressed.has(each))) {
+      this.#rest();
+      this.armed = true;
+    } else if (!this.may()) {
+      if (begins) this.barred();
+      this.end();
+    } else if (this.armed) {
+      this.#move(pad, now);
+    }
+  }
+
+  #presses(pad, button) {
+    const before = this.pressed.has(button);
+    const { pressed } = pad.buttons[button];
+    this.pressed[pressed ? "add" : "delete"](button);
+    return pressed && !before;
+  }
+
+  // Right is x, away from the hand is y; the right stick to the left is phi, counterclockwise.
+  #move(pad, now) {
+    const [x, y, phi] = now - pad.timestamp > QUIET ? [0, 0, 0] : pad.axes.map(share);
+    if (!x && !y && !phi) return this.#rest();
+    this.moves = true;
+    this.sign({ x, y: -y, phi: -phi });
+  }
+
+  #rest() {
+    if (!this.moves) return;
+    this.moves = false;
+    this.release();
+  }
+}
+
+// How far a stick is from its middle, -1 to 1, but for the dead part of its way.
+function share(at) {
+  return Math.sign(at) * Math.min(Math.max(0, Math.abs(at) - DEAD) / (1 - DEAD), 1);
+}

@@ -1,0 +1,92 @@
+// What the service says, in the language of the page: by its codes, with their values. The service's own sentence,
+// which is English, stands where the language has no words for a code, and is shown on hover where it has.
+
+import { angle, length, rounded } from "./units.js";
+import { has, number, quoted, say } from "./words.js";
+
+// A refusal, or how a jog ended: {code, message, slider, value, limit}.
+export function refusal(told) {
+  return worded(`refusal.${told.code}`, { ...told, bound: bound(told) }, told.message);
+}
+
+// What is in the way of a pose: {message, code, what, value, limit, unit}.
+export function obstacle(told) {
+  const shown = (value) => (told.unit === "m" ? length(value) : `${number((value * 180) / Math.PI, 2)}°`);
+  const values = { what: told.what, value: shown(told.value ?? 0), limit: shown(told.limit ?? 0) };
+  return worded(`obstacle.${told.code}`, values, told.message);
+}
+
+// A reason why the robot is in fault, with the event that told it, if one did.
+export function fault(message, told) {
+  return told ? event(told) : quoted(message);
+}
+
+export function event(told) {
+  const { kind, message, id, outcome, user, mode, code } = told;
+  const why = code ? refusal(told).textContent : sentence(told);
+  if (kind === "refused" && code) return worded("event.refused", { user, why }, message);
+  if (kind === "goal") return worded(why ? "event.goal_because" : "event.goal", { id, user, end: say(`outcome.${outcome}`), why }, message);
+  if (kind === "mode" && !told.goal) return worded(why ? "event.mode_because" : "event.mode", { mode: say(`mode.${mode}`), why }, message);
+  return why ? spoken(why, message) : quoted(message);
+}
+
+// How values of events are shown, by their names; others as numbers, or as they are.
+const metres = (value) => length(value);
+const seconds = (value) => `${number(value, 0, 3)} s`;
+const limited = (value, { unit = "m" }) => (unit === "m" ? length(value) : unit === "rad" ? angle(value) : `${rounded(value)} ${unit}`);
+const word = (value) => say(`word.${value.replaceAll(" ", "_")}`, {}, value);
+const alignment = (value) => say(`alignment.${value}`, {}, value);
+const SHOWN = {
+  command: (value) => say(`do.${value}`, {}, value).replaceAll("\u00ad", ""),
+  outcome: (value) => say(`outcome.${value}`, {}, value),
+  purpose: alignment,
+  end: alignment,
+  part: word,
+  quantity: word,
+  cause,
+  x: metres,
+  y: metres,
+  phi: (value) => angle(value),
+  position: metres,
+  position_before: metres,
+  value: limited,
+  limit: limited,
+  settle: (value) => `${number(value * 1e3, 0, 3)} ms`,
+  timeout: seconds,
+  silence: seconds,
+  seconds,
+  wait: seconds,
+  until: seconds,
+};
+
+// An event's sentence; empty where the language has none for its code.
+function sentence({ event_code, params = {}, fault }) {
+  if (!event_code && fault && has("cause.drive")) return cause(fault.cause, fault); // of an older service
+  if (!has(`said.${event_code}`)) return "";
+  const shown = ([name, value]) => [name, SHOWN[name]?.(value, params) ?? (typeof value === "number" ? number(value, 0, 3) : value)];
+  return say(`said.${event_code}`, Object.fromEntries(Object.entries(params).map(shown)));
+}
+
+// The cause of a fault: {drive, code} tell which drive, and its own error code.
+function cause(name, { drive = "", code = 0 }) {
+  const where = drive && say("cause.drive", { drive });
+  return say(`cause.${name}`, { where, code: code ? code.toString(16).toUpperCase().padStart(4, "0") : "" }, `${where}${name}`);
+}
+
+// The slider, its value and its limit; empty where the refusal names none.
+function bound({ slider, value, limit, code }) {
+  if (code !== "out_of_workspace" || !slider || value == null || limit == null || !has("bound.slider")) return "";
+  return say("bound.slider", { slider, value: length(value), limit: length(limit) });
+}
+
+function worded(key, values, message) {
+  return has(key) ? spoken(say(key, values), message) : quoted(message);
+}
+
+// The page's own words, with the service's sentence on hover.
+function spoken(text, message) {
+  const span = document.createElement("span");
+  span.textContent = text;
+  span.title = message;
+  return span;
+}

@@ -1,0 +1,101 @@
+"""Bytes that messages hold in the gateway's memory, counted until each is released, and the heap that they leave."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from trirail.processes.realtime import return_free_memory
+
+OVERHEAD: Final = 1024
+"""Memory of a message besides its content: Zenoh's query and the objects of this process [bytes]."""
+
+
+class Reservation:
+    """Bytes of a budget, taken for as long as this object lives: every copy of a message carries the same one."""
+
+    __slots__ = ("_release",)
+
+    def __init__(self, release: Callable[[], None]) -> None:
+        self._release = release
+
+    def __del__(self) -> None:
+        self._release()
+
+
+class Budget:
+    """Budget of bytes that may be held at a time, of all users and of each one."""
+
+    def __init__(self, total: int, of_one: int) -> None:
+        self._total, self._of_one = total, of_one
+        self._held: Counter[str] = Counter()
+        self._all = 0
+        # Reentrant: a thread that takes some may release others meanwhile.
+        self._lock = threading.RLock()
+
+    @property
+    def held(self) -> int:
+        """Bytes held now, of all users."""
+        return self._all
+
+    def hold(self, user: str, size: int, room: int = 1) -> Reservation | None:
+        """Reserve bytes for a message of a user; return None if that exceeds `room` times the budget."""
+        with self._lock:
+            if self._all + size > room * self._total or self._held[user] + size > room * self._of_one:
+                self._forget(user)
+                return None
+            self._all += size
+            self._held[user] += size
+        return Reservation(lambda: self._release(user, size))
+
+    def _release(self, user: str, size: int) -> None:
+        with self._lock:
+            self._all -= size
+            self._held[user] -= size
+            self._forget(user)
+
+    def _forget(self, user: str) -> None:
+        if not self._held[user]:
+            del self._held[user]
+
+
+TRIM_EVERY: Final = 1.0
+"""Interval between two checks of this process's memory [s]."""
+TRIM_ABOVE: Final = 8_000_000
+"""Growth above which the heap is trimmed [bytes]."""
+
+
+class HeapTrim:
+    """Trimmer of the heap after a burst of messages: malloc keeps the free memory otherwise."""
+
+    def __init__(
+        self,
+        trim: Callable[[], None] = return_free_memory,
+        resident: Callable[[], int] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._trim, self._clock = trim, clock
+        self._resident = resident or _resident
+        self._least = self._resident()
+        self._due = clock()
+
+    def poll(self) -> None:
+        """Trim the heap if it has grown, at intervals."""
+        now = self._clock()
+        if now < self._due:
+            return
+        self._due = now + TRIM_EVERY
+        resident = self._resident()
+        self._least = min(self._least, resident)
+        if resident > self._least + TRIM_ABOVE:
+            self._trim()
+
+
+def _resident() -> int:
+    """Return the resident memory of this process [bytes]; proc(5)."""
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")

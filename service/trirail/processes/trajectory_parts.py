@@ -1,0 +1,120 @@
+"""Trajectories in several messages, kept until all their parts are there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.processes.incoming import Incoming
+from trirail.wire.kinds.trajectory import TrajectoryGoal
+from trirail.wire.packed_trajectory import ROW, PackedTrajectory, joined, packed
+from trirail.wire.sizes import MAX_POINTS
+from trirail.wire.text import quoted
+
+PARTS_WITHIN = 5.0
+"""Longest time from one part to the next; after it the goal is refused [s]."""
+
+
+class _Received(NamedTuple):
+    incoming: Incoming
+    goal: PackedTrajectory
+
+
+class _Incomplete:
+    """Trajectory with missing parts."""
+
+    def __init__(self, of: int) -> None:
+        self.of = of
+        self.received: dict[int, _Received] = {}
+        self.due = 0.0
+
+    @property
+    def message(self) -> Incoming:
+        """Its messages as one, with the number of the first part; an answer to it is one to all of them."""
+        first, *others = sorted((part.incoming for part in self.received.values()), key=lambda each: each.number)
+        newest = others[-1] if others else first
+        size = first.size + sum(each.size for each in others)
+        return first._replace(arrived_ns=newest.arrived_ns, size=size, alike=tuple(others))
+
+    @property
+    def missing(self) -> str:
+        """Missing parts, for people."""
+        numbers = [number for number in range(1, self.of + 1) if number not in self.received]
+        listed = ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")
+        return f"part{'s' if len(numbers) > 1 else ''} {listed} of {self.of}"
+
+
+class TrajectoryParts:
+    """Trajectories under assembly from their parts, whose memory counts as their user's until they are answered.
+
+    `refuse` answers all parts of a goal of which some are missing; `clock` gives seconds.
+    """
+
+    def __init__(
+        self, refuse: Callable[[Incoming, RefusedError], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._refuse = refuse
+        self._clock = clock
+        self._incomplete: dict[tuple[str, str], _Incomplete] = {}
+
+    def __iter__(self) -> Iterator[Incoming]:
+        """Yield the messages that are not answered yet."""
+        return (goal.message for goal in self._incomplete.values())
+
+    def add(self, incoming: Incoming, user: str, goal: TrajectoryGoal) -> tuple[Incoming, PackedTrajectory] | None:
+        """Add a part; return the whole goal with its messages once all are there, else None.
+
+        Raises RefusedError for a part that does not match those before it.
+        """
+        if goal.part is None or goal.id is None:
+            return incoming, packed(goal)
+        key, (number, of) = (user, goal.id), (goal.part.number, goal.part.of)
+        incomplete = self._incomplete.get(key) or _Incomplete(of)
+        _check(incomplete, goal, number, of)
+        incomplete.received[number] = _Received(incoming._replace(payload=b""), packed(goal))
+        incomplete.due = self._clock() + PARTS_WITHIN
+        self._incomplete[key] = incomplete
+        if len(incomplete.received) < of:
+            return None
+        del self._incomplete[key]
+        try:
+            return incomplete.message, joined([incomplete.received[n].goal for n in range(1, of + 1)])
+        except ValueError as error:
+            self._refuse(incomplete.message, RefusedError(RefusalCode.MALFORMED, f"not a goal: {error}"))
+        return None
+
+    def poll(self) -> None:
+        """Refuse the goals whose parts have not arrived in time."""
+        now = self._clock()
+        for key, goal in list(self._incomplete.items()):
+            if goal.due < now:
+                del self._incomplete[key]
+                text = (
+                    f"trajectory {quoted(key[1])}: {goal.missing} did not come within {PARTS_WITHIN:g} s: "
+                    "send the goal again, all of its parts one after the other"
+                )
+                self._refuse(goal.message, RefusedError(RefusalCode.EXPIRED, text))
+
+
+def _check(incomplete: _Incomplete, goal: TrajectoryGoal, number: int, of: int) -> None:
+    """Raise RefusedError for a part that does not match those that have arrived."""
+    problem = ""
+    points = sum(len(part.goal.rows) // ROW for part in incomplete.received.values()) + len(goal.points)
+    first = next(iter(incomplete.received.values()), None)
+    if of != incomplete.of:
+        problem = f"is of {of}, the others are of {incomplete.of}"
+    elif number in incomplete.received:
+        problem = "has come already"
+    elif first is not None and _options(first.goal) != _options(goal):
+        problem = "has other options than those before it: stretch, settle and valid_for are the same in all"
+    elif points > MAX_POINTS:
+        problem = f"makes {points} points: at most {MAX_POINTS} are taken; take fewer, since paths are quintic between"
+    if problem:
+        text = f"trajectory {quoted(goal.id or '')}: part {number} {problem}"
+        raise RefusedError(RefusalCode.MALFORMED, text)
+
+
+def _options(goal: PackedTrajectory | TrajectoryGoal) -> tuple[bool, bool, float | None]:
+    return goal.stretch, goal.settle, goal.valid_for

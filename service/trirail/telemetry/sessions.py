@@ -1,0 +1,132 @@
+"""Sessions of a folder of recordings, found by the sidecars of the recordings."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from trirail.telemetry import contents
+from trirail.telemetry.contents import Contents
+from trirail.telemetry.retention import is_being_written
+
+
+class Wanted(NamedTuple):
+    """Filter of sessions; None for any."""
+
+    robot: str | None = None
+    since: float | None = None
+    """Earliest time of the end [s since 1970]."""
+    until: float | None = None
+    """Latest time of the begin [s since 1970]."""
+    fault: str | None = None
+    """Part of a fault's cause, code as 0x8700, or message; case is ignored."""
+    user: str | None = None
+    """User that sent something; with `outcome`, user whose goal ended so."""
+    outcome: str | None = None
+
+
+class RecordedSession(Struct):
+    """A session, of one file or, where its recording was rotated, several."""
+
+    session: str
+    robot: str
+    began: float | None
+    """Time of the begin [s since 1970]; None where nothing was recorded."""
+    ended: float | None
+    cycles: int
+    files: list[str]
+    reason: str | None
+    """Fault for which a black box was kept."""
+    trouble: str | None
+    """Reason why one of its files could not be read."""
+    users: list[str]
+    goals: dict[str, int]
+    """Number of ended goals, by outcome."""
+    faults: list[str]
+    """Messages of its faults, in order."""
+    running: bool = False
+    """Whether it is still being recorded: then these values are some seconds old."""
+
+
+def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], None] | None = None) -> list[Contents]:
+    """Return the contents of each recording of a folder, in the order of their names.
+
+    A recording without a usable sidecar, or with `reread` any, is read after a call of `on_read` with it, and its
+    contents are written beside it. One that is being written is omitted until its recorder has written its sidecar.
+    """
+    found = []
+    for path in sorted(folder.glob("*.rrd"), key=lambda path: path.name):
+        known = contents.load(path)
+        if known is None or known.running or reread:
+            try:
+                being_written = is_being_written(path)
+            except FileNotFoundError:
+                continue
+            if not being_written:  # a recording that is still marked as running was cut off
+                if on_read is not None:
+                    on_read(path)
+                known = contents.of_file(path)
+                with contextlib.suppress(OSError):  # the folder is another user's: read it again the next time
+                    contents.save(path, known)
+        if known is not None:
+            found.append(known)
+    return found
+
+
+def find(files: Iterable[Contents], wanted: Wanted = Wanted()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
+    """Return the sessions of files that match a filter, in the order of their begin."""
+    parts_of: dict[str, list[Contents]] = {}
+    for file in sorted(files, key=lambda file: (file.began or 0.0, file.name)):
+        parts_of.setdefault(file.session, []).append(file)
+    return [_joined(parts) for parts in parts_of.values() if _is_wanted(parts, wanted)]
+
+
+def fault_codes(files: Iterable[Contents]) -> list[str]:
+    """Return cause and code of each fault in files, without repetition."""
+    return sorted({entry.code for file in files for entry in file.faults})
+
+
+def _joined(parts: list[Contents]) -> RecordedSession:
+    goals = Counter[str]()
+    for part in parts:
+        for outcomes in part.goals.values():
+            goals.update(outcomes)
+    faults = sorted((entry for part in parts for entry in part.faults), key=lambda entry: entry.time)
+    return RecordedSession(
+        session=parts[0].session,
+        robot=parts[0].robot,
+        began=min((part.began for part in parts if part.began is not None), default=None),
+        ended=max((part.ended for part in parts if part.ended is not None), default=None),
+        cycles=sum(part.cycles for part in parts),
+        files=[part.name for part in parts],
+        reason=parts[0].reason,
+        trouble=next((part.trouble for part in parts if part.trouble), None),
+        users=sorted(set().union(*(part.users for part in parts))),
+        goals=dict(sorted(goals.items())),
+        faults=[entry.message for entry in faults],
+        running=any(part.running for part in parts),
+    )
+
+
+def _is_wanted(parts: list[Contents], wanted: Wanted) -> bool:
+    began = [part.began for part in parts if part.began is not None]
+    ended = [part.ended for part in parts if part.ended is not None]
+    if wanted.robot is not None and all(part.robot != wanted.robot for part in parts):
+        return False
+    if wanted.since is not None and not any(time >= wanted.since for time in ended):
+        return False
+    if wanted.until is not None and not any(time <= wanted.until for time in began):
+        return False
+    if wanted.fault is not None:
+        words = wanted.fault.lower()
+        if not any(words in f"{entry.code} {entry.message}".lower() for part in parts for entry in part.faults):
+            return False
+    if wanted.outcome is not None:
+        whose = (goals for part in parts for user, goals in part.goals.items() if wanted.user in (None, user))
+        return any(wanted.outcome in outcomes for outcomes in whose)
+    return wanted.user is None or any(wanted.user in part.users for part in parts)

@@ -1,0 +1,149 @@
+"""Event codes: what an event says, for programs and for pages in other languages than its English message."""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from typing import Any, NamedTuple, Self
+
+
+class EventCode(StrEnum):
+    """Content of an event's message; `params` names the values in it, in SI units and radians."""
+
+    meaning: str
+    """Meaning, in one line."""
+    params: tuple[str, ...]
+    """Names of the values in the message."""
+
+    # Goals and modes.
+    GOAL_STARTED = "goal_started", "a goal has begun", "goal", "user"
+    ARRIVED = "arrived", "the goal has reached its end"
+    SETTLED = "settled", "the robot is in position", "settle"
+    NOT_IN_POSITION = "not_in_position", "the robot did not settle in time", "timeout"
+    STANDSTILL = "standstill", "the robot stands"
+    RELEASED = "released", "a jog or track was not renewed and has stopped"
+    NOT_RENEWED = "not_renewed", "a jog or track was not renewed in time", "goal", "user"
+    PASSED = "passed", "the robot passed the goal's end on its way to the next goal", "goal"
+    PREEMPTED = "preempted", "another goal has replaced it", "goal"
+    EARLIER_GOAL_ENDED = "earlier_goal_ended", "a goal that it was to follow has ended", "goal", "outcome"
+    TOO_LATE = "too_late", "the goal waited longer than its valid_for"
+    STOPPED_AT_LIMIT = "stopped_at_limit", "a jog has stopped at a limit"
+    BEYOND_LIMIT = "beyond_limit", "a track's target is beyond a limit", "goal"
+    COMMAND = "command", "a user sent a command", "command", "user"
+    OVERRIDE = "override", "a user has set the speed override", "percent", "user"
+    PLANNER_BUSY = "planner_busy", "a goal waits for the planner", "goal", "silence"
+    REFUSED = "refused", "the event's code says why something was refused"
+    POWERED = "powered", "all drives are enabled"
+    POWERED_NOT_HOMED = "powered_not_homed", "all drives are enabled, slider positions are unknown"
+    HOMED = "homed", "all drives are homed"
+    OUTSIDE_LIMITS = (
+        *("outside_limits", "the robot stands outside its limits"),
+        *("part", "name", "quantity", "value", "limit", "unit"),
+    )
+
+    # The lease.
+    LEASE_ACQUIRED = "lease_acquired", "a user has acquired the lease", "user"
+    LEASE_TAKEN_OVER = "lease_taken_over", "a user has taken the lease from another", "user", "before"
+    LEASE_RELEASED = "lease_released", "a user has released the lease", "user"
+    LEASE_EXPIRED = "lease_expired", "the lease's holder gave no sign of life", "user", "timeout"
+
+    # Faults.
+    FOLLOWING_ERROR = "following_error", "a slider lags too far behind", "slider", "value", "limit"
+    ENABLE_TIMEOUT = "enable_timeout", "drives were not enabled in time", "drives", "timeout"
+    BAD_SETPOINT = "bad_setpoint", "the last check has refused a setpoint"
+    BAD_POSITION = "bad_position", "the robot cannot hold at the measured slider positions"
+    DRIVE_FAULT = "drive_fault", "a drive or its bus reports a fault", "cause", "drive", "code"
+    LOOP_DIED = "loop_died", "the loop's process has died"
+    LOOP_FROZEN = "loop_frozen", "the loop's process hung and was killed"
+    INTERNAL_ERROR = "internal_error", "an error of the service's own", "error"
+    MACHINE_BUSY = "machine_busy", "the loop missed ticks in a row", "ticks"
+    GATEWAY_LOST = "gateway_lost", "the gateway's process has died"
+    GATEWAY_FROZEN = "gateway_frozen", "the gateway's process hangs", "timeout"
+    SHUTDOWN = "shutdown", "the service is ending"
+
+    # Drives.
+    DRIVE_WARNING = "drive_warning", "a warning of the drives or their bus", "warning"
+    DRIVE_NOT_READY = "drive_not_ready", "a drive must be configured again", "drive", "reason"
+    DRIVE_READY = "drive_ready", "a drive is configured, others are not", "drive"
+    DRIVES_READY = "drives_ready", "a drive is configured, as all are now", "drive"
+    POSITION_UNKNOWN = "position_unknown", "a slider must be homed again", "slider"
+    SLIDER_MOVED = "slider_moved", "a slider moved while its drive was off", "slider", "position_before", "position"
+
+    # Poses and alignments.
+    POSE_TAUGHT = "pose_taught", "a pose was taught", "pose", "user", "x", "y", "phi"
+    POSE_REMOVED = "pose_removed", "a taught pose was removed", "pose", "user"
+    POSES_UNREADABLE = "poses_unreadable", "the file of taught poses cannot be read", "file"
+    POSES_LOST = "poses_lost", "the file of taught poses has been deleted", "file"
+    ALIGNMENT_LOOK = "alignment_look", "an alignment has taken pictures", "id", "purpose", "number"
+    ALIGNMENT_ENDED = "alignment_ended", "an alignment has ended", "id", "purpose", "end", "seconds"
+
+    # Recordings.
+    RECORDING = "recording", "a recording has begun", "file"
+    RECORDER_LOST = "recorder_lost", "the recorder's process has ended"
+    RECORDER_UNREADABLE = "recorder_unreadable", "the recorder sent an invalid message", "error"
+    NOT_RECORDED = "not_recorded", "the recording cannot be written", "error"
+    NOT_CAPTURED = "not_captured", "the log of CAN frames cannot be written", "error"
+    RECORDED_AGAIN = "recorded_again", "the recording is written again"
+    RECORDING_INCOMPLETE = "recording_incomplete", "parts of the recording are missing", "lost", "skipped", "absent"
+    RECORDING_MOVED = "recording_moved", "a recording was deleted or moved", "file", "next"
+    CAPTURE_MOVED = "capture_moved", "a log of CAN frames was deleted or moved", "file"
+    RECORDINGS_DELETED = "recordings_deleted", "old recordings were deleted", "keep_mb", "files"
+    RECORDINGS_KEPT = "recordings_kept", "old recordings cannot be deleted", "error"
+    NOT_INDEXED = "not_indexed", "the index of sessions cannot be written", "error"
+    BLACK_BOX_INCOMPLETE = "black_box_incomplete", "parts of the minute before a fault are missing", "file", "error"
+    BLACK_BOX_SHORT = "black_box_short", "too many messages before a fault, the oldest are missing", "until"
+    NO_BLACK_BOX = "no_black_box", "the minute before a fault cannot be kept", "error"
+
+    # The network.
+    ROUTER_LINKED = "router_linked", "the gateway is connected to a router", "router"
+    ROUTER_LOST = "router_lost", "the gateway has no connection to a router", "router"
+    SESSIONS_FULL = "sessions_full", "nearly as many sessions as the gateway accepts", "used", "most"
+    DESCRIPTORS_FULL = "descriptors_full", "nearly as many file descriptors as the gateway may open", "used", "most"
+    CONNECTIONS_WAIT = "connections_wait", "many connections open no session", "count", "wait"
+
+    OTHER = "other", "a code of a newer service that this client does not know"
+
+    def __new__(cls, code: str, meaning: str = "", *params: str) -> Self:
+        """Make a member of its row; with a code alone the enumeration looks it up."""
+        member = str.__new__(cls, code)
+        member._value_ = code
+        member.meaning, member.params = meaning, params
+        return member
+
+    @classmethod
+    def _missing_(cls, value: object) -> EventCode | None:
+        """Return OTHER for a code of a newer service."""
+        return cls.OTHER if isinstance(value, str) else None
+
+
+Params = dict[str, float | str]
+MAX_PARAM = 200
+"""Longest text of a parameter; an event with a long error must fit into a packet [characters]."""
+
+
+class EventText(NamedTuple):
+    """An English text for people with its code and parameters for programs."""
+
+    text: str
+    code: EventCode
+    params: Params
+
+    def __str__(self) -> str:
+        return self.text
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Fields by which a message carries the code beside the text."""
+        return {"event_code": self.code, "params": self.params}
+
+
+def coded(text: str, code: EventCode, /, **params: float | str) -> EventText:
+    """Return a text with its code; the parameters are those of the code."""
+    return EventText(text, code, {name: _plain(value) for name, value in params.items()})
+
+
+def _plain(value: float | str) -> float | str:
+    """Return a value that JSON can carry: no subclass of another library, and no number that is not finite."""
+    if isinstance(value, str):
+        return str(value)[:MAX_PARAM]
+    return float(value) if math.isfinite(value) else str(value)

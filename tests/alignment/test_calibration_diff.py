@@ -1,0 +1,78 @@
+"""Whether a camera stands as it was: a shift, a turn and another scale are told beyond their doubt, and no more."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+from alignment.cameras import Stage, camera, part_at
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.alignment.calibration_diff import ViewChange, compare_views
+from trirail.alignment.camera_calibration import CameraCalibration
+from trirail.alignment.images import CameraView, Pair
+from trirail.alignment.procedure import calibrate_by_moves, repeat_calibration
+from trirail.alignment.rigid_motion import rotation_matrix
+
+PART: dict[str, Pair] = {"left": (-0.06, 0.01), "right": (0.06, 0.01)}
+seeds = st.integers(0, 2**32 - 1)
+
+
+def compared(seed: int, shift: Pair = (0.0, 0.0), turn: float = 0.0, scale: float = 0.0) -> list[ViewChange]:
+    """Return the changes of two cameras, of which the left is shifted [m], turned and brought nearer; another part."""
+    rng = np.random.default_rng(seed)
+    views = {name: camera(rng, place) for name, place in PART.items()}
+    stage = Stage(views, PART, rng, noise=0.1)
+    kept: CameraCalibration = stage.drive(calibrate_by_moves(looks=4))
+    left = views["left"]
+    (a, b), (c, d) = ((1.0 + scale) * rotation_matrix(turn) @ np.array(left.matrix)).tolist()
+    x, y = np.subtract(left.origin, shift).tolist()
+    stage.views["left"] = msgspec.structs.replace(left, origin=(x, y), matrix=((a, b), (c, d)))
+    error = rng.uniform(-1.0, 1.0, 3) * (3e-4, 3e-4, 3e-3)
+    stage.part = part_at(PART, (float(error[0]), float(error[1]), float(error[2])))
+    return compare_views(kept, stage.drive(repeat_calibration(kept, 4)))
+
+
+@given(seeds, st.floats(2e-4, 5e-4), st.floats(-math.pi, math.pi))
+def test_a_shift_is_told_though_the_part_is_another(seed: int, way: float, direction: float) -> None:
+    shift = way * math.cos(direction), way * math.sin(direction)
+    left, right = compared(seed, shift)
+    assert (left.view, left.is_shifted) == ("left", True)
+    for found, deviation, real in zip(left.shift, left.shift_deviation, shift, strict=True):
+        assert abs(found - real) < 6.0 * deviation
+        assert deviation < 3e-5
+    assert not right.is_changed
+
+
+@given(seeds, st.sampled_from(((3e-3, 0.0), (-3e-3, 0.0), (0.0, 3e-3), (0.0, -3e-3))))
+def test_a_turn_and_another_scale_are_told(seed: int, change: Pair) -> None:
+    left, right = compared(seed, turn=change[0], scale=change[1])
+    assert left.is_changed
+    assert abs(left.turn - change[0]) < 6.0 * left.deviation
+    assert abs(left.scale - change[1]) < 6.0 * left.deviation
+    assert not right.is_changed
+
+
+@given(seeds)
+def test_cameras_that_stand_as_they_did_are_not_told_of(seed: int) -> None:
+    assert not any(each.is_changed for each in compared(seed))
+
+
+def test_deviations_are_those_of_many_trials() -> None:
+    """What is said to be the doubt is it: shift, turn and scale scatter by it."""
+    found = [compared(seed)[0] for seed in range(80)]
+    for k in range(2):
+        scatter = np.std([each.shift[k] / each.shift_deviation[k] for each in found])
+        assert 0.7 < scatter < 1.3
+    for what in ("turn", "scale"):
+        scatter = np.std([getattr(each, what) / each.deviation for each in found])
+        assert 0.7 < scatter < 1.3
+
+
+def test_views_that_are_in_one_alone_are_left_out() -> None:
+    rng = np.random.default_rng(1)
+    views: dict[str, CameraView] = {name: camera(rng, place) for name, place in PART.items()}
+    both = Stage(views, PART, rng).drive(calibrate_by_moves())
+    one = Stage(views, {"left": PART["left"]}, rng).drive(calibrate_by_moves())
+    assert [each.view for each in compare_views(both, one)] == ["left"]

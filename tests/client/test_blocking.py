@@ -1,0 +1,259 @@
+"""The client with threads: interrupted, shared and closed at any time, and nothing is left of it."""
+
+from __future__ import annotations
+
+import queue
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+from trirail.client.blocking import LoopThread
+from trirail.client.client import Robot
+from trirail.errors import ServiceError
+from trirail.wire import zenoh_session
+from trirail.wire.goals import Goal, PoseGoal
+from trirail.wire.messages import CommandReply, Event, GoalReply
+from waiting import WITHIN, wait_until
+
+CLOSED = "the connection is closed"
+
+
+class Slow:
+    """A robot's keys, on which what is asked is kept, and answered when the test says so."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+        self.asked: queue.Queue[zenoh.Query] = queue.Queue()
+        keep = zenoh.handlers.Callback(self.asked.put, indirect=False)
+        self._declared = session.declare_queryable("trirail/demo/**", keep)
+
+    def next(self) -> zenoh.Query:
+        return self.asked.get(timeout=WITHIN)
+
+
+@pytest.fixture
+def slow(tmp_path: Path) -> Iterator[Slow]:
+    with zenoh_session.open_service([f"unixsock-stream/{tmp_path}/zenoh"]) as session:
+        yield Slow(session)
+
+
+@pytest.fixture
+def robot(slow: Slow, tmp_path: Path) -> Iterator[Robot]:
+    with Robot("demo", f"unixsock-stream/{tmp_path}/zenoh", user="ann") as robot:
+        yield robot
+
+
+def reply(query: zenoh.Query, message: msgspec.Struct) -> None:
+    with query:
+        query.reply(query.key_expr, msgspec.json.encode(message))
+
+
+class Call:
+    """A call in a thread of its own."""
+
+    def __init__(self, do: Callable[[], Any]) -> None:
+        self._do = do
+        self.outcome: Any = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.outcome = self._do()
+        except ServiceError as error:
+            self.outcome = error
+
+    def end(self) -> Any:
+        self._thread.join(WITHIN)
+        assert not self._thread.is_alive()
+        return self.outcome
+
+
+def interrupt(do: Callable[[], object], when: Callable[[], object] = lambda: None) -> None:
+    """Press Ctrl-C in a call of the main thread once something has come, and the thread waits."""
+    main = threading.get_ident()
+
+    def waits() -> bool:
+        frame = sys._current_frames()[main]
+        codes = [frame.f_code for frame, _ in traceback.walk_stack(frame)]
+        return codes[0] is threading.Condition.wait.__code__ and LoopThread.call.__code__ in codes
+
+    def press() -> None:
+        when()
+        wait_until(waits)
+        signal.pthread_kill(main, signal.SIGINT)
+
+    pressing = threading.Thread(target=press)
+    pressing.start()
+    with pytest.raises(KeyboardInterrupt):
+        do()
+    pressing.join()
+
+
+STOPPING: dict[str, Callable[[Robot], object]] = {
+    "stop": Robot.stop,
+    "quick_stop": Robot.quick_stop,
+    "disable": lambda robot: robot.command("disable"),
+}
+
+
+@pytest.mark.parametrize("name", STOPPING)
+def test_a_stop_waits_for_no_call_that_a_congested_link_holds_up(name: str, robot: Robot, slow: Slow) -> None:
+    free, held = threading.Event(), threading.Event()
+
+    async def send() -> None:
+        held.set()
+        free.wait()  # as Zenoh's own send does, in the thread of the event loop
+
+    sending = robot._loop.start(send())
+    assert held.wait(WITHIN)
+    stopping = Call(lambda: STOPPING[name](robot))
+    try:
+        query = slow.next()
+        assert str(query.key_expr) == f"trirail/demo/cmd/ann/{name}"
+        reply(query, CommandReply(name, "holding", 1))
+        stopping.end()
+        assert not sending.done()
+    finally:
+        free.set()
+
+
+# ---------------------------------------------------------------------- Ctrl-C
+
+
+def test_ctrl_c_while_a_goal_is_sent_stops_it_if_it_was_taken(robot: Robot, slow: Slow) -> None:
+    kept: list[zenoh.Query] = []
+    interrupt(lambda: robot.move_to(0.0, 0.0, 0.0, id="g"), lambda: kept.append(slow.next()))
+    with slow.next() as stop:
+        assert stop.payload is not None
+        assert f"{stop.key_expr} {stop.payload.to_string()}" == 'trirail/demo/cmd/ann/stop {"goal":"g"}'
+    wait_until(lambda: not robot._robot._goals)
+    kept.clear()
+
+
+def test_ctrl_c_ends_a_command_and_the_next_one_is_answered(robot: Robot, slow: Slow) -> None:
+    kept: list[zenoh.Query] = []
+    interrupt(robot.home, lambda: kept.append(slow.next()))
+    kept.clear()
+    enabling = Call(lambda: robot.command("enable").mode)
+    reply(slow.next(), CommandReply("enable", "holding", 1))
+    assert enabling.end() == "holding"
+
+
+def test_ctrl_c_in_a_wait_leaves_the_goal(robot: Robot, slow: Slow) -> None:
+    sending = Call(lambda: robot.move_to(0.0, 0.0, 0.0, id="g"))
+    reply(slow.next(), GoalReply("g", 1.0))
+    goal = sending.end()
+    interrupt(goal.wait)
+    ended = Event("goal", "info", "done", id="g", outcome="done", seq=1, t=0.0, cycle=0, time=1.0)
+    waiting = Call(lambda: goal.wait(WITHIN))
+    slow.session.put("trirail/demo/event", msgspec.json.encode(ended))
+    assert waiting.end().outcome == "done"
+    assert slow.asked.empty()
+
+
+@pytest.mark.parametrize("name", ["states", "events"])
+def test_ctrl_c_while_it_listens_ends_the_iteration_alone(robot: Robot, slow: Slow, name: str) -> None:
+    told = getattr(robot, name)()
+    interrupt(lambda: next(told))
+    assert list(told) == []
+    assert list(getattr(robot, name)(timeout=0.01)) == []
+
+
+# ---------------------------------------------------------------------- several threads
+
+
+def test_calls_of_several_threads_are_under_way_at_once(robot: Robot, slow: Slow) -> None:
+    calls = [Call(lambda: robot.command("enable").seq) for _ in range(8)]
+    queries = [slow.next() for _ in calls]
+    for number, query in enumerate(queries):
+        reply(query, CommandReply("enable", "holding", number))
+    assert {call.end() for call in calls} == set(range(8))
+
+
+def test_a_jog_and_a_lease_are_kept_while_the_program_does_other_things(robot: Robot, slow: Slow) -> None:
+    """Whatever the thread does that has entered them."""
+    entering = Call(lambda: (robot.jog(x=0.01, timeout=0.3).__enter__(), robot.lease(timeout=0.4).__enter__()))
+    kinds: dict[str, int] = {}
+    while not (kinds.get("goal", 0) > 2 and kinds.get("cmd", 0) > 2):
+        query = slow.next()
+        kind = str(query.key_expr).split("/")[2]
+        kinds[kind] = kinds.get(kind, 0) + 1
+        reply(query, GoalReply("g", 1.0) if kind == "goal" else CommandReply("acquire", "holding", 1))
+    jog, lease = entering.end()
+    assert jog.error is None
+    assert lease.lost is None
+
+
+def test_a_function_that_a_call_calls_cannot_wait_for_the_same_robot(robot: Robot) -> None:
+    """It would wait for itself, for ever."""
+
+    def make(name: str) -> Goal:
+        robot.state()
+        return PoseGoal(0.0, 0.0, 0.0, id=name)
+
+    with pytest.raises(ServiceError, match="called by a function"):
+        robot.send(make)
+
+
+def test_points_are_taken_in_the_callers_thread(robot: Robot, slow: Slow) -> None:
+    threads: list[int] = []
+
+    def points() -> Iterator[tuple[float, ...]]:
+        for t in (0.0, 1.0):
+            threads.append(threading.get_ident())
+            yield t, 0.0, 0.0, 0.0
+
+    answering = Call(lambda: reply(slow.next(), GoalReply("g", 1.0)))
+    robot.follow(points(), id="g")
+    answering.end()
+    assert set(threads) == {threading.get_ident()}
+
+
+# ---------------------------------------------------------------------- the end
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda robot: robot.home(),
+        lambda robot: robot.stop(),
+        lambda robot: robot.move_to(0.0, 0.0, 0.0),
+        lambda robot: next(robot.states()),
+        lambda robot: next(robot.events()),
+        lambda robot: robot.lease().__enter__(),
+    ],
+)
+def test_closing_ends_what_other_threads_wait_for(
+    robot: Robot, slow: Slow, call: Callable[[Robot], object], caplog: pytest.LogCaptureFixture
+) -> None:
+    started = threading.Event()
+
+    def do() -> object:
+        started.set()
+        return call(robot)
+
+    calling = Call(do)
+    started.wait(WITHIN)
+    robot.close()
+    assert CLOSED in str(calling.end()) or "no robot" in str(calling.end())
+    assert caplog.records == []
+
+
+def test_after_closing_every_call_says_so_and_no_thread_is_left(robot: Robot, slow: Slow) -> None:
+    sending = Call(lambda: robot.move_to(0.0, 0.0, 0.0, id="g"))
+    reply(slow.next(), GoalReply("g", 1.0))
+    goal = sending.end()
+    robot.close()
+    robot.close()
+    assert not robot._loop._thread.is_alive()
+    for call in (robot.state, robot.enable, goal.wait, goal.cancel, lambda: next(robot.states()), robot.users):
+        with pytest.raises(ServiceError, match=CLOSED):
+            call()

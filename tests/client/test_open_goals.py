@@ -1,0 +1,65 @@
+"""The goals of a client: a refusal concerns its own call alone, and every handle of an accepted goal ends."""
+
+from __future__ import annotations
+
+import itertools
+
+from hypothesis import given
+from hypothesis import strategies as st
+from trirail.client.goal import AsyncGoalHandle, OpenGoals, Result
+from trirail.wire.messages import GoalReply
+
+IDS = ("g1", "g2")
+
+
+def handle(goal_id: str) -> AsyncGoalHandle:
+    async def command(*_: object) -> None:
+        raise AssertionError("nothing was to be commanded")
+
+    return AsyncGoalHandle(goal_id, command)
+
+
+def reply(goal_id: str) -> GoalReply:
+    return GoalReply(goal_id, 1.0)
+
+
+def test_a_used_id_that_is_refused_leaves_the_first_handle() -> None:
+    goals: OpenGoals = OpenGoals()
+    first = goals.open(handle("g1"))
+    goals.accept(first, reply("g1"))
+    goals.open(handle("g1"))
+    assert not goals.refuse("g1")
+    goals.end(Result("g1", "done", ""))
+    assert first.result is not None
+    assert repr(first) == "<AsyncGoalHandle g1 done>"
+
+
+@given(st.lists(st.tuples(st.sampled_from(["open", "accept", "refuse", "end"]), st.integers(0, 7)), max_size=40))
+def test_every_handle_of_an_accepted_call_ends(steps: list[tuple[str, int]]) -> None:
+    """Calls of several threads with few ids, answered in any order; the end of a goal may come before its answer."""
+    goals: OpenGoals = OpenGoals()
+    under_way: list[AsyncGoalHandle] = []
+    accepted: list[AsyncGoalHandle] = []
+    for step, number in steps:
+        if step == "open":
+            under_way.append(goals.open(handle(IDS[number % 2])))
+        elif step == "end":
+            goals.end(Result(IDS[number % 2], "done", ""))
+        elif under_way:
+            call = under_way.pop(number % len(under_way))
+            if step == "accept":
+                goals.accept(call, reply(call.id))
+                accepted.append(call)
+            else:
+                goals.refuse(call.id)
+    for each, goal_id in itertools.product(accepted, IDS):
+        if each.result is None and each.id == goal_id:
+            goals.end(Result(goal_id, "done", ""))
+            assert each.result is not None
+    for call in under_way:
+        goals.refuse(call.id)
+    for goal_id in IDS:
+        goals.end(Result(goal_id, "done", ""))
+    assert not goals
+    assert not goals._calls
+    assert not goals._accepted

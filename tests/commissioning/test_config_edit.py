@@ -1,0 +1,76 @@
+"""The configuration that is written: only what was found changes, and comments stay."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trirail.commissioning import config_edit
+from trirail.config import SIM, load, parse
+from trirail.errors import ConfigError
+from trirail_drivers.interface import NAMES
+
+SHIPPED = sorted(SIM.parent.rglob("*.toml"))
+changes = st.fixed_dictionaries(
+    {},
+    optional={
+        f"drives.{name}.{key}": values
+        for name in NAMES
+        for key, values in (
+            ("direction", st.sampled_from((1, -1))),
+            ("counts_per_metre", st.floats(5e6, 1e8)),
+        )
+    },
+)
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
+@settings(max_examples=8)
+@given(found=changes)
+def test_only_what_was_found_changes(path: Path, found: dict[str, int | float]) -> None:
+    text = path.read_text(encoding="utf-8")
+    if "odrive" in text:
+        found = {key: value for key, value in found.items() if "counts" not in key}
+    written = config_edit.edit_text(text, found)
+    assert parse(written) == config_edit.replace_values(parse(text), found)
+    lines = list(difflib.ndiff(text.splitlines(), written.splitlines()))
+    assert sum(line.startswith(("- ", "+ ")) for line in lines) <= 2 * len(found)
+    for line in text.splitlines():
+        if line.lstrip().startswith("#"):
+            assert line in written
+
+
+def test_an_inline_table_is_changed_too() -> None:
+    text = SIM.read_text(encoding="utf-8").replace("[drives.B]\nnode = 2\ncounts_per_metre = 1e7\n", "")
+    inline = 'protocol = "cia402"\nB = { node = 2, counts_per_metre = 1e7 }  # mine'
+    text = text.replace('protocol = "cia402"', inline)
+    written = config_edit.edit_text(text, {"drives.B.direction": -1, "drives.B.node": 7})
+    assert "# mine" in written
+    assert (parse(written).drives.B.direction, parse(written).drives.B.node) == (-1, 7)
+
+
+def test_what_would_be_no_configuration_is_not_written() -> None:
+    with pytest.raises(ConfigError, match="node ids"):
+        config_edit.edit_text(SIM.read_text(encoding="utf-8"), {"drives.A.node": 2})
+
+
+def test_no_file_is_written_over(tmp_path: Path) -> None:
+    source = tmp_path / "mine.toml"
+    first = config_edit.find_free_path(source)
+    config_edit.write_new_file(first, "precious")
+    second = config_edit.find_free_path(source)
+    assert (first.name, second.name) == ("mine-commissioned.toml", "mine-commissioned-2.toml")
+    with pytest.raises(ConfigError, match="exists already"):
+        config_edit.write_new_file(first, "other")
+    assert first.read_text() == "precious"
+
+
+def test_eds_files_are_found_from_another_folder(tmp_path: Path) -> None:
+    text = SIM.read_text(encoding="utf-8").replace("[drives.B]\n", '[drives.B]\neds = "maker.eds"\n')
+    (tmp_path / "here").mkdir()
+    moved = tmp_path / "moved.toml"
+    config_edit.write_new_file(moved, config_edit.resolve_eds_paths(text, tmp_path / "here"))
+    assert load(moved).drives.B.eds == str(tmp_path / "here" / "maker.eds")

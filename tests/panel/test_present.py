@@ -1,0 +1,346 @@
+"""What the page says is so now, what cannot work is disabled and says why, and nothing is lost without a question."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import msgspec
+import pytest
+from chromium import Page, needs_chromium
+from panel.conftest import SHOWN
+from panel.fake_robot import FakeRobot
+from panel.test_page import moves, stands, typed, until
+from trirail.errors import RefusalCode, RefusedError
+from trirail.panel.server import Panel
+from trirail.wire.state import GoalState, Pose
+from trirail.wire.vocabulary import Command, Mode
+
+pytestmark = [pytest.mark.viewer, needs_chromium]
+
+ANSWER = "document.querySelector('#answer').textContent"
+RIGHT = "[data-axis=x][data-sign='1']"
+EVERYBODYS = {each for each in Command if each.everybodys}
+
+
+def bars(page: Page) -> dict[str, str]:
+    """Return the reason of each control that is disabled."""
+    found: dict[str, str] = page.evaluate(
+        "Object.fromEntries([...document.querySelectorAll('button:disabled, input:disabled')]"
+        ".map((each) => [each.id || each.dataset.command || Object.values(each.dataset).join(' '), each.title]))"
+    )
+    return found
+
+
+# ---------------------------------------------------------------------- every line states the present
+
+
+@pytest.mark.parametrize(
+    ("outcome", "words"), [("done", "arrived"), ("stopped", "stopped"), ("preempted", "replaced by another goal")]
+)
+def test_a_goal_is_on_its_way_while_it_is_and_then_has_ended(
+    enabled: Page, robot: FakeRobot, outcome: str, words: str
+) -> None:
+    robot.lasting = True
+    typed(enabled, "1", "2", "3")
+    enabled.click("#go")
+    enabled.until(f"{ANSWER} === 'go there: on its way'")
+    robot.share = 0.0
+    enabled.until(f"{ANSWER} === 'go there: waits'")
+    robot.share = 1.0
+    enabled.until(f"{ANSWER} === 'go there: on its way'")
+    robot.arrive(outcome)
+    enabled.until(f"{ANSWER} === 'go there: {words}'")
+    robot.fault("drive B")
+    enabled.until(f"{ANSWER} === ''")
+
+
+def test_what_is_done_is_said_until_it_is_so_no_longer(enabled: Page, robot: FakeRobot) -> None:
+    enabled.click("[data-command=acquire]")
+    enabled.until(f"{ANSWER} === 'Take lease: done'")
+    robot.refusal = RefusedError(RefusalCode.LEASE_OVER, "taken over by bob")
+    robot.holder = "bob"
+    enabled.until(f"{ANSWER} === '' && document.querySelector('#lease').textContent.startsWith('bob')")
+    assert enabled.evaluate("document.querySelector('header').contains(document.querySelector('#lease'))")
+
+
+def test_a_line_goes_by_itself_after_a_while(enabled: Page, robot: FakeRobot) -> None:
+    robot.refusal = RefusedError(RefusalCode.MOVING, "no")
+    enabled.click("[data-command=disable]")
+    enabled.until(f"{ANSWER} === 'Disable: no'")
+    enabled.evaluate("(() => { const now = performance.now(); performance.now = () => now + 60_000; })()")
+    enabled.until(f"{ANSWER} === ''")
+
+
+def test_no_line_outlives_the_contact(enabled: Page, robot: FakeRobot) -> None:
+    with robot.hanging("pause"):
+        robot.mode, robot._alive_until = "moving", float("inf")
+        enabled.until("!document.querySelector('[data-command=pause]').disabled")
+        enabled.click("[data-command=pause]")
+        enabled.until(f"{ANSWER} === 'Pause …'")
+        robot.silent.set()
+        enabled.until(f"document.body.dataset.contact === 'none' && {ANSWER} === ''")
+    robot.silent.clear()
+
+
+def test_a_way_is_checked_again_when_the_robot_stands_elsewhere(enabled: Page, robot: FakeRobot) -> None:
+    typed(enabled, "100", "0", "0")
+    enabled.until("document.querySelector('#going').dataset.may === 'yes'")
+    robot.pose = (0.22, 0.0, 0.0)
+    enabled.until("document.querySelector('#going').dataset.may === 'no'")
+    assert "on the way" in enabled.text("#going-says")
+
+
+# ---------------------------------------------------------------------- what cannot work
+
+
+def test_under_a_lease_of_another_what_is_not_everybodys_is_disabled(enabled: Page, robot: FakeRobot) -> None:
+    robot.holder = "bob"
+    enabled.until("document.querySelector('.hold').disabled")
+    found = bars(enabled)
+    for name in ("go", "override", "park", "follow", "x 1", "phi -1"):
+        assert "bob holds the lease" in found[name], name
+    for command in enabled.evaluate("[...document.querySelectorAll('[data-command]')].map((e) => e.dataset.command)"):
+        if command in set(Command) - EVERYBODYS:
+            assert "bob" in found[command], command
+    assert {"disable", "quick_stop", "takeover"}.isdisjoint(found)
+    robot.holder = None
+    enabled.until("!document.querySelector('.hold').disabled")
+
+
+@pytest.mark.parametrize("by", ["mouse", "finger", "key"])
+def test_a_disabled_control_says_why_where_it_is_pressed(enabled: Page, robot: FakeRobot, by: str) -> None:
+    robot.holder = "bob"
+    enabled.until("document.querySelector('.hold').disabled")
+    if by == "key":
+        enabled.type_key("ArrowRight")
+    elif by == "mouse":
+        enabled.click(RIGHT)
+    else:
+        enabled.resize(390, 844, phone=True)
+        enabled.touch(RIGHT)
+        enabled.end_touch()
+    enabled.until(f"{ANSWER} === 'bob holds the lease: wait, or take it over.'")
+    assert not robot.sent
+    box = enabled.evaluate(
+        "(({top, bottom}) => [top, bottom])(document.querySelector('#answer').getBoundingClientRect())"
+    )
+    stop = enabled.evaluate("document.querySelector('#stop').getBoundingClientRect().top")
+    assert 0.0 <= box[0] < box[1] <= stop
+    robot.holder = None
+    enabled.until(f"{ANSWER} === ''")
+
+
+@pytest.mark.parametrize("policy", ["optional", "required"])
+def test_every_disabled_control_has_its_reason_in_every_state(enabled: Page, robot: FakeRobot, policy: str) -> None:
+    robot.told = msgspec.structs.replace(robot.told, lease=policy)
+    robot.silent.set()
+    enabled.until("document.body.dataset.contact === 'none'")
+    robot.silent.clear()
+    enabled.until(SHOWN)
+    goals = (None, GoalState("g", 0.5, 1.0, target=Pose(0.0, 0.0, 0.0)))
+    marker = itertools.count(10)
+    for mode, holder, goal in itertools.product(Mode, (None, "ann", "bob"), goals):
+        with robot._lock:
+            robot.mode, robot.holder, robot.goal, robot._alive_until = mode, holder, goal, float("inf")
+            robot.share = (number := next(marker)) / 100.0
+        enabled.until(f"document.querySelector('#override-says').textContent === '{number} %'")
+        for name, why in bars(enabled).items():
+            assert len(why) > 10, (name, mode, holder)
+        may = mode in (Mode.HOLDING, Mode.MOVING) or (mode is Mode.STOPPING and goal is not None)
+        may = may and (holder == "ann" or (holder is None and policy == "optional"))
+        assert enabled.evaluate("!document.querySelector('.hold').disabled") == may, (mode, holder, goal)
+
+
+# ---------------------------------------------------------------------- a hand that leaves
+
+
+@pytest.mark.usefixtures("slow_hand")
+def test_a_mouse_that_is_dragged_off_a_held_button_stops(enabled: Page, robot: FakeRobot) -> None:
+    enabled.press(RIGHT)
+    moves(robot)
+    at = enabled.middle(RIGHT)
+    enabled._mouse("mouseMoved", at | {"x": at["x"] + 5.0})
+    assert robot.goal is not None
+    enabled._mouse("mouseMoved", at | {"y": at["y"] + 100.0})
+    stands(robot)
+    asked = len(robot.sent)
+    enabled._mouse("mouseMoved", at)  # back again: it has been let go
+    enabled.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert len(robot.sent) == asked
+    enabled.let_go()
+
+
+@pytest.mark.usefixtures("slow_hand")
+def test_a_finger_that_leaves_a_held_button_stops(enabled: Page, robot: FakeRobot) -> None:
+    enabled.resize(390, 844, phone=True)
+    enabled.touch(RIGHT)
+    moves(robot)
+    at = enabled.middle(RIGHT)
+    enabled._call("Input.dispatchTouchEvent", type="touchMove", touchPoints=[at | {"x": at["x"] - 150.0}])
+    stands(robot)
+    enabled.end_touch()
+
+
+# ---------------------------------------------------------------------- speed, events
+
+
+@pytest.mark.parametrize("speed", [0, 3, 6])
+def test_the_speed_governs_goals_as_it_does_jogs(enabled: Page, robot: FakeRobot, speed: int) -> None:
+    enabled.evaluate(f"document.querySelector('#speed').value = {speed}")
+    typed(enabled, "1", "2", "3")
+    enabled.click("#go")
+    until(lambda: len(robot.speeds) == 1, "it goes")
+    enabled.click("[data-pose=park]")
+    until(lambda: len(robot.speeds) == 2, "to a pose")
+    enabled.click("[data-step='1']")
+    enabled.until("!document.querySelector('.hold').disabled")
+    enabled.click(RIGHT)
+    until(lambda: len(robot.speeds) == 3, "by a step")
+    assert robot.speeds == [(0.01, 0.1, 1.0)[speed // 3]] * 3
+
+
+@pytest.mark.usefixtures("slow_hand")
+def test_a_jog_is_one_line_of_events(enabled: Page, robot: FakeRobot) -> None:
+    lines = "document.querySelector('#events').childElementCount"
+    for jogs in (1, 2):
+        before = enabled.evaluate(lines)
+        enabled.press(RIGHT)
+        moves(robot)
+        enabled.until(f"{lines} === {before} + 1")
+        enabled.let_go(RIGHT)
+        stands(robot)
+        enabled.until("document.querySelector('#events li').textContent.includes('done')")
+        robot.say(f"after jog {jogs}")
+        enabled.until(f"document.querySelector('#events li').textContent.includes('after jog {jogs}')")
+        assert enabled.evaluate(lines) == before + 2
+
+
+# ---------------------------------------------------------------------- what would be lost
+
+
+@pytest.mark.parametrize("what", ["teach", "forget"])
+def test_what_would_lose_a_pose_asks_first(enabled: Page, robot: FakeRobot, what: str) -> None:
+    robot.named["pick"] = old = (0.0, 0.0, 0.0)
+    robot.say("pose pick taught by bob", kind="pose")
+    enabled.until("document.querySelector('[data-pose=pick]')")
+    enabled.write("#pose-name", "pick")
+    button = f"document.querySelector('#{what}')"
+    enabled.until(f"!{button}.disabled")
+    usual = enabled.text(f"#{what}")
+    for _ in range(2):  # a double click is one press
+        enabled.click(f"#{what}")
+    enabled.until(f"{button}.innerText === 'Sure?' && {ANSWER}.includes('pick')")
+    enabled.write("#pose-name", "pic")  # another name is another question
+    enabled.until(f"{button}.innerText === {usual!r} && {ANSWER} === ''")
+    enabled.write("#pose-name", "pick")
+    enabled.click(f"#{what}")
+    enabled.until(f"{button}.innerText === 'Sure?'")
+    assert robot.named["pick"] == old
+    time.sleep(0.6)
+    enabled.click(f"#{what}")
+    until(lambda: robot.named.get("pick") != old, "it is answered")
+    assert robot.named.get("pick") == (robot.pose if what == "teach" else None)
+
+
+def test_a_question_lasts_ten_seconds(browser: Page, robot: FakeRobot) -> None:
+    robot.named["pick"] = (0.0, 0.0, 0.0)
+    with Panel(robot.robot(), 0) as panel:
+        panel._files["naming.js"] = panel._files["naming.js"].replace(b"ASKED = 10_000;", b"ASKED = 100;")
+        page = browser.another()
+        page.open(panel.url)
+        page.until(SHOWN)
+        page.write("#pose-name", "pick")
+        page.click("#forget")
+        page.until("document.querySelector('#forget').innerText === 'Forget'")
+        assert "pick" in robot.named
+        page.close()
+
+
+def test_a_pose_keeps_its_place_while_others_come_and_go(page: Page, robot: FakeRobot) -> None:
+    def place(name: str) -> list[float]:
+        box: list[float] = page.evaluate(
+            f"(({{x, y}}) => [x, y])(document.querySelector('[data-pose={name}]').getBoundingClientRect())"
+        )
+        return box
+
+    for name in ("b", "d"):
+        robot.named[name] = (0.0, 0.0, 0.0)
+    robot.say("poses", kind="pose")
+    page.until("document.querySelector('[data-pose=d]')")
+    before = place("d")
+    del robot.named["park"]
+    robot.say("pose", kind="pose")
+    page.until("!document.querySelector('[data-pose=park]')")
+    assert place("d") == before
+    robot.named = {"a": (0.0, 0.0, 0.0)} | robot.named
+    robot.say("pose", kind="pose")
+    page.until("document.querySelector('[data-pose=a]')")
+    assert place("d") == before
+
+
+# ---------------------------------------------------------------------- a stage, and German
+
+
+def small(robot: FakeRobot) -> None:
+    limits = msgspec.to_builtins(robot.told.limits)
+    limits["platform"]["x"] = [-0.01, 0.01]
+    robot.told = msgspec.structs.replace(robot.told, limits=limits)
+
+
+def test_a_stage_is_shown_in_micrometres_and_gone_to_in_them(browser: Page, robot: FakeRobot) -> None:
+    small(robot)
+    robot.mode, robot.pose = "holding", (1.2345e-3, 0.0, 0.0)
+    with Panel(robot.robot(), 0) as panel:
+        page = browser.another()
+        page.open(panel.url)
+        page.until(f"{SHOWN} && document.querySelector('#pose').textContent.includes('1234.5 µm')")
+        assert page.evaluate("document.querySelector('#to-x').placeholder") == "µm"
+        assert "µm/s" in page.text("#sliders")
+        assert "µm/s" in page.text("#speed-says")
+        page.click("#here")
+        assert page.evaluate("document.querySelector('#to-x').value") == "1234.5"
+        typed(page, "250", "0.5 mm", "0")
+        page.click("#go")
+        until(lambda: bool(robot.moved_to), "it goes")
+        assert robot.moved_to[0][0] == pytest.approx((250e-6, 0.5e-3, 0.0))
+        assert page.text("[data-step='1']").split() == ["1", "µm", "0.0001°"]
+        page.close()
+
+
+def test_step_buttons_show_their_units(page: Page) -> None:
+    shown = [page.text(f"[data-step='{step}']").split("\n") for step in range(1, 5)]
+    assert [[part.replace("\u00a0", " ") for part in parts] for parts in shown] == [
+        ["10 µm", "0.01°"],
+        ["0.1 mm", "0.1°"],
+        ["1 mm", "1°"],
+        ["10 mm", "1°"],
+    ]
+
+
+def test_german_has_decimal_commas_and_words_for_what_the_service_says(page: Page, robot: FakeRobot) -> None:
+    page.choose("#language", "de")
+    page.until("document.documentElement.lang === 'de'")
+    robot.pose = (0.0321, -0.0123, -0.2)
+    page.until("document.querySelector('#pose').innerText.includes('32,10 mm')")
+    assert "−12,30 mm" in page.text("#pose")
+    assert "." not in page.text("#numbers") + page.text("#speed-says") + page.text("#steps")
+    page.click("#here")
+    assert page.evaluate("document.querySelector('#to-y').value") == "-12,3"
+    typed(page, "-12,3", "0", "0")
+    page.until("document.querySelector('#going').dataset.may === 'yes'")
+    typed(page, "500", "0", "0")
+    page.until("document.querySelector('#going').dataset.may === 'no'")
+    assert page.text("#going-says").startswith("Schlitten ")
+    robot.refusal = RefusedError(RefusalCode.NOT_AT_REST, "slider A is moved from outside", slider="A")
+    page.click("[data-command=enable]")
+    page.until(f"{ANSWER}.startsWith('Ein: ein Schlitten wird von außen bewegt')")
+    assert page.evaluate("document.querySelector('#answer span').title") == "slider A is moved from outside"
+    robot.refusal = RefusedError(RefusalCode.OUT_OF_WORKSPACE, "no", slider="B", value=0.1525, limit=0.15)
+    page.click("[data-command=enable]")
+    page.until(f"{ANSWER}.endsWith('außerhalb der Grenzen: Schlitten B 152,50 mm, Grenze 150,00 mm')")
+    robot.say("drive B: EMCY 8700", "error", kind="fault", fault={"cause": "emcy", "drive": "B", "code": 0x8700})
+    page.until("document.querySelector('#events li').textContent.endsWith('Antrieb B: EMCY 8700h')")
+    robot.fault("drive B: EMCY 8700")
+    page.until("document.querySelector('#alarm').innerText.includes('Antrieb B: EMCY 8700h')")
+    page.evaluate("localStorage.clear()")

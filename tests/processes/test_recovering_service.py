@@ -1,0 +1,97 @@
+"""A whole service whose drives are off when it starts, and lose their supply while it runs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from trirail import RefusedError, Robot
+from trirail.client import own_service
+from trirail.wire.vocabulary import Mode
+from waiting import wait_until
+
+VIRTUAL_DRIVES = Path(__file__).parents[2] / "tools/virtual_drives.py"
+TURNS = "counts_per_metre = 25.0"
+"""Unit of an ODrive's position: turns of a screw with 40 mm lead."""
+Tell = Callable[[str], None]
+
+
+@pytest.fixture(params=["cia402", "odrive"])
+def drives(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Path, str, Tell]]:
+    """Simulated drives of a process of their own: the service's configuration, its locator, what takes fault lines."""
+    config, locator = own_service.private(tmp_path)
+    bus = tmp_path / "bus"
+    text = config.read_text()
+    text = text.replace('interface = "simulated" ', f'interface = "unix"\nchannel = "{bus}" ')
+    if request.param == "odrive":
+        text = text.replace('protocol = "cia402"', 'protocol = "odrive"').replace("counts_per_metre = 1e7", TURNS)
+    config.write_text(text)
+    given = [str(config), "--interface", "unix", "--channel", str(bus)]
+    with subprocess.Popen([sys.executable, str(VIRTUAL_DRIVES), *given], stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        told = process.stdin
+
+        def tell(line: str) -> None:
+            told.write(f"{line}\n".encode())
+            told.flush()
+
+        try:
+            wait_until(bus.exists)
+            yield config, locator, tell
+        finally:
+            process.terminate()
+
+
+def move(robot: Robot, x: float) -> None:
+    result = robot.move_to(x=x, y=0.0, phi=0.0).wait(timeout=30)
+    assert result.outcome == "done", (result, robot.state().faults)
+
+
+def reset_once_configured(robot: Robot) -> None:
+    """Send reset until it is accepted."""
+
+    def accepted() -> bool:
+        try:
+            robot.reset()
+        except RefusedError:
+            return False
+        return True
+
+    wait_until(accepted)
+
+
+@pytest.mark.long
+def test_a_service_recovers_without_a_restart(drives: tuple[Path, str, Tell], tmp_path: Path) -> None:
+    config, locator, tell = drives
+    tell("all silent")
+    with own_service.service(config, tmp_path / "session.rrd"), Robot(connect=locator) as robot:
+        assert robot.state().mode == Mode.FAULT
+        wait_until(lambda: "drive C does not answer" in robot.state().faults)
+        with pytest.raises(RefusedError, match="drive A does not answer"):
+            robot.reset()
+        tell("clear")
+        reset_once_configured(robot)
+        robot.enable()
+        move(robot, 0.005)
+        tell("all reboot for 2")
+        wait_until(lambda: robot.state().mode == Mode.FAULT)
+        wait_until(lambda: len(robot.state().faults) == 4)
+        reset_once_configured(robot)
+        assert robot.state().faults == ()
+        robot.enable()
+        move(robot, 0.0)
+
+
+@pytest.mark.long
+def test_a_service_that_starts_without_its_bus_is_in_fault_and_says_why(tmp_path: Path) -> None:
+    config, locator = own_service.private(tmp_path)
+    text = config.read_text()
+    config.write_text(text.replace('interface = "simulated" ', 'interface = "socketcan"\nchannel = "can7" '))
+    with own_service.service(config, tmp_path / "session.rrd"), Robot(connect=locator) as robot:
+        (fault,) = robot.state().faults
+        assert fault.startswith("CAN bus can7 is down: ")
+        with pytest.raises(RefusedError, match="can7"):
+            robot.reset()

@@ -1,0 +1,424 @@
+"""Sessions found again: by what stands beside recordings, whatever has become of it, the same as by reading them."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+import made
+import msgspec
+import pytest
+from cyclopts import CycloptsError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trirail.cli.app import app
+from trirail.config import SIM, Config, load
+from trirail.telemetry import contents, retention
+from trirail.telemetry import sessions as found_sessions
+from trirail.telemetry.blackbox import BlackBox
+from trirail.telemetry.contents import Contents, FaultEntry, of_file
+from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.retention import sidecar
+from trirail.telemetry.sessions import RecordedSession, Wanted, find, recorded
+from trirail.wire.goals import PoseGoal
+from trirail.wire.messages import Event, FaultDetail
+from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
+from trirail.wire.vocabulary import Command
+
+
+class Time:
+    """The clocks of a recording, that go with its records."""
+
+    def __init__(self, began: str) -> None:
+        self.wall_ns = round(datetime.fromisoformat(began).timestamp()) * 1_000_000_000
+        self.ns = made.MONOTONIC_NS
+
+    def monotonic(self) -> int:
+        return self.ns
+
+    def wall(self) -> int:
+        return self.wall_ns + self.ns - made.MONOTONIC_NS
+
+
+def configured(name: str = "demo", **telemetry: object) -> Config:
+    config = load(SIM)
+    return msgspec.structs.replace(
+        config,
+        robot=msgspec.structs.replace(config.robot, name=name),
+        telemetry=msgspec.structs.replace(config.telemetry, **telemetry),
+    )
+
+
+def asked(seq: int, user: str) -> ControlInput:
+    return ControlInput(seq, 10, made.MONOTONIC_NS, GoalRequest(seq, user, f"g{seq}", PoseGoal(0.01, 0.0, 0.1), 0))
+
+
+def record(folder: Path, began: str = "2026-01-31 12:00:00", name: str = "demo", seconds: float = 0.5) -> Path:
+    """Record a session in which ann and ben send goals, and drive B has a fault."""
+    time = Time(began)
+    recording = Recorder(
+        configured(name), folder, sidecars=True, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic
+    )
+    box = BlackBox(
+        1000,
+        lambda called, reason: Recorder(
+            configured(name), folder, name=called, reason=reason, sidecars=True, live=False, wall_ns=time.wall,
+            monotonic_ns=time.monotonic,
+        ),
+        lambda text: pytest.fail(text.text),
+    )  # fmt: skip
+    for taker in (recording, box):
+        taker.control_input(asked(1, "ann"))
+        taker.control_input(asked(2, "ben"))
+        taker.control_input(ControlInput(3, 11, made.MONOTONIC_NS, CommandRequest(3, "eva", Command.STOP)))
+    sent = made.records(seconds)
+    for start in range(0, len(sent), 20):
+        time.ns = int(sent[start : start + 20]["deadline_ns"][-1])
+        recording.records(sent[start : start + 20].tobytes())
+        box.records(sent[start : start + 20].tobytes())
+    now = time.wall() * 1e-9
+    for event in (
+        Event("goal", "info", "done", id="g1", outcome="done", user="ann", seq=1, t=0.3, cycle=300, time=now),
+        Event("goal", "error", "faulted", id="g2", outcome="faulted", user="ben", seq=2, t=0.3, cycle=300, time=now),
+        Event(
+            "fault",
+            "error",
+            "drive B: EMCY 8700",
+            fault=FaultDetail("emcy", "B", 0x8700),
+            seq=3,
+            t=0.3,
+            cycle=300,
+            time=now,
+        ),
+    ):
+        recording.event(event)
+        box.event(event)
+    recording.close()
+    box.close()
+    return recording.path
+
+
+def sessions(folder: Path, *options: str) -> list[RecordedSession]:
+    """What the command prints."""
+    done: list[str] = []
+    capture = pytest.MonkeyPatch()
+    capture.setattr("trirail.cli.terminal.json", lambda content: done.append(msgspec.json.encode(content).decode()))
+    try:
+        assert (
+            app(["sessions", str(folder), "--json", *options], exit_on_error=False, result_action="return_value") == 0
+        )
+    finally:
+        capture.undo()
+    return msgspec.convert(json.loads(done[0])["sessions"], list[RecordedSession])
+
+
+def test_what_the_recorder_enters_is_what_its_files_hold(tmp_path: Path) -> None:
+    record(tmp_path)
+    kept = find(recorded(tmp_path, on_read=lambda path: pytest.fail(f"{path} was read")))
+    read: list[Contents] = [of_file(path) for path in tmp_path.glob("*.rrd")]
+    assert len(kept) == 2
+    assert find(read) == kept
+    box, whole = sorted(kept, key=lambda session: session.reason is None)
+    assert box.reason == "drive B: EMCY 8700"
+    assert whole.reason is None
+    assert (whole.robot, whole.goals, sorted(whole.users)) == ("demo", {"done": 1, "faulted": 1}, ["ann", "ben", "eva"])
+    assert whole.faults == box.faults == ["drive B: EMCY 8700"]
+    assert whole.cycles == 500
+    assert whole.began == datetime.fromisoformat("2026-01-31 12:00:00").timestamp()
+    assert whole.ended == pytest.approx(whole.began + 0.499)
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        ([], ["one", "two"]),
+        (["--robot", "two"], ["two"]),
+        (["--since", "2026-02-01"], ["two"]),
+        (["--until", "2026-02-01"], ["one"]),
+        (["--since", "2026-03-01"], []),
+        (["--fault", "EMCY"], ["one", "two"]),
+        (["--fault", "0x8700"], ["one", "two"]),
+        (["--fault", "8700"], ["one", "two"]),
+        (["--fault", "0x8611"], []),
+        (["--user", "eva"], ["one", "two"]),
+        (["--user", "max"], []),
+        (["--outcome", "faulted"], ["one", "two"]),
+        (["--outcome", "stopped"], []),
+        (["--outcome", "faulted", "--user", "ben"], ["one", "two"]),
+        (["--outcome", "faulted", "--user", "ann"], []),
+        (["--last", "1"], ["two"]),
+    ],
+)
+def test_sessions_are_found_by_what_was_in_them(shelf: Path, options: list[str], found: list[str]) -> None:
+    assert [session.robot for session in sessions(shelf, *options) if session.reason is None] == found
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--fault", "zzz"], "0 sessions\nno recorded fault says zzz: there are emcy 0x8700\n"),
+        (["--fault", "0x8611"], "0 sessions\nno recorded fault says 0x8611: there are emcy 0x8700\n"),
+        (["--fault", "emcy", "--user", "max"], "0 sessions\n"),
+    ],
+)
+def test_a_fault_that_never_was_is_told_with_those_that_were(
+    shelf: Path, options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert app(["sessions", str(shelf), *options], exit_on_error=False, result_action="return_value") == 0
+    assert capsys.readouterr().out == said
+
+
+@pytest.mark.parametrize("words", ["0xzzz", "0x87000000000"])
+def test_a_code_that_no_fault_can_have_is_refused(shelf: Path, words: str) -> None:
+    with pytest.raises(CycloptsError, match=f"{words}' is no code such as 0x8700"):
+        app(["sessions", str(shelf), "--fault", words], exit_on_error=False, print_error=False)
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sessions of two robots, without black boxes."""
+    folder = tmp_path_factory.mktemp("shelf")
+    for began, name in (("2026-01-31 12:00:00", "one"), ("2026-02-28 12:00:00", "two")):
+        record(folder, began, name)
+    for box in folder.glob("fault-*"):
+        box.unlink()
+    return folder
+
+
+def _cut(beside: Path) -> None:
+    beside.write_bytes(beside.read_bytes()[: beside.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        Path.unlink,
+        lambda beside: beside.write_bytes(b""),
+        lambda beside: beside.write_bytes(b"\xff\x00 nonsense" * 100),
+        _cut,
+        lambda beside: beside.write_text("[1, 2]"),
+        lambda beside: beside.write_text('{"name": "demo.rrd", "robot": "demo", "version": 99}'),
+    ],
+    ids=["gone", "empty", "nonsense", "cut", "other", "newer"],
+)
+def test_a_recording_with_nothing_usable_beside_it_is_read(shelf: Path, damage: Callable[[Path], object]) -> None:
+    before = sessions(shelf)
+    one = sidecar(min(shelf.glob("*.rrd")))
+    kept = one.read_bytes()
+    damage(one)
+    assert sessions(shelf) == before
+    assert one.read_bytes() == kept
+    assert sessions(shelf, "--rebuild") == before
+
+
+def test_rebuild_reads_what_seems_usable(shelf: Path) -> None:
+    before = sessions(shelf)
+    beside = sidecar(min(shelf.glob("*.rrd")))
+    beside.write_bytes(beside.read_bytes().replace(b'"eva"', b'"max"'))
+    assert sessions(shelf) != before
+    assert sessions(shelf, "--rebuild") == before
+    assert sessions(shelf) == before
+
+
+def test_a_folder_that_cannot_be_written_is_listed_all_the_same(shelf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = sessions(shelf)
+    beside = sidecar(min(shelf.glob("*.rrd")))
+    kept = beside.read_bytes()
+    beside.unlink()
+
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    with monkeypatch.context() as unwritable:
+        unwritable.setattr("trirail_drivers.files.replace", refuse)
+        assert sessions(shelf) == before
+    assert not beside.exists()
+    beside.write_bytes(kept)
+
+
+def test_a_recorder_that_cannot_write_beside_its_recording_says_so_and_records(tmp_path: Path) -> None:
+    time, told = Time("2026-01-31 12:00:00"), list[str]()
+    recording = Recorder(
+        configured(), tmp_path, sidecars=True, live=False, wall_ns=time.wall,
+        monotonic_ns=time.monotonic, warn=lambda text: told.append(text.text),
+    )  # fmt: skip
+    sidecar(recording.path).mkdir()
+    recording.records(made.records(0.1).tobytes())
+    recording.close()
+    assert ["cannot be written, trirail sessions reads the recording" in words for words in told] == [True]
+    assert of_file(recording.path).cycles == 100
+
+
+def test_what_stands_beside_a_recording_is_for_the_same_people(tmp_path: Path) -> None:
+    recording = record(tmp_path)
+    for mode in (0o640, 0o600):
+        recording.chmod(mode)
+        contents.save(recording, of_file(recording))
+        assert sidecar(recording).stat().st_mode & 0o777 == mode
+
+
+def test_what_stands_beside_a_recording_is_deleted_with_it(tmp_path: Path) -> None:
+    old = record(tmp_path)
+    time = Time("2026-02-01 12:00:00")
+    recording = Recorder(
+        configured(keep_mb=1.0), tmp_path, sidecars=True, live=False, wall_ns=time.wall,
+        monotonic_ns=time.monotonic,
+    )  # fmt: skip
+    with old.open("r+b") as file:  # the oldest, and large enough to go alone
+        file.truncate(3_000_000)
+    recording.records(made.records(0.1).tobytes())
+    recording.close()
+    assert not old.exists()
+    assert {path.name for path in tmp_path.glob("*.json")} == {sidecar(path).name for path in tmp_path.glob("*.rrd")}
+
+
+def test_what_is_deleted_by_hand_or_was_cut_off_by_a_kill_is_right_all_the_same(shelf: Path, tmp_path: Path) -> None:
+    for path in shelf.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    one, two = sorted(tmp_path.glob("*.rrd"))
+    killed = tmp_path / "demo-20260301-120000.rrd"
+    killed.write_bytes(two.read_bytes()[: two.stat().st_size * 19 // 20])
+    one.unlink()
+    (tmp_path / "mine.rrd").write_bytes(b"no recording")
+    found = {session.session: session for session in sessions(tmp_path)}
+    assert set(found) == {two.stem, killed.stem, "mine"}
+    assert found["mine"].trouble
+    assert 0 < found[killed.stem].cycles <= 500
+
+
+def read_in(folder: Path) -> list[Path]:
+    """Return which recordings had to be read."""
+    found: list[Path] = []
+    recorded(folder, on_read=found.append)
+    return found
+
+
+def test_what_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    written = tmp_path / "demo-20260301-120000.rrd"
+    written.write_bytes(b"RRF2")
+    lock = retention.lock(written)
+    assert sessions(tmp_path) == []
+    assert read_in(tmp_path) == []
+    retention.unlock(lock)
+    assert read_in(tmp_path) == [written]
+    assert read_in(tmp_path) == []
+
+
+names = st.sampled_from(["ann", "ben", "eva"])
+outcomes = st.sampled_from(["done", "stopped", "faulted"])
+when = st.floats(0.0, 100.0)
+faults = st.builds(
+    FaultEntry,
+    when,
+    st.builds(FaultDetail, st.sampled_from(["emcy", "bus"]), st.just(""), st.sampled_from([0, 0x8700])),
+    st.sampled_from(["drive A", "CAN bus"]),
+)
+
+
+@st.composite
+def files(draw: st.DrawFn) -> list[Contents]:
+    found = []
+    for number in range(draw(st.integers(0, 8))):
+        robot = draw(st.sampled_from(["x", "y"]))
+        for part in range(draw(st.integers(1, 3))):
+            began = draw(when)
+            found.append(
+                Contents(
+                    f"{robot}-{number}{f'-part{part + 1}' if part else ''}.rrd", robot, began, began + draw(when), 10,
+                    draw(st.sets(names, max_size=2)),
+                    draw(st.dictionaries(names, st.dictionaries(outcomes, st.integers(1, 3), min_size=1), max_size=2)),
+                    draw(st.lists(faults, max_size=2)),
+                )
+            )  # fmt: skip
+    return found
+
+
+def fits(parts: list[Contents], wanted: Wanted) -> bool:
+    """Whether a session is wanted: said once more."""
+    goals = {(user, outcome) for part in parts for user, outcomes in part.goals.items() for outcome in outcomes}
+    said = [f"{each.fault.cause} 0x{each.fault.code:04X} {each.message}".lower() for p in parts for each in p.faults]
+    users = {user for part in parts for user in part.users}
+    return (
+        (wanted.robot is None or parts[0].robot == wanted.robot)
+        and (wanted.since is None or max(part.ended or 0.0 for part in parts) >= wanted.since)
+        and (wanted.until is None or min(part.began or 0.0 for part in parts) <= wanted.until)
+        and (wanted.fault is None or any(wanted.fault.lower() in text for text in said))
+        and (wanted.user is None or wanted.outcome is not None or wanted.user in users)
+        and (wanted.outcome is None or any(o == wanted.outcome and wanted.user in (None, u) for u, o in goals))
+    )
+
+
+def test_a_session_that_runs_is_found_and_one_that_was_cut_off_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    time = Time("2026-01-31 12:00:00")
+    recording = Recorder(
+        configured(), tmp_path, sidecars=True, live=False, wall_ns=time.wall, monotonic_ns=time.monotonic
+    )
+    sent = made.records(2.0)
+    for start in range(0, 1500, 50):
+        time.ns = int(sent["deadline_ns"][start])
+        recording.records(sent[start : start + 50].tobytes())
+    (found,) = find(recorded(tmp_path))
+    assert (found.running, found.robot, found.files) == (True, "demo", [recording.path.name])
+    assert read_in(tmp_path) == []
+    with monkeypatch.context() as killed:
+        killed.setattr(found_sessions, "is_being_written", lambda _: False)
+        assert read_in(tmp_path) == [recording.path]
+    (cut_off,) = find(recorded(tmp_path))
+    assert not cut_off.running
+    assert cut_off.cycles > found.cycles
+    recording.close()
+    (whole,) = find(recorded(tmp_path))
+    assert (whole.running, whole.cycles) == (False, 1500)
+
+
+@settings(max_examples=60)
+@given(
+    files(),
+    st.builds(
+        Wanted,
+        st.none() | st.sampled_from(["x", "y"]),
+        st.none() | when,
+        st.none() | when,
+        st.none() | st.sampled_from(["EMCY", "0x8700", "can", "drive a"]),
+        st.none() | names,
+        st.none() | outcomes,
+    ),
+)
+def test_what_is_wanted_is_found_and_nothing_else(found: list[Contents], wanted: Wanted) -> None:
+    by_session: dict[str, list[Contents]] = {}
+    for each in found:
+        by_session.setdefault(each.session, []).append(each)
+    expected = {name for name, parts in by_session.items() if fits(parts, wanted)}
+    answer = find(found, wanted)
+    assert {session.session for session in answer} == expected
+    for session in answer:
+        parts = by_session[session.session]
+        assert session.cycles == 10 * len(parts)
+        goals = Counter[str]()
+        for outcomes in (outcomes for part in parts for outcomes in part.goals.values()):
+            goals.update(outcomes)
+        assert session.goals == goals
+        assert len(session.faults) == sum(len(part.faults) for part in parts)
+        assert set(session.files) == {part.name for part in parts}
+    assert [s.began for s in answer] == sorted(s.began or 0.0 for s in answer)
+
+
+@given(files())
+def test_what_stands_beside_a_recording_is_what_was_in_it(found: list[Contents]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for each in found:
+            recording = Path(folder, each.name)
+            recording.touch()
+            contents.save(recording, each)
+            assert contents.load(recording) == each
+
+
+def test_the_name_of_a_black_box_is_that_of_its_faults_time() -> None:
+    moment = datetime(2026, 1, 31, 12, 0, 5).astimezone().timestamp()
+    assert contents.box_name(moment) == "fault-20260131-120005"

@@ -1,0 +1,191 @@
+"""Find names and sentences that an engineer who is new to the project stumbles over.
+
+python tools/plain_language.py                        count per room and guide, beside the ceiling of each
+python tools/plain_language.py service/trirail/wire   list each place below a folder, or in a file
+python tools/plain_language.py --lower                lower the ceilings to today's counts
+
+A place is a suggestion. Words, openings and phrases are in plain_language.toml, the ceilings in
+plain_language_ceilings.toml: tests/test_language.py fails where a room has more places than its ceiling allows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import re
+import subprocess
+import sys
+import tokenize
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+WORDS = Path(__file__).with_suffix(".toml")
+CEILINGS = WORDS.with_name("plain_language_ceilings.toml")
+CONTEXT = 40
+"""Number of characters shown on either side of a phrase."""
+
+
+class Place(NamedTuple):
+    """Name or sentence to review."""
+
+    file: str
+    line: int
+    rule: str
+    text: str
+
+
+class _Rules:
+    """Compiled word lists."""
+
+    def __init__(self) -> None:
+        lists = tomllib.loads(WORDS.read_text(encoding="utf-8"))
+        names = lists["names"]
+        classes, endings = "|".join(names["classes"]), "|".join(names["class_endings"])
+        self.class_name = re.compile(rf"_?(?:{classes}|\w+(?:{endings}))")
+        self.verbs = frozenset(names["verbs"])
+        self.constants = frozenset(names["constants"])
+        self.arguments = frozenset(names["arguments"])
+        self.variables = frozenset(names["variables"])
+        self.opening = re.compile(rf"(?:{'|'.join(lists['docstrings']['openings'])})\b")
+        self.phrases = {name: re.compile(pattern) for name, pattern in lists["phrases"].items()}
+
+    def names(self, node: ast.AST) -> Iterator[tuple[int, str, str]]:
+        """Yield line, rule and text of each name that a node introduces and a list contains."""
+        match node:
+            case ast.ClassDef(name=name) if self.class_name.fullmatch(name):
+                yield node.lineno, "class", name
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
+                bare = name.strip("_")
+                if bare in self.verbs or bare.split("_")[0] in self.verbs:
+                    yield node.lineno, "function", name
+            case ast.arg(arg=name) if name in self.arguments:
+                yield node.lineno, "argument", name
+            case ast.Name(id=name, ctx=ast.Store()) if name in self.variables:
+                yield node.lineno, "variable", name
+
+    def sentences(self, line: int, text: str) -> Iterator[tuple[int, str, str]]:
+        """Yield line, rule and surroundings of each phrase in a text."""
+        for rule, pattern in self.phrases.items():
+            for hit in pattern.finditer(text):
+                yield line, rule, text[max(0, hit.start() - CONTEXT) : hit.end() + CONTEXT].strip()
+
+
+@cache
+def _rules() -> _Rules:
+    return _Rules()
+
+
+def places_in_python(source: str) -> Iterator[tuple[int, str, str]]:
+    """Yield line, rule and text of each place in Python source."""
+    rules, tree = _rules(), ast.parse(source)
+    for statement in tree.body:
+        targets = (
+            statement.targets
+            if isinstance(statement, ast.Assign)
+            else [statement.target]
+            if isinstance(statement, ast.AnnAssign)
+            else []
+        )
+        for target in targets:
+            if isinstance(target, ast.Name) and target.id.strip("_") in rules.constants:
+                yield statement.lineno, "constant", target.id
+    for node in ast.walk(tree):
+        yield from rules.names(node)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            summary = " ".join(node.value.value.split("\n\n")[0].split())
+            if rules.opening.match(summary):
+                yield node.lineno, "docstring", summary[: 2 * CONTEXT]
+            yield from rules.sentences(node.lineno, " ".join(node.value.value.split()))
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield from rules.sentences(token.start[0], token.string.lstrip("# "))
+        elif token.type == tokenize.STRING and " " in token.string and not token.string.startswith(('"""', "r", "b")):
+            yield from rules.sentences(token.start[0], token.string)
+
+
+def places_in_guide(text: str) -> Iterator[tuple[int, str, str]]:
+    """Yield line, rule and text of each place in the prose of a Markdown page; code is left out."""
+    fenced = False
+    for number, line in enumerate(text.splitlines(), 1):
+        fenced ^= line.lstrip().startswith("```")
+        if not fenced and not line.startswith("    "):
+            yield from _rules().sentences(number, re.sub(r"`[^`]*`|\[([^]]*)\]\([^)]*\)", r"\1", line))
+
+
+def places(file: str) -> list[Place]:
+    """Return the places of a file, given relative to the checkout."""
+    text = (ROOT / file).read_text(encoding="utf-8")
+    look = places_in_guide if file.endswith(".md") else places_in_python
+    return [Place(file, *place) for place in look(text)]
+
+
+def files() -> list[str]:
+    """Return the files to check: source, tools and guides."""
+    listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", "*.py", "*.md"],
+                            cwd=ROOT, capture_output=True, text=True, check=True)  # fmt: skip
+    return sorted(file for file in listed.stdout.split() if not file.startswith("tests/") and (ROOT / file).exists())
+
+
+def room(file: str) -> str:
+    """Return the room of a source file, such as service/trirail/wire, or a guide itself."""
+    if file.endswith(".md"):
+        return file
+    *folders, _ = file.split("/")
+    return "/".join(folders[: 1 if folders[0] == "tools" else 3])
+
+
+def counts() -> Counter[str]:
+    """Return the number of places in each room and guide."""
+    found: Counter[str] = Counter()
+    for file in files():
+        found[room(file)] += len(places(file))
+    return found
+
+
+def ceilings() -> dict[str, int]:
+    """Return the maximum number of places of each room and guide; 0 for a room that is not listed."""
+    ceiling: dict[str, int] = tomllib.loads(CEILINGS.read_text(encoding="utf-8"))["ceilings"]
+    return ceiling
+
+
+def lowered() -> str:
+    """Return the text of the ceilings, each lowered to today's count."""
+    old = ceilings() if CEILINGS.exists() else {}
+    rows = [f'"{name}" = {min(count, old.get(name, count))}' for name, count in sorted(counts().items()) if count]
+    return (
+        "# Places that tools/plain_language.py finds: the counts may only fall.\n[ceilings]\n" + "\n".join(rows) + "\n"
+    )
+
+
+def main() -> int:
+    """Print the requested list or counts, or lower the ceilings."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("paths", nargs="*", help="folders and files of which each place is listed")
+    parser.add_argument("--lower", action="store_true", help="lower the ceilings to today's counts")
+    options = parser.parse_args()
+    if options.lower:
+        CEILINGS.write_text(lowered(), encoding="utf-8")
+        return 0
+    if options.paths:
+        for file in files():
+            if any(file == path or file.startswith(path.rstrip("/") + "/") for path in options.paths):
+                for place in places(file):
+                    print(f"{place.file}:{place.line}: {place.rule}: {place.text}")
+        return 0
+    allowed, total = ceilings(), 0
+    for name, count in sorted(counts().items(), key=lambda row: -row[1]):
+        total += count
+        if count or allowed.get(name):
+            print(f"{count:6} of {allowed.get(name, 0):6} {name}")
+    print(f"{total:6} places")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
