@@ -485,6 +485,7 @@ def test_every_kind_of_goal(shared: tuple[Service, Robot, zenoh.Session], tmp_pa
     robot.override(100.0)
 
 
+@pytest.mark.alone
 def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Service) -> None:
     """Puts, which have no answer: faster than the loop plans them; then a stop. Each has its ending, in order."""
     ids = [f"f{k}" for k in range(900)]
@@ -516,7 +517,7 @@ def test_a_flood_of_goals_ends_one_by_one_and_a_stop_overtakes_it(service: Servi
     assert [event.seq for event in heard] == list(range(1, len(heard) + 1))
     outcomes = [(event.id, event.outcome) for event in heard if event.outcome]
     assert [name for name, _ in outcomes] == ids
-    assert {outcome for _, outcome in outcomes[:-1]} <= {"preempted", "stopped"}
+    assert {outcome for _, outcome in outcomes[:-1]} <= {"done", "preempted", "stopped"}  # done: the next came late
     assert outcomes[-1][1] == "stopped"
     assert service.end() == 0, service.log.read_text()
     assert_stopped_smoothly(service.frames())
@@ -773,6 +774,7 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
     assert "trirail: recorder: nothing is recorded: " in service.log.read_text()
 
 
+@pytest.mark.alone
 def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Service) -> None:
     """Its folder has gone, so that every restart fails; when that is back, so is the recording."""
     folder, aside = service.folder / "recordings", service.folder / "aside"
@@ -783,7 +785,7 @@ def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Serv
         folder.write_bytes(b"")
         os.kill(service.child("recorder"), signal.SIGKILL)
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
-        service.wait_said("the recorder has died (exit code 78): the robot is not affected; starting it again in 10 s")
+        service.wait_said("the recorder has died (exit code 78): the robot is not affected; starting it again")
         folder.unlink()
         assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         said = (event.message for event in robot.events(history=True, timeout=WITHIN) if "record" in event.message)

@@ -142,6 +142,7 @@ def test_a_jog_lasts_while_the_key_is_held(service: Service, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_camera_is_followed(service: Service, tmp_path: Path) -> None:
     with Robot("demo", service.locator) as robot:
         robot.enable()
