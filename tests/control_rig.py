@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -55,6 +55,16 @@ class PerfectDrives:
         self._state = OFF
         self._due = position, position
         self._position = position
+        self.outputs: list[int] = [0, 0, 0]
+        """Output words that were set last."""
+        self.inputs = (0, 0, 0)
+        """Input words that the drives report."""
+
+    path_outputs = (True, True, True)
+
+    def set_outputs(self, words: Sequence[int]) -> None:
+        """Take output words."""
+        self.outputs = list(words)
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """Do nothing: there is nothing to set up."""
@@ -65,7 +75,7 @@ class PerfectDrives:
 
     def read(self) -> Feedback:
         """Tell where the sliders are."""
-        return Feedback(self._position, self._state, None)
+        return Feedback(self._position, self._state, None, inputs=self.inputs)
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """Take setpoints, as from the next SYNC on."""

@@ -114,6 +114,7 @@ class Feedback(NamedTuple):
     unready: UnreadyDrives = (None, None, None)
     """Reason for which each drive cannot be reset yet; None if it is configured. A drive without a position since the
     start is reported at its zero, and as not homed."""
+    inputs: tuple[int, int, int] = (0, 0, 0)
 
 
 class DriveGroup(Protocol):

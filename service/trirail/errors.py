@@ -185,6 +185,16 @@ class RefusalCode(StrEnum):
         "the jog or track is over: not renewed in time, paused, stopped or refused",
         "start a new one",
     )
+    BAD_MARK = (
+        "bad_mark",
+        "a mark is not on the goal's path, its switches come too fast, or its output cannot switch on a path",
+        "move the mark onto the path, or lower the speed",
+    )
+    UNKNOWN_OUTPUT = (
+        "unknown_output",
+        "no output or input of that name in the configuration",
+        "use one of those in info",
+    )
     WRONG_TIME = (
         "wrong_time",
         "the time of a track's target is too old, or too far ahead",

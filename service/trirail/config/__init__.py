@@ -1,5 +1,6 @@
 """Configuration files: keys (`tables`), loading (`loading`), and checks (`impossible`, `explained`)."""
 
+from trirail.config.digital import Input, Output
 from trirail.config.explained import Mistake, overlap, wrong_values
 from trirail.config.impossible import check_as_built
 from trirail.config.loading import SIM, Findings, everything, load, parse, toml_tables
@@ -34,6 +35,8 @@ __all__ = [
     "Config",
     "ControlTable",
     "Findings",
+    "Input",
+    "Output",
     "FramesTable",
     "GeometryTable",
     "InPosition",

@@ -10,6 +10,7 @@ from typing import Annotated, Literal, cast
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct, structs
+from trirail.config.digital import Input, Output
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
 from trirail_drivers.interface import NAMES, Triple
 
@@ -344,6 +345,8 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
     """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. Taught poses are not here; the
     service stores them."""
+    outputs: dict[str, Output] = {}
+    inputs: dict[str, Input] = {}
 
     @property
     def period(self) -> float:

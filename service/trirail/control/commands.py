@@ -13,6 +13,7 @@ from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter, LeaseChange
 from trirail.control.ledger import Ledger
 from trirail.control.modes import Action, ModeEvent
+from trirail.control.outputs import Outputs
 from trirail.control.plan_requests import PlanRequests
 from trirail.control.setpoints import Setpoints
 from trirail.control.transitions import Transitions
@@ -111,6 +112,7 @@ class Commands:
         planner: PlanRequests,
         measured: Measured,
         setpoints: Setpoints,
+        outputs: Outputs,
     ) -> None:
         self._modes = modes
         self._lease = lease
@@ -119,6 +121,7 @@ class Commands:
         self._planner = planner
         self._measured = measured
         self._setpoints = setpoints
+        self._outputs = outputs
         self._can_home = any(drive.homing is not None for drive in config.drives.each)
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
@@ -178,6 +181,14 @@ class Commands:
         text = coded(words, EventCode.OVERRIDE, percent=request.content.percent, user=request.user)
         self._ledger.notices.append(Notice("service", "info", text.text, user=request.user, **text.fields))
 
+    def _set_output(self, request: CommandRequest) -> None:
+        """Set an output from the next setpoints on."""
+        name, value = request.content.output, request.content.value
+        self._outputs.set(name, value, self._modes.state.mode)
+        words = f"output {name} {'on' if value else 'off'} by {request.user}"
+        text = coded(words, EventCode.OUTPUT_SET, output=name, value=float(value), user=request.user)
+        self._ledger.notices.append(Notice("output", "info", text.text, user=request.user, **text.fields))
+
     def _acquire(self, request: CommandRequest) -> None:
         """Give a user the lease, or renew it."""
         change = self._lease.acquire(request.user, request.content, self._modes.cycle)
@@ -219,6 +230,7 @@ EFFECTS: dict[Command, Effect] = {
     Command.PAUSE: Effect(standing),
     Command.RESUME: Effect(at_once),
     Command.OVERRIDE: Effect(at_once, Commands._override),
+    Command.SET_OUTPUT: Effect(at_once, Commands._set_output),
     Command.ACQUIRE: Effect(at_once, Commands._acquire),
     Command.RELEASE: Effect(standing, Commands._release),
 }

@@ -21,6 +21,7 @@ from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger
 from trirail.control.modes import ModeEvent, ModeState
+from trirail.control.outputs import Outputs
 from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.returning_drives import ReturningDrives
 from trirail.control.setpoints import Setpoints
@@ -78,10 +79,11 @@ class Control:
         self._period = self.period = config.period
         self.schedule = Schedule(rest(ZERO_RATES), config.period)
         self._planner = PlanRequests(config, planner, self.schedule)
-        self.ledger = Ledger()
+        self.outputs = Outputs(config.outputs, config.inputs, config.period)
+        self.ledger = Ledger(self._goal_ended)
         frames, queue = NamedFrames(config.frames), config.motion.queue
         self.lease = LeaseArbiter(config.control.lease, config.period)
-        self.goal_queue = GoalQueue(self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period)
+        self.goal_queue = GoalQueue(self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period, self.outputs)
         legs, step_length = robot.packed(), config.limits.slider.fastest * config.period
         self._following_error_limit = config.limits.slider.following_error
         taken = reserve_for_backlash(config.correction.backlash, config.limits.slider)
@@ -97,11 +99,13 @@ class Control:
         )
         self._commands = Commands(
             *(config, self.modes, self.lease, self.ledger),
-            *(self.goal_queue, self._planner, self.measured, self.setpoints),
+            *(self.goal_queue, self._planner, self.measured, self.setpoints, self.outputs),
         )
         self._returning = ReturningDrives(robot.labels, config.limits.in_position.sliders)
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._found = 0
+        self._concluding = False
+        """Whether the setpoints of the present cycle have been sent."""
 
     @property
     def cycles(self) -> int:
@@ -121,10 +125,11 @@ class Control:
     def calm(self) -> Calm | None:
         """Return the state for cycles in which nothing happens; None while something needs to be done."""
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
-        follows = mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
+        follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         if stopped_now or self.ledger.busy or mode in (Mode.ENABLING, Mode.HOMING):
             return None
+        self.outputs.follow_mode(mode)
         if len(runs) > 1 or (mode is Mode.STOPPING and not runs):
             return None
         run = runs[0] if runs and not follows else None
@@ -136,6 +141,11 @@ class Control:
             until = min(until, goal.alive_until)
         held = mode not in (Mode.DISABLED, Mode.FAULT)
         return Calm(run, follows, held, self._stands, found, until, settling.ends)
+
+    @property
+    def _follows(self) -> bool:
+        """Whether setpoints follow the measured sliders."""
+        return self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
 
     def _waits(self, run: Run | None) -> bool:
         """Whether a motion has ended and its goal waits."""
@@ -187,6 +197,7 @@ class Control:
                 self._check_solved(code)
         except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
             self._trip_for(error)
+        self._switch_outputs()
         mark(Part.KINEMATICS)
         self.write()
         mark(Part.WRITE)
@@ -199,6 +210,8 @@ class Control:
 
     def start(self, feedback: Feedback) -> None:
         """Take the measured sliders for the commanded ones, before the first cycle."""
+        if self.outputs.any:
+            self.outputs.allow_paths(self._drives.path_outputs)
         self.measured.start(feedback)
         self.setpoints.start()
         self._follow_measured()
@@ -214,6 +227,7 @@ class Control:
         if behind is None:
             behind = self.measured.update(feedback, self._stands)
         self._tell_warnings(feedback)
+        self._tell_edges(before, feedback)
         mode = self.state.mode
         if feedback.fault is not None:
             drive, cause, code, message = feedback.fault
@@ -249,7 +263,7 @@ class Control:
         All of that is one compiled call.
         """
         run = self.schedule.begin_cycle()
-        if self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed:
+        if self._follows:
             self._found = 0
             self._follow_measured()
             return
@@ -263,6 +277,42 @@ class Control:
         if refused := self.setpoints.refusal(self._found):
             self.modes.trip(coded(refused, EventCode.BAD_SETPOINT), FaultCause.LIMIT)
 
+    def _switch_outputs(self) -> None:
+        """Switch the outputs that are due with the setpoints of this cycle."""
+        if not self.outputs.any:
+            return
+        self.outputs.follow_mode(self.state.mode)
+        run = self.schedule.runs[0] if self.schedule.runs and not self._follows else None
+        time, record = run.time if run is not None else 0.0, self.measured.record
+        self.outputs.step(run, time, self.schedule.version, self.modes.cycle, record)
+        record["outputs"] = self.outputs.words
+        self._drives.set_outputs(self.outputs.words.tolist())
+
+    def _goal_ended(self, goal: str, outcome: Outcome) -> None:
+        """Close what a goal has open, and report its switches before its end is."""
+        self.outputs.close(goal, outcome, self.modes.cycle + self._concluding, self.measured.record)
+        self._report_switches(all_=True)
+
+    def _report_switches(self, *, all_: bool = False) -> None:
+        for switches in self.outputs.take_switches(self.modes.cycle, all_=all_):
+            goal, number = switches[-1].goal, len(switches)
+            text = coded(f"{number} outputs switched", EventCode.OUTPUTS_SWITCHED, goal=goal, number=number)
+            self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
+
+    def _tell_edges(self, before: Feedback, now: Feedback) -> None:
+        """Report the inputs that have changed; stop the goal that is to end at such an edge."""
+        goal, pose = self.ledger.goal, self.measured.pose
+        x, y, phi = pose
+        for name, value in self.outputs.edges(before.inputs, now.inputs):
+            words = f"input {name} {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi {phi:.5f} rad"
+            text = coded(words, EventCode.INPUT_CHANGED, input=name, value=float(value), x=x, y=y, phi=phi)
+            self.ledger.notices.append(Notice("input", "info", text.text, **text.fields))
+            if goal is not None and goal.stop_at is not None and self.state.mode is Mode.MOVING:
+                edge = "rising" if value else "falling"
+                if (goal.stop_at.input, goal.stop_at.edge) == (name, edge):
+                    reached = coded(f"input {name} {edge}", EventCode.INPUT_REACHED, input=name, x=x, y=y, phi=phi)
+                    self.modes.go(ModeEvent.INPUT_EDGE, reached)
+
     def write(self) -> None:
         """Send the setpoints."""
         self._drives.write(*self.setpoints.sent)
@@ -274,6 +324,7 @@ class Control:
 
         Commands that are carried out are answered.
         """
+        self._concluding = True
         try:
             schedule, found = self.schedule, self._found
             if found and schedule.runs:
@@ -285,8 +336,10 @@ class Control:
             if found and moves and schedule.runs and schedule.runs[0].at_rest:
                 self._stand(schedule.runs[0])
             self._commands.settle()
+            self._report_switches()
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
+        self._concluding = False
         self.modes.cycle += 1
 
     def decide(self, given: Iterable[Given]) -> None:

@@ -145,6 +145,7 @@ class Measured:
             *feedback.homed,
             feedback.homing,
         )
+        self.record["inputs"] = feedback.inputs
 
     def _recorded(self, field: str) -> Triple:
         x, y, z = self.record[field][0].tolist()

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger, Withdrawal
+from trirail.control.outputs import Outputs
 from trirail.control.plan_requests import PlanRequests
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.goal_motion import PoseSource
@@ -51,6 +52,7 @@ class GoalQueue:
         frames: NamedFrames,
         queue: int,
         period: float,
+        outputs: Outputs,
     ) -> None:
         self._ledger = ledger
         self._lease = lease
@@ -59,6 +61,7 @@ class GoalQueue:
         self._frames = frames
         self._queue = queue
         self._period = period
+        self._outputs = outputs
         self._waiting: deque[_Sent] = deque()
         self._served: dict[str, int] = {}
         """Turn of each user's last goal, counted since the queue was last idle."""
@@ -202,7 +205,10 @@ class GoalQueue:
         if blend is not None and len(ledger.goals) > self._queue:
             text = f"{self._queue} goals are waiting already (motion.queue): send it when one has ended"
             raise RefusedError(RefusalCode.QUEUE_FULL, text, value=len(ledger.goals), limit=self._queue)
-        self._planner.plan(planned, blend)
+        self._outputs.check_marks(planned.marks)
+        if planned.stop_at is not None:
+            self._outputs.check_input(planned.stop_at.input)
+        self._planner.plan(planned, blend, request.id)
 
     def _timed(self, planned: Goal, sent: _Sent, cycle: int) -> Goal:
         """Return a goal with its time in the schedule's count. Raises RefusedError where that is too far from now.

@@ -15,6 +15,7 @@ from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goals import Goal
+from trirail.wire.marks import StopAt
 from trirail.wire.messages import REMEMBERED_IDS, GoalReply, Level, Notice, Outcome
 from trirail.wire.packets import (
     Accepted,
@@ -56,6 +57,8 @@ class ActiveGoal(NamedTuple):
     """Whether it is done only when the robot is in position."""
     target: Triple | None = None
     """Last reported pose of a track's target."""
+    stop_at: StopAt | None = None
+    """Edge of an input at which it ends."""
     lag: float | None = None
     """Last lag of a track: trirail.wire.messages.GoalReply."""
 
@@ -83,7 +86,9 @@ class _Ended(NamedTuple):
 class Ledger:
     """Goals and commands under way; outgoing messages wait in `answers` and `notices`."""
 
-    def __init__(self) -> None:
+    def __init__(self, on_end: Callable[[str, Outcome], None] = lambda _goal, _outcome: None) -> None:
+        """`on_end` is called with the id and outcome of each goal that ends, before that is announced."""
+        self._on_end = on_end
         self.goals: deque[ActiveGoal] = deque()
         """Goal that the robot is moving to, and the queued ones."""
         self.answers: list[Answer] = []
@@ -144,7 +149,7 @@ class Ledger:
         passes = at_end and last is not None and last.blend is not None and goal.follows
         if not taken.reply.queued and not passes:
             self.end("preempted", coded(f"preempted by goal {request.id}", EventCode.PREEMPTED, goal=request.id))
-        begun = ActiveGoal(request.id, request.user, type(goal), goal.blend, expires, alive_until, settles=goal.settle)
+        begun = ActiveGoal(request.id, request.user, type(goal), goal.blend, expires, alive_until, settles=goal.settle, stop_at=goal.stop_at)
         self.goals.append(begun)
         if passes:
             self.pass_on()
@@ -249,6 +254,7 @@ class Ledger:
     ) -> None:
         if goal_id in self._ended:  # by the same event, which also withdraws its renewals
             return
+        self._on_end(goal_id, outcome)
         level = _LEVELS.get(outcome, "info")
         self._ended[goal_id] = _Ended(user, kind, outcome, reason.text, bound)
         if len(self._ended) > REMEMBERED_IDS:

@@ -21,6 +21,7 @@ class ModeEvent(Enum):
     PAUSE = auto()
     RESUME = auto()
     NOT_RENEWED = auto()  # the jog or the track is no longer renewed
+    INPUT_EDGE = auto()  # an input has changed at which the goal under way is to end
     HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
     HOMED = auto()  # all drives know their position, and follow setpoints again
@@ -154,6 +155,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.STOP: Step(STOPPING, Action.BRAKE),
         ModeEvent.PAUSE: Step(PAUSING, Action.BRAKE),
         ModeEvent.NOT_RENEWED: Step(RELEASING, Action.BRAKE),
+        ModeEvent.INPUT_EDGE: Step(RELEASING, Action.BRAKE),
         ModeEvent.HOME: _MOVING,
         ModeEvent.ARRIVED: Step(HOLDING),
         ModeEvent.GATEWAY_LOST: Step(STOPPING, Action.BRAKE),

@@ -19,6 +19,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.backlash_reserve import planned_limits
 from trirail.motion.feasibility import Checker
 from trirail.motion.limits import Bounds
+from trirail.motion.marks import GoalMarks
 from trirail.motion.motion_planner import revision
 from trirail.motion.packing import pack_run, unpack_law, unpack_path, unpack_run
 from trirail.motion.paths import Path, constant_law
@@ -79,6 +80,7 @@ class PlanRequests:
         self._schedule = schedule
         self._leads = [max(LEAST_LEAD, math.ceil(lead / self._period)) for lead in LEADS]
         self._goal: Goal | None = None
+        self._goal_id = ""
         self._blend: float | None = None
         self._number = 0
         self._asked: PlanRequest | None = None
@@ -134,8 +136,12 @@ class PlanRequests:
         nowhere.replace_runs(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant_law(1.0), 1.0)))]))
         RateChange(self._scaling, nowhere, 0.0, self._period).step()
 
-    def plan(self, goal: Goal, blend: float | None = None) -> None:
-        """Have a goal planned: to preempt the motion under way, or to follow it from within `blend` [m] of its end."""
+    def plan(self, goal: Goal, blend: float | None = None, name: str = "") -> None:
+        """Have a goal planned: to preempt the motion under way, or to follow it from within `blend` [m] of its end.
+
+        `name` is its id.
+        """
+        self._goal_id = name
         self._goal, self._blend, self._times, self._since = goal, blend, 0, None
         self._asked = self._answer = self._lost = None
 
@@ -255,6 +261,7 @@ class PlanRequests:
         if planned.first is not None and schedule.cycle < planned.first:
             return None  # it waits for its time
         run = unpack_run(self._legs, planned.run)
+        run.marks.append(self._marks(planned.switches))
         runs = deque([run])
         if planned.reply.stops_first and schedule.runs:
             runs.appendleft(self._stopping(schedule.runs[0], planned))
@@ -273,6 +280,7 @@ class PlanRequests:
         """Return the motion under way, stopping, with no goal on its path."""
         run = under_way.copy()
         run.seams.clear()
+        run.marks.clear()
         if planned.stop is not None:
             run.change_law(unpack_law(planned.stop), 0.0)
         return run
@@ -292,6 +300,10 @@ class PlanRequests:
             state = rest(run.state(run.end_time - run.time, state.pose).pose)
         return True
 
+    def _marks(self, switches: bytes) -> GoalMarks:
+        """Return the marks of the planned goal. Raises ValueError where the switches are not those of its marks."""
+        return GoalMarks(self._goal_id, self._goal.marks if self._goal is not None else (), switches)
+
     def _extend(self, extended: Extended) -> AcceptedPlan | None:
         schedule = self._schedule
         path = unpack_path(extended.path, 3)
@@ -303,7 +315,7 @@ class PlanRequests:
         ):
             self._asked = None
             return None
-        schedule.append(extended.s, path)
+        schedule.append(extended.s, path, self._marks(extended.switches))
         return AcceptedPlan(extended.reply.with_duration(schedule.remaining if run.target else math.inf))
 
 

@@ -76,6 +76,8 @@ class Transitions:
         """First reason since the last reset."""
         self.entered = 0
         """Cycle in which the mode was entered."""
+        self._edge: EventText | None = None
+        """Edge of an input at which the goal under way ends."""
         self.orders = 0
         """Number of orders sent to the drives."""
 
@@ -93,6 +95,8 @@ class Transitions:
         if isinstance(decided, Refusal):
             return
         self._act(decided)
+        if event is ModeEvent.INPUT_EDGE:
+            self._edge = reason
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
             self.entered = self.cycle
@@ -103,7 +107,9 @@ class Transitions:
             self._schedule.stop_on_path()  # also where it brakes already: no goal begins on the way
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = EventCode.RELEASED if before.released else EventCode.ARRIVED
-            self._ledger.end(outcome, coded(arrived.value, arrived) if outcome == "done" else reason)
+            at_end = self._edge if before.released and self._edge is not None else coded(arrived.value, arrived)
+            self._ledger.end(outcome, at_end if outcome == "done" else reason)
+            self._edge = None
         if self.state.mode is not before.mode:
             begun = goal.id if goal is not None else None
             words = f"{self.state.mode}: {reason}"

@@ -11,11 +11,13 @@ from collections import deque
 from collections.abc import Callable
 
 import msgspec
+from msgspec import structs
 
 from trirail.config import Config, corrected_geometry
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.backlash_reserve import planned_limits
 from trirail.motion.goal_planner import MOTIONS, Extension, GoalPlanner, PlannedMotion
+from trirail.motion.marks import place_marks
 from trirail.motion.packing import pack_path, pack_run, unpack_run
 from trirail.motion.runs import MotionState
 from trirail.motion.schedule import Schedule
@@ -49,16 +51,23 @@ class MotionPlanner:
             words = f"internal error in planning, please report it: {error!r}"
             return _refusal(request, RefusedError(RefusalCode.INTERNAL, words))
         number, version = request.number, request.version
+        try:
+            path = decided.path if isinstance(decided, Extension) else decided.run.path
+            placed = place_marks(request.goal.marks, path, self._legs, request.commanded[0], self._period)
+        except RefusedError as refusal:
+            return _refusal(request, refusal)
+        reply, switches = structs.replace(decided.reply, marks=placed.marks), placed.switches.tobytes()
         if isinstance(decided, Extension):
-            return Extended(number, version, decided.s, pack_path(decided.path), decided.reply)
+            return Extended(number, version, decided.s, pack_path(decided.path), reply, switches)
         return Planned(
             number,
             version,
             decided.first,
             pack_run(decided.run),
-            decided.reply,
+            reply,
             pack_path(decided.stop) if decided.stop is not None else None,
             decided.bound,
+            switches,
         )
 
     def warm_up(self) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from ruckig import Trajectory
 
 from trirail.kinematics.arrays import Array
+from trirail.motion.marks import GoalMarks
 from trirail.motion.paths import (
     CENTRE_TOOLS,
     LAST_PIECE_S,
@@ -99,6 +100,8 @@ class Run:
         self.furthest = np.full(1, -np.inf)
         """Greatest time along the path that was commanded, (1,) [s]; it never falls."""
         self.seams: deque[Seam] = deque()
+        self.marks: deque[GoalMarks] = deque()
+        """Marks of the goals on the path, in their order, from the goal under way on; empty where no goal has any."""
         self._begun = 0.0
         self._goal_span = GoalSpan(0.0, 0.0, 0.0)
         self._span_law: Path | None = None
@@ -177,11 +180,17 @@ class Run:
         other = Run(self._legs, self.path, self.law, self.target)
         other.time, other.seams, other._begun = self.time, self.seams.copy(), self._begun
         other.furthest[:] = self.furthest
+        other.marks = self.marks.copy()
         return other
 
-    def append(self, s: float, path: Path) -> None:
-        """Continue from a time along the path with another path, which begins in the same state of motion."""
+    def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
+        """Continue from a time along the path with another path, which begins in the same state of motion.
+
+        Marks of the goals before that are behind `s` are cut off, unless the new goal is dropped again.
+        """
         longer = joined([cut(self.path, s), path])
+        self.marks.append(marks or GoalMarks())
+        self.marks[-1].begin = s
         self.seams.append(Seam(s, self.path))
         self.path = longer
 
@@ -190,12 +199,16 @@ class Run:
         self.path = self.seams[number].before
         while len(self.seams) > number:
             self.seams.pop()
+            if self.marks:
+                self.marks.pop()
 
     def pass_seams(self) -> int:
         """Remove the seams that are passed; return their number, that of the goals that ended."""
         s, passed = self.law_state.s, 0
         while self.seams and s >= self.seams[0].s:
             self._begun = self.seams.popleft().s
+            if self.marks:
+                self.marks.popleft()
             passed += 1
         return passed
 

@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 
+from trirail.motion.marks import GoalMarks
 from trirail.motion.paths import Path
 from trirail.motion.runs import MotionState, Run
 
@@ -64,9 +65,9 @@ class Schedule:
         self.runs = runs
         self.version += 1
 
-    def append(self, s: float, path: Path) -> None:
+    def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
         """Continue from a time along the last path with another path: Run.append."""
-        self.runs[-1].append(s, path)
+        self.runs[-1].append(s, path, marks)
         self.version += 1
 
     def drop(self, number: int) -> None:
@@ -85,6 +86,7 @@ class Schedule:
             self.runs.pop()
         for run in self.runs:
             run.seams.clear()
+            run.marks.clear()
         self.version += 1
 
     def advance(self) -> int:

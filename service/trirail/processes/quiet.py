@@ -19,7 +19,7 @@ from numba import f8, from_dtype, i8, types, u1, u8
 from numpy.typing import NDArray
 from trirail_drivers.driver.cyclic import MOST_FRAMES
 
-from trirail.control import cycle
+from trirail.control import cycle, outputs
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.processes.clock import DOORS, SPARE_NS, called, now_ns, sleep, wait
@@ -108,6 +108,8 @@ STATE = np.dtype(
         ("arrived", "<i8"),  # frames that have been received; Python must check those behind
         ("error", "<i8"),  # of receiving frames: a number of errno.h
         ("sent", "<i8"),  # setpoints that the bus has accepted
+        ("logged", "<i8"),  # rows in the log of switches, and the cycle behind which they are reported
+        ("report_due", "<i8"),
     ],
     align=True,
 )
@@ -169,6 +171,7 @@ def _receive(
         *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
         *(cycle.MONITORED, cycle.RECORD, u1[::1]),
         *(cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
+        *(outputs.OUTPUTS, outputs.PLAN, i8[::1], outputs.LOG),
     ),
     releases=True,
 )
@@ -210,12 +213,17 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     law_knots: Array,
     law_pieces: Array,
     furthest: Array,
+    switches: NDArray[np.void],
+    planned: NDArray[np.void],
+    words: NDArray[np.int64],
+    log: NDArray[np.void],
 ) -> int:
     """Run cycles; return the stage that the newest has reached: Reached.
 
     `moment` (2,) is room for a struct timespec, `bus` (3,) a BusAccess, `doors` (n, 2) an array for poll, the
     gateway's first, `hearts` the counters of trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made`
-    (SIZE,) the bytes of `record`. All else as in control.cycle and cycle_frames.
+    (SIZE,) the bytes of `record`; `switches`, `planned`, `words` and `log` are those of control.outputs.switch. All else
+    as in control.cycle and cycle_frames.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
@@ -291,6 +299,14 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         late = _now_ns(state, moment) / 1e9 - s.synced > s.period
         if code >> 2 != 0 or late or not set_frames(setpoints, axes, sliders[0]):
             return Reached.SOLVED
+        if len(switches):
+            s.logged = outputs.switch(
+                *(switches, planned, words, log, s.logged, law_knots, law_pieces, s.source == COMMAND),
+                *(s.time, s.period, s.cycle + 1, record),
+            )
+            s.called |= s.logged > outputs.LOG_ENOUGH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
+            for i in range(3):
+                axes[i].outputs = row.outputs[i] = words[i]
         _mark(state, moment, Part.KINEMATICS)
 
         s.sent = send_frames(bus, departures, setpoints, times)

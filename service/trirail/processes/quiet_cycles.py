@@ -112,6 +112,7 @@ class QuietCycles:
         state["batched"] = self._reports.batched
         state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
         state["listens"] = listens
+        state["logged"], state["report_due"] = control.outputs.logged, control.outputs.report_due
         self._doors.refresh()
         reached = Reached(quiet.run(*self._tables, *self._motion))
         left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
@@ -119,6 +120,7 @@ class QuietCycles:
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
+        control.outputs.logged = left["logged"]
         decides = bool(left["called"]) and reached in (Reached.WRITTEN, Reached.DONE)
         called = decides or reached is Reached.CALLED
         self._decided = self._decided or called or once
@@ -194,4 +196,7 @@ class QuietCycles:
         """Return the compiled call's arguments for a motion."""
         path, law = (run.path, run.law) if run is not None else (_NOWHERE, _UNMOVED)
         furthest = run.furthest if run is not None else self._nothing
-        return path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest
+        outputs = self._control.outputs
+        outputs.prepare(run, self._control.schedule.version)
+        switches = outputs.state, outputs.planned, outputs.words, outputs.log
+        return path.knots, path.pieces, path.tools, law.knots, law.pieces, furthest, *switches

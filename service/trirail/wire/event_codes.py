@@ -69,6 +69,12 @@ class EventCode(StrEnum):
     POSITION_UNKNOWN = "position_unknown", "a slider must be homed again", "slider"
     SLIDER_MOVED = "slider_moved", "a slider moved while its drive was off", "slider", "position_before", "position"
 
+    # Outputs and inputs.
+    OUTPUT_SET = "output_set", "a user has set an output", "output", "value", "user"
+    OUTPUTS_SWITCHED = "outputs_switched", "outputs have switched on the path of a goal", "goal", "number"
+    INPUT_CHANGED = "input_changed", "an input has changed", "input", "value", "x", "y", "phi"
+    INPUT_REACHED = "input_reached", "an input has changed at which the goal was to end", "input", "x", "y", "phi"
+
     # Poses and alignments.
     POSE_TAUGHT = "pose_taught", "a pose was taught", "pose", "user", "x", "y", "phi"
     POSE_REMOVED = "pose_removed", "a taught pose was removed", "pose", "user"

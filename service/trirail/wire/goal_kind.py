@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar, Self
 from msgspec import Meta, Struct, structs
 from trirail_drivers.interface import Triple
 
+from trirail.wire.marks import Mark, StopAt
 from trirail.wire.sizes import MAX_NAME
 from trirail.wire.text import ID_RULE, is_id, quoted
 
@@ -127,6 +128,16 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
     @property
     def blend(self) -> float | None:
         """How far from its end the next goal may begin [m]; None where that preempts it."""
+        return None
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """Places on its path at which outputs switch."""
+        return ()
+
+    @property
+    def stop_at(self) -> StopAt | None:
+        """Edge of an input at which it ends."""
         return None
 
     @property

@@ -15,6 +15,7 @@ from trirail_drivers.interface import Triple
 from trirail.errors import RefusalCode
 from trirail.wire.event_codes import EventCode, Params
 from trirail.wire.looks import AlignmentLook
+from trirail.wire.marks import PlacedMark, Switch
 
 Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"]
@@ -41,6 +42,8 @@ class GoalReply(Struct, frozen=True):
     lag: float | None = None
     """Of a track: how far a point of the platform was at most from where the target had it, when this was taken up
     [m]."""
+    marks: tuple[PlacedMark, ...] = ()
+    """Where each mark of the goal will switch first."""
     accepted: Literal[True] = True
 
     def with_duration(self, duration: float) -> GoalReply:
@@ -107,9 +110,10 @@ class FaultDetail(Struct, frozen=True, omit_defaults=True):
 class Notice(Struct, frozen=True, omit_defaults=True):
     """Something to tell everyone, before it is numbered as an event."""
 
-    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "alignment", "service"]
+    kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "alignment", "output", "input", "service"]
     """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
-    removed, a new holder of the lease, a look of an alignment, the service itself."""
+    removed, a new holder of the lease, a look of an alignment, outputs that have switched, the edge of an input, the
+    service itself."""
     level: Level
     """How much it matters to people."""
     message: str
@@ -153,10 +157,13 @@ class Notice(Struct, frozen=True, omit_defaults=True):
     None from a service older than these codes."""
     params: Params = {}
     """Values in the message, by the names that the event code has; SI units and radians."""
+    marks: tuple[Switch, ...] = ()
+    """Switches on the path of a goal, with kind output, in the order in which they happened."""
 
     def event(self, seq: int, t: float, cycle: int, time: float) -> Event:
         """Return it with its number and time."""
-        return Event(**structs.asdict(self), seq=seq, t=t, cycle=cycle, time=time)
+        marks = tuple(structs.replace(switch, time=time - (t - switch.t)) for switch in self.marks)
+        return Event(**structs.asdict(structs.replace(self, marks=marks)), seq=seq, t=t, cycle=cycle, time=time)
 
 
 class Event(Notice, frozen=True, omit_defaults=True, kw_only=True):

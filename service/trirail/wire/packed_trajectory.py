@@ -14,6 +14,7 @@ from trirail_drivers.interface import Triple
 
 from trirail.wire.goal_kind import GoalKind, check_fields
 from trirail.wire.kinds.trajectory import TrajectoryGoal, TrajectoryPoint, check_times
+from trirail.wire.marks import Mark, StopAt
 from trirail.wire.sizes import MAX_PART
 
 COLUMNS = 10
@@ -32,6 +33,8 @@ class PackedTrajectory(GoalKind, frozen=True, tag="packed trajectory"):
     stretch: bool = False
     settle: bool = True
     valid_for: float | None = None
+    marks: tuple[Mark, ...] = ()
+    stop_at: StopAt | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -54,7 +57,9 @@ class PackedTrajectory(GoalKind, frozen=True, tag="packed trajectory"):
     def unpacked(self) -> TrajectoryGoal:
         """Return it as a client has it."""
         points = tuple(TrajectoryPoint(t, *pose, *derivatives) for t, pose, *derivatives in self.points)
-        return TrajectoryGoal(points, self.id, self.stretch, self.settle, self.valid_for)
+        return TrajectoryGoal(
+            points, self.id, self.stretch, self.settle, self.valid_for, marks=self.marks, stop_at=self.stop_at
+        )
 
 
 def packed(goal: TrajectoryGoal) -> PackedTrajectory:
@@ -62,7 +67,9 @@ def packed(goal: TrajectoryGoal) -> PackedTrajectory:
     rows = array("d")
     for p in goal.points:
         rows.extend((p.t, p.x, p.y, p.phi, *(p.velocity or _NONE), *(p.acceleration or _NONE)))
-    return PackedTrajectory(rows.tobytes(), goal.id, goal.stretch, goal.settle, goal.valid_for)
+    return PackedTrajectory(
+        rows.tobytes(), goal.id, goal.stretch, goal.settle, goal.valid_for, goal.marks, goal.stop_at
+    )
 
 
 def joined(parts: Sequence[PackedTrajectory]) -> PackedTrajectory:

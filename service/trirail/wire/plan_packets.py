@@ -77,6 +77,8 @@ class Planned(Struct, frozen=True, tag=True):
     """The law of that stop; None where the law that the motion under way has is the one to stand by."""
     bound: str | None = None
     """The limit before which a jog comes to rest, or beyond which a track's target is."""
+    switches: bytes = b""
+    """Planned switches of outputs, of trirail.motion.marks.SWITCH; their times count from the start of the path."""
 
 
 class Extended(Struct, frozen=True, tag=True):
@@ -89,6 +91,8 @@ class Extended(Struct, frozen=True, tag=True):
     path: PackedPath
     reply: GoalReply
     """As in Planned; the loop adds the duration as well."""
+    switches: bytes = b""
+    """As in Planned."""
 
 
 class NotPlanned(Struct, frozen=True, tag=True):

@@ -63,9 +63,11 @@ FIELDS: tuple[tuple[str, str, int], ...] = (
     ("following_error", "d", 3),  # setpoint due at this SYNC less measured position [m]
     ("progress", "d", 1),  # of the running goal, 0 to 1
     ("remaining", "d", 1),  # of the running goal [s]
+    ("outputs", "I", 3),  # wanted output words of the drives A, B, C, from this cycle's setpoints on
+    ("inputs", "I", 3),  # input words of the drives A, B, C
 )
 
-_NUMPY = {"q": "<i8", "i": "<i4", "B": "u1", "d": "<f8"}
+_NUMPY = {"q": "<i8", "i": "<i4", "I": "<u4", "B": "u1", "d": "<f8"}
 DTYPE: np.dtype[Any] = np.dtype(
     [(name, _NUMPY[code], (n,) if n > 1 else ()) for name, code, n in FIELDS],
     align=True,  # as compiled code likes to read and write it

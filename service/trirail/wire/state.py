@@ -160,6 +160,10 @@ class State(Struct, frozen=True):
     certificate expires soon, or that nothing is recorded, or no CAN frames, and why."""
     lease: str | None = None
     """The user who holds the lease: his goals and commands alone move the robot; None where nobody does."""
+    outputs: dict[str, bool] = {}
+    """Value of each output of the configuration, from the newest setpoints on."""
+    inputs: dict[str, bool] = {}
+    """Newest value of each input of the configuration."""
 
 
 SUMMARY_BYTES = 300
@@ -251,6 +255,10 @@ class Info(Struct, frozen=True):
     """Key [geometry] kind of the configuration, which says what the keys of its legs are."""
     labels: tuple[str, str, str] = ("A", "B", "C")
     """What people call the sliders A, B, C: key [geometry] labels of the configuration."""
+    outputs: tuple[str, ...] = ()
+    """Names of the outputs of the configuration."""
+    inputs: tuple[str, ...] = ()
+    """Names of the inputs of the configuration."""
     takeover: str = Role.MAINTAINER.value
     """A trirail.wire.vocabulary.Role, the least that may take the lease over: key [control] takeover of the
     configuration."""

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 from msgspec import Meta, Struct
 
 from trirail.wire.goal_kind import Identifier, check_fields
+from trirail.wire.marks import OutputName
 
 
 class Mode(StrEnum):
@@ -130,6 +131,17 @@ class ReleaseLease(CommandContent, frozen=True):
     """As in its acquire; without it the user's own, whichever that is."""
 
 
+class SetOutput(CommandContent, frozen=True):
+    """The content of the command set_output: an output, and its new value."""
+
+    words = '{"output": name, "value": true or false}'
+    optional = False
+
+    output: OutputName
+    """Name of an output of the configuration."""
+    value: bool
+
+
 class NoContent(CommandContent, frozen=True):
     """The content of the other commands."""
 
@@ -187,6 +199,7 @@ class Command(StrEnum):
         Role.OPERATOR,
         Override,
     )
+    SET_OUTPUT = _CommandRow("set_output", "Set a digital output of a drive.", Role.OPERATOR, SetOutput)
     ACQUIRE = _CommandRow(
         "acquire",
         "Take the lease, or keep it: only its holder moves the robot; everybody may stop and disable it.",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from trirail.wire.goal_kind import AxesFrame, Blend, Coordinate, GoalKind, GoalLimits, OwnId, Speed, ToolPoint, ValidFor
+from trirail.wire.marks import Marks, StopAtEdge
 
 
 class MoveGoal(GoalKind, frozen=True, tag="move", rename={"origin": "from"}):
@@ -29,3 +30,5 @@ class MoveGoal(GoalKind, frozen=True, tag="move", rename={"origin": "from"}):
     valid_for: ValidFor = None
     limits: GoalLimits = None
     blend: Blend = None
+    marks: Marks = ()
+    stop_at: StopAtEdge = None

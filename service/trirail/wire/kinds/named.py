@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from trirail.wire.goal_kind import Blend, GoalKind, GoalLimits, OwnId, PoseName, Speed, ValidFor
+from trirail.wire.marks import Marks, StopAtEdge
 
 
 class NamedGoal(GoalKind, frozen=True, tag="named"):
@@ -15,3 +16,5 @@ class NamedGoal(GoalKind, frozen=True, tag="named"):
     valid_for: ValidFor = None
     limits: GoalLimits = None
     blend: Blend = None
+    marks: Marks = ()
+    stop_at: StopAtEdge = None

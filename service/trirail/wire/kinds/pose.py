@@ -14,6 +14,7 @@ from trirail.wire.goal_kind import (
     ToolPoint,
     ValidFor,
 )
+from trirail.wire.marks import Marks, StopAtEdge
 
 
 class PoseGoal(GoalKind, frozen=True, tag="pose"):
@@ -34,9 +35,11 @@ class PoseGoal(GoalKind, frozen=True, tag="pose"):
     blend: Blend = None
     tool: ToolPoint = None
     frame: PoseFrame = "base"
+    marks: Marks = ()
+    stop_at: StopAtEdge = None
 
 
 def pose_in_place_of(goal: GoalKind, x: float, y: float, phi: float, tool: Tool | None = None) -> PoseGoal:
     """Return the pose that a goal means which says it in other words; all that they have in common is the same."""
-    same = {name: getattr(goal, name) for name in ("id", "speed", "valid_for", "limits", "blend")}
+    same = {name: getattr(goal, name) for name in ("id", "speed", "valid_for", "limits", "blend", "marks", "stop_at")}
     return PoseGoal(x, y, phi, tool=tool, **same)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from trirail.wire.goal_kind import Coordinates, GoalKind, OwnId, Speed, ValidFor
+from trirail.wire.marks import Marks, StopAtEdge
 
 
 class SlidersGoal(GoalKind, frozen=True, tag="sliders"):
@@ -13,3 +14,5 @@ class SlidersGoal(GoalKind, frozen=True, tag="sliders"):
     id: OwnId = None
     speed: Speed = 1.0
     valid_for: ValidFor = None
+    marks: Marks = ()
+    stop_at: StopAtEdge = None

@@ -17,6 +17,7 @@ from trirail.wire.goal_kind import (
     ValidFor,
     check_fields,
 )
+from trirail.wire.marks import Marks, StopAtEdge
 from trirail.wire.sizes import MAX_PART, MAX_POINTS
 
 SHORTEST_PIECE = 1e-4
@@ -77,6 +78,8 @@ class TrajectoryGoal(GoalKind, frozen=True, tag="trajectory"):
     part: TrajectoryPart | None = None
     """Number of this message if the points are sent in several, each with the same `id` and options. Each is answered
     as the whole goal is."""
+    marks: Marks = ()
+    stop_at: StopAtEdge = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -1,0 +1,374 @@
+"""Digital outputs: their values, and the marks at which they switch while a goal's path is run.
+
+A switch belongs to the cycle whose setpoints are nearest to its mark on the commanded path; the drives take up both at
+the same SYNC. So its error is half a cycle at most. The commanded path is known ahead: with the delay of an output, the
+place is taken that will be commanded when the delay has passed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numba import b1, f8, from_dtype, i8
+from numpy.typing import NDArray
+from trirail_drivers.interface import NAMES
+
+from trirail.config import Input, Output
+from trirail.errors import RefusalCode, RefusedError
+from trirail.kinematics.arrays import Array
+from trirail.kinematics.compiled import compiled
+from trirail.motion.marks import GoalMarks
+from trirail.motion.paths import law_at
+from trirail.motion.runs import Run
+from trirail.wire.marks import Mark, Switch
+from trirail.wire.messages import Outcome
+from trirail.wire.records import DTYPE
+from trirail.wire.vocabulary import Mode
+
+OUTPUT: Final = np.dtype(
+    [
+        ("axis", "<i8"),
+        ("bit", "<i8"),  # its bit in the drive's word, as a mask
+        ("delay", "<f8"),  # delay of the device that is switched [s]
+        ("next", "<i8"),  # its next planned switch in the table, and the end of its part of the table
+        ("end", "<i8"),
+        ("goal", "<i8"),  # number of the goal whose pulse or stretch has it open; 0 for none
+        ("mark", "<i8"),  # the mark of that
+        ("opened", "<i8"),  # the value that it has meanwhile
+        ("until", "<i8"),  # cycle in which a pulse ends; 0 for none
+    ],
+    align=True,
+)
+"""State of an output."""
+PLANNED: Final = np.dtype(
+    [
+        ("s", "<f8"),  # time along the path [s]
+        ("on", "<i8"),
+        ("cycles", "<i8"),  # duration of a pulse; 0 for a value that stays
+        ("opens", "<i8"),  # whether another switch, or the end of a pulse, closes it
+        ("goal", "<i8"),
+        ("mark", "<i8"),
+    ],
+    align=True,
+)
+"""A switch to come, in a table that is sorted by output and time along the path."""
+SWITCHED: Final = np.dtype(
+    [
+        ("cycle", "<i8"),
+        ("output", "<i8"),
+        ("on", "<i8"),
+        ("goal", "<i8"),
+        ("mark", "<i8"),
+        ("closed", "<i8"),
+        ("commanded", "<f8", 3),
+        ("measured", "<f8", 3),
+    ],
+    align=True,
+)
+"""A switch that has happened."""
+LOG_LENGTH = 512
+"""Room for switches until Python reads them."""
+LOG_ENOUGH = 128
+"""Switches after which Python is called."""
+TABLE_DELAY = 0.1
+"""Time after which switches are reported that do not fill a message [s]."""
+TABLE_LENGTH = 50
+"""Switches in one message."""
+
+OUTPUTS, PLAN, LOG = from_dtype(OUTPUT)[::1], from_dtype(PLANNED)[::1], from_dtype(SWITCHED)[::1]
+RECORDS = from_dtype(DTYPE)[::1]
+
+
+@compiled()
+def _set(words: NDArray[np.int64], output: NDArray[np.void], on: int) -> None:
+    """Set an output's bit in the word of its drive."""
+    if on:
+        words[output.axis] |= output.bit  # type: ignore[attr-defined]
+    else:
+        words[output.axis] &= ~output.bit  # type: ignore[attr-defined]
+
+
+@compiled()
+def _note(
+    log: NDArray[np.void], number: int, cycle: int, output: int, on: int, goal: int, mark: int, record: NDArray[np.void]
+) -> int:
+    """Append a switch to the log; return the number of its rows. A full log keeps its first rows."""
+    if number < len(log):
+        row = log[number]
+        row.cycle, row.output, row.on, row.goal, row.mark, row.closed = cycle, output, on, goal, mark, 0
+        row.commanded[:] = record[0].commanded_pose
+        row.measured[:] = record[0].pose
+    return min(number + 1, len(log))
+
+
+@compiled(i8(OUTPUTS, PLAN, i8[::1], LOG, i8, f8[::1], f8[:, :, ::1], b1, f8, f8, i8, RECORDS))
+def switch(
+    outputs: NDArray[np.void],
+    planned: NDArray[np.void],
+    words: NDArray[np.int64],
+    log: NDArray[np.void],
+    number: int,
+    law_knots: Array,
+    law_pieces: Array,
+    moves: bool,
+    time: float,
+    period: float,
+    cycle: int,
+    record: NDArray[np.void],
+) -> int:
+    """Switch the outputs that are due in a cycle; return the number of rows in the log.
+
+    Parameters
+    ----------
+    outputs, planned
+        State of the outputs, and table of their planned switches.
+    words : (3,)
+        Wanted values of the drives' output words.
+    log, number
+        Room for the switches that happen, and the number of its rows in use.
+    law_knots, law_pieces, moves, time
+        Law of the motion under way, whether there is one, and the time of the law in this cycle [s].
+    period, cycle
+        Period [s] and number of the cycle.
+    record
+        The cycle's record, with the commanded and measured pose.
+    """
+    for k in range(len(outputs)):
+        output = outputs[k]
+        if output.until != 0 and cycle >= output.until:
+            _set(words, output, 1 - output.opened)
+            number = _note(log, number, cycle, k, 1 - output.opened, output.goal, output.mark, record)
+            output.until, output.goal = 0, 0
+        if not moves or output.next >= output.end:
+            continue
+        # The nearer of two setpoints takes the switch: one whose mark is before the middle between this one and the
+        # next. The law tells both, also while it brakes; nothing that a later decision changes is farther than that.
+        here = law_at(law_knots, law_pieces, time + output.delay)[0]
+        there = law_at(law_knots, law_pieces, time + period + output.delay)[0]
+        while output.next < output.end and planned[output.next].s <= (here + there) / 2.0:
+            due = planned[output.next]
+            _set(words, output, due.on)
+            number = _note(log, number, cycle, k, due.on, due.goal, due.mark, record)
+            output.until = cycle + due.cycles if due.cycles else 0
+            output.goal, output.mark, output.opened = (due.goal if due.opens else 0), due.mark, due.on
+            output.next += 1
+    return number
+
+
+class Outputs:
+    """Outputs and inputs of a robot, by their names in the configuration."""
+
+    def __init__(self, outputs: Mapping[str, Output], inputs: Mapping[str, Input], period: float) -> None:
+        self._named = dict(outputs)
+        self._names = tuple(outputs)
+        self._inputs = {name: (NAMES.index(each.drive), 1 << each.bit) for name, each in inputs.items()}
+        self._period = period
+        self._path_allowed = (True, True, True)
+        self.words = np.zeros(3, np.int64)
+        """Wanted values of the drives' output words, (3,)."""
+        self.state = np.zeros(len(self._names), OUTPUT)
+        self.planned = np.zeros(0, PLANNED)
+        self.log = np.zeros(LOG_LENGTH, SWITCHED)
+        self.logged = 0
+        """Rows of the log in use."""
+        for row, output in zip(self.state, self._named.values(), strict=True):
+            row["axis"], row["bit"], row["delay"] = NAMES.index(output.drive), 1 << output.bit, output.delay
+        self.make_safe()
+        self._goals: dict[str, int] = {}
+        """Numbers of goals in the tables, by their ids; 0 is none."""
+        self._number = 0
+        self._over: set[str] = set()
+        """Goals that have ended, whose last switches are not reported."""
+        self._table: list[GoalMarks] = []
+        """Goals whose switches are in the table."""
+        self._built_for: tuple[Run | None, int, int] = (None, -1, 0)
+        self._first = [0] * len(self._names)
+        """First row of the table for each output."""
+        self._safe_in: Mode | None = None
+        self._reported = 0
+        """Cycle of the newest report."""
+
+    @property
+    def any(self) -> bool:
+        """Whether there are outputs."""
+        return bool(self._names)
+
+    def allow_paths(self, allowed: tuple[bool, bool, bool]) -> None:
+        """Note of which drives outputs may switch on a path: of those that take them with a setpoint."""
+        self._path_allowed = allowed
+
+    # ------------------------------------------------------------------ values
+
+    def values(self) -> dict[str, bool]:
+        """Return the wanted value of each output."""
+        words = self.words.tolist()
+        return {name: bool(words[row["axis"]] & int(row["bit"])) for name, row in zip(self._names, self.state, strict=True)}
+
+    def set(self, name: str, value: bool, mode: Mode) -> None:
+        """Set an output now. Raises RefusedError for an unknown one, and where the mode does not allow it."""
+        output = self._find(name)
+        if mode in (Mode.DISABLED, Mode.FAULT) and not output.always:
+            code = RefusalCode.FAULT if mode is Mode.FAULT else RefusalCode.NOT_ENABLED
+            safe = "on" if output.safe else "off"
+            raise RefusedError(
+                code,
+                f"output {name!r} stays {safe}, its safe value, while the robot is {'in ' * (mode is Mode.FAULT)}{mode}: "
+                "send enable first, or set always = true in its section of the configuration",
+            )
+        row = self.state[self._names.index(name)]
+        row["until"] = row["goal"] = 0
+        self._write(self._names.index(name), value)
+
+    def follow_mode(self, mode: Mode) -> None:
+        """Set all outputs to their safe values where the robot has become disabled, or is in fault."""
+        if mode is not self._safe_in:
+            self._safe_in = mode
+            if mode in (Mode.DISABLED, Mode.FAULT):
+                self.make_safe()
+
+    def make_safe(self) -> None:
+        """Set all outputs to their safe values; planned switches are over."""
+        self.state["until"] = self.state["goal"] = 0
+        for number, output in enumerate(self._named.values()):
+            self._write(number, output.safe)
+
+    def _write(self, number: int, value: bool) -> None:
+        axis, bit = int(self.state[number]["axis"]), int(self.state[number]["bit"])
+        self.words[axis] = self.words[axis] | bit if value else self.words[axis] & ~bit
+
+    def _find(self, name: str) -> Output:
+        if name not in self._named:
+            known = f"the robot has {', '.join(self._names)}" if self._names else "the configuration has no [outputs]"
+            raise RefusedError(RefusalCode.UNKNOWN_OUTPUT, f"there is no output {name!r}: {known}")
+        return self._named[name]
+
+    # ------------------------------------------------------------------ inputs
+
+    def input_values(self, words: Sequence[int]) -> dict[str, bool]:
+        """Return the value of each input, from the drives' words."""
+        return {name: bool(words[axis] & bit) for name, (axis, bit) in self._inputs.items()}
+
+    def edges(self, before: Sequence[int], now: Sequence[int]) -> list[tuple[str, bool]]:
+        """Return the inputs that have changed between two readings of the drives' words, with their new values."""
+        return [
+            (name, bool(now[axis] & bit)) for name, (axis, bit) in self._inputs.items() if (before[axis] ^ now[axis]) & bit
+        ]
+
+    def check_input(self, name: str) -> None:
+        """Raise RefusedError for an unknown input."""
+        if name not in self._inputs:
+            known = f"the robot has {', '.join(self._inputs)}" if self._inputs else "the configuration has no [inputs]"
+            raise RefusedError(RefusalCode.UNKNOWN_OUTPUT, f"there is no input {name!r}: {known}")
+
+    # ------------------------------------------------------------------ marks
+
+    def check_marks(self, marks: Sequence[Mark]) -> None:
+        """Raise RefusedError for a mark of an unknown output, or of one that cannot switch on a path."""
+        for mark in marks:
+            drive = self._find(mark.output).drive
+            if not self._path_allowed[NAMES.index(drive)]:
+                raise RefusedError(
+                    RefusalCode.BAD_MARK,
+                    f"output {mark.output!r} cannot switch on a path: drive {drive} takes 60FEh by SDO only, not with a "
+                    "setpoint; use set_output, or an output of another drive",
+                )
+
+    def prepare(self, run: Run | None, version: int) -> None:
+        """Make the table of planned switches for a motion, if it is not that already."""
+        goals = list(run.marks) if run is not None else []
+        key = run, version, len(goals)
+        if key == self._built_for:
+            return
+        self._built_for = key
+        self._note_passed()
+        ends = [seam.s for seam in run.seams] if run is not None else []
+        self._table = [goal for goal in goals if goal.has_switches]
+        limits = dict(zip(map(id, goals), [*ends, math.inf], strict=False))
+        rows: list[tuple[float, int, int, bool, int, int]] = []
+        for number, name in enumerate(self._names):
+            row = self.state[number]
+            row["next"] = len(rows)
+            for goal in self._table:
+                for s, on, width, opens, mark in goal.pending(name, limits[id(goal)]):
+                    cycles = 0 if math.isnan(width) else max(1, round(width / self._period))
+                    rows.append((s, on, cycles, opens, self._number_of(goal.goal), mark))
+            row["end"] = len(rows)
+        self._first = self.state["next"].tolist()
+        self.planned = np.array(rows, PLANNED)
+
+    def _number_of(self, goal: str) -> int:
+        if goal not in self._goals:
+            self._number += 1
+            self._goals[goal] = self._number
+        return self._goals[goal]
+
+    def _note_passed(self) -> None:
+        """Note for each goal of the table which of its switches have happened."""
+        for number, name in enumerate(self._names):
+            passed = self.planned["goal"][self._first[number] : int(self.state[number]["next"])]
+            for goal in (goal for goal in self._table if goal.goal in self._goals):
+                goal.note_passed(name, int(np.count_nonzero(passed == self._number_of(goal.goal))))
+
+    def step(self, run: Run | None, time: float, version: int, cycle: int, record: NDArray[np.void]) -> None:
+        """Switch what is due in a cycle."""
+        if not self._names:
+            return
+        self.prepare(run, version)
+        knots, pieces = (run.law.knots, run.law.pieces) if run is not None else (_NO_LAW_KNOTS, _NO_LAW_PIECES)
+        self.logged = switch(
+            *(self.state, self.planned, self.words, self.log, self.logged, knots, pieces),
+            *(run is not None, time, self._period, cycle, record),
+        )
+
+    @property
+    def report_due(self) -> int:
+        """Cycle behind which switches are reported."""
+        return self._reported + math.ceil(TABLE_DELAY / self._period)
+
+    def close(self, goal: str, outcome: Outcome, cycle: int, record: NDArray[np.void]) -> None:
+        """Switch back what a goal has open at its end; the pulses of one that is done last as long as they should."""
+        if goal not in self._goals:
+            return
+        number = self._goals[goal]
+        self._over.add(goal)
+        for k, row in enumerate(self.state):
+            if row["goal"] != number or (outcome == "done" and row["until"]):
+                continue
+            value = not row["opened"]
+            self._write(k, value)
+            if self.logged < len(self.log):
+                pose, measured = record[0]["commanded_pose"], record[0]["pose"]
+                self.log[self.logged] = cycle, k, value, number, row["mark"], 1, pose, measured
+                self.logged += 1
+            row["goal"] = row["until"] = 0
+
+    def take_switches(self, cycle: int, *, all_: bool = False) -> list[tuple[Switch, ...]]:
+        """Return the switches to report now, in tables for one message each, without their wall clock."""
+        due = all_ or self.logged >= TABLE_LENGTH or (cycle - self._reported) * self._period >= TABLE_DELAY
+        if self.logged and not due:
+            return []
+        self._reported = cycle
+        rows, self.logged = self.log[: self.logged], 0
+        names = {number: goal for goal, number in self._goals.items()}
+        switches = [
+            Switch(
+                names[int(row["goal"])],
+                int(row["mark"]),
+                self._names[int(row["output"])],
+                bool(row["on"]),
+                int(row["cycle"]),
+                int(row["cycle"]) * self._period,
+                math.nan,
+                tuple(row["commanded"].tolist()),
+                tuple(row["measured"].tolist()),
+                bool(row["closed"]),
+            )
+            for row in rows
+        ]
+        for goal in self._over:
+            del self._goals[goal]
+        self._over.clear()
+        return [tuple(switches[k : k + TABLE_LENGTH]) for k in range(0, len(switches), TABLE_LENGTH)]

@@ -1,0 +1,293 @@
+"""Places of marks: the times along a planned path at which outputs switch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail.errors import RefusalCode, RefusedError
+from trirail.kinematics.arrays import Array
+from trirail.motion.paths import Path, constant_law, path_motion, platform_at_law_time
+from trirail.wire.marks import Mark, PlacedMark
+
+SWITCH: Final = np.dtype([("s", "<f8"), ("width", "<f8"), ("mark", "<i4"), ("on", "<i4")], align=True)
+"""A switch: time along the path [s], duration of the pulse [s] (NaN for a value that stays), index of the mark in its
+goal, and the new value."""
+MAX_SWITCHES = 10_000
+"""Switches of one goal."""
+SAMPLES = 24
+"""Samples per piece of a path, between which its length is integrated."""
+BISECTIONS = 50
+"""Bisection steps after which an interval between samples is narrower than the resolution of a float."""
+LEAST_LENGTH = 1e-9
+"""Length below which a tool does not travel [m]."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
+
+
+class Placed(NamedTuple):
+    """Marks of a goal on its path."""
+
+    switches: NDArray[np.void]
+    """(n,) of SWITCH, by rising time along the path."""
+    marks: tuple[PlacedMark, ...]
+
+
+def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[float], period: float) -> Placed:
+    """Return where the marks of a goal lie on its path.
+
+    Parameters
+    ----------
+    marks
+        The goal's marks.
+    path
+        The goal's path alone.
+    legs
+        Geometry.packed(), for a path in slider space.
+    start
+        Pose of the platform's centre at the start of the path: x, y [m], phi [rad].
+    period
+        Period of the cycle [s].
+
+    Raises
+    ------
+    RefusedError
+        A mark is not on the path, or switches would follow each other within two cycles.
+
+    """
+    if not marks:
+        return Placed(np.zeros(0, SWITCH), ())
+    trace = _Trace(path, legs, start)
+    rows: list[tuple[float, float, int, int]] = []
+    placed = []
+    for number, mark in enumerate(marks):
+        own = list(_switches(number, mark, trace))
+        if len(rows) + len(own) > MAX_SWITCHES:
+            raise _refusal(number, mark, f"has {len(own):,} switches; a goal has {MAX_SWITCHES:,} at most")
+        rows += own
+        s = own[0][0]
+        pose = trace.pose_at(s)
+        switched = sum(on == mark.value for *_, on in own)
+        placed.append(
+            PlacedMark(number, mark.output, mark.value, pose, float(trace.lengths_at(np.array([s]))[0]), s, switched)
+        )
+    switches = np.array(rows, SWITCH)
+    switches = switches[np.argsort(switches["s"], kind="stable")]
+    _check_spacing(switches, marks, period)
+    return Placed(switches, tuple(placed))
+
+
+class GoalMarks:
+    """Marks of a goal on the path of a run, and which of its switches have happened."""
+
+    def __init__(self, goal: str = "", marks: Sequence[Mark] = (), switches: bytes = b"") -> None:
+        """`switches`: packed rows of SWITCH. Raises ValueError where they are not of these marks."""
+        self.goal = goal
+        """Id of the goal."""
+        self.begin = 0.0
+        """Time along the path of the run at which the path of the goal begins [s]."""
+        self._marks = tuple(marks)
+        self._rows = np.frombuffer(switches, SWITCH)
+        self._passed = np.zeros(len(self._rows), np.bool)
+        if not (np.isfinite(self._rows["s"]).all() and np.all(self._rows["mark"] < len(self._marks))):
+            raise ValueError(f"switches that do not belong to the {len(self._marks)} marks of goal {goal!r}")
+
+    @property
+    def has_switches(self) -> bool:
+        """Whether the goal has marks."""
+        return len(self._rows) > 0
+
+    def pending(self, output: str, end: float) -> Iterator[tuple[float, int, float, bool, int]]:
+        """Yield the switches of an output that have not happened, before the time `end` along the path of the run.
+
+        Each has its time along that path [s], its value, the duration of its pulse [s] (NaN for none), whether it
+        opens what closes again, and the index of its mark.
+        """
+        for k in self._of(output):
+            s, width, mark, on = self._rows[k].tolist()
+            if self.begin + s <= end:
+                opens = self._marks[mark].closes and bool(on) == self._marks[mark].value
+                yield self.begin + s, on, width, opens, mark
+
+    def note_passed(self, output: str, number: int) -> None:
+        """Note that a number of switches of an output have happened, besides those noted before."""
+        self._passed[self._of(output)[:number]] = True
+
+    def _of(self, output: str) -> NDArray[np.int64]:
+        named = np.array([mark.output == output for mark in self._marks], np.bool)
+        return np.flatnonzero(~self._passed & named[self._rows["mark"]]) if len(self._rows) else np.zeros(0, np.int64)
+
+
+class _Trace:
+    """Path of a tool: lengths and coordinates by the time along it."""
+
+    def __init__(self, path: Path, legs: Array, start: Sequence[float]) -> None:
+        self._path, self._legs = path, legs
+        self._near = np.array(start, dtype=np.float64)
+        shares = np.linspace(0.0, 1.0, SAMPLES, endpoint=False)
+        spans = np.diff(path.knots)
+        self.times = np.append((path.knots[:-1, None] + shares * spans[:, None]).ravel(), path.duration)
+        self.coordinates = self.states(self.times)[0]
+        self._lengths = np.append(0.0, np.cumsum(self._integrate(self.times[:-1], self.times[1:])))
+
+    @property
+    def duration(self) -> float:
+        return self._path.duration
+
+    @property
+    def length(self) -> float:
+        return float(self._lengths[-1])
+
+    def states(self, times: Array) -> tuple[Array, Array]:
+        """Return coordinates of the tool (n, 3), x, y [m], phi [rad], and their velocities at full speed."""
+        if self._path.in_sliders:
+            return self._platform_states(times)
+        knots, pieces = self._path.knots, self._path.pieces
+        piece = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(pieces) - 1)
+        t = np.clip(times, knots[0], knots[-1]) - knots[piece]
+        powers = t[:, None] ** np.arange(6.0)
+        slopes = np.arange(1.0, 6.0) * powers[:, :5]
+        p = pieces[piece]
+        return np.einsum("nij,nj->ni", p, powers), np.einsum("nij,nj->ni", p[:, :, 1:], slopes)
+
+    def _platform_states(self, times: Array) -> tuple[Array, Array]:
+        law = constant_law(1.0)
+        out, near = np.zeros((3, 3)), self._near.copy()
+        states = np.zeros((2, len(times), 3))
+        for k in np.argsort(times, kind="stable"):  # each on the branch of the pose before it
+            if platform_at_law_time(self._legs, *self._path, law.knots, law.pieces, times[k], near, out):
+                raise RefusedError(RefusalCode.BAD_MARK, "the marks of a path through a singular pose have no place")
+            near[:] = out[0]
+            states[:, k] = out[:2]
+        return states[0], states[1]
+
+    def pose_at(self, s: float) -> tuple[float, float, float]:
+        """Return the pose of the platform's centre at a time along the path."""
+        if self._path.in_sliders:
+            x, y, phi = self._platform_states(np.array([s]))[0][0].tolist()
+        else:
+            motion = np.zeros((3, 3))
+            path_motion(self._path.knots, self._path.pieces, self._path.tools, s, motion)
+            x, y, phi = motion[0].tolist()
+        return x, y, phi
+
+    def _integrate(self, begins: Array, ends: Array) -> Array:
+        """Return the length of the tool's path between times, by Gauss' quadrature [m]."""
+        half = (ends - begins) / 2.0
+        times = (begins + half)[:, None] + half[:, None] * _NODES
+        velocities = self.states(times.ravel())[1]
+        return half * (np.hypot(velocities[:, 0], velocities[:, 1]).reshape(times.shape) @ _WEIGHTS)
+
+    def lengths_at(self, times: Array) -> Array:
+        """Return the length of the tool's path up to times along it [m]."""
+        k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+        lengths: Array = self._lengths[k] + self._integrate(self.times[k], times)
+        return lengths
+
+    def times_at(self, lengths: Array) -> Array:
+        """Return the times along the path at which the tool has travelled lengths [m]."""
+        k = np.clip(np.searchsorted(self._lengths, lengths, side="left") - 1, 0, len(self.times) - 2)
+        left, low, high = lengths - self._lengths[k], self.times[k].copy(), self.times[k + 1].copy()
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2.0
+            short = self._integrate(self.times[k], middle) < left
+            low, high = np.where(short, middle, low), np.where(short, high, middle)
+        return high
+
+    def crossing(self, coordinate: int, value: float) -> float | None:
+        """Return the time of the first crossing of a coordinate's value; None where there is none."""
+        offset = self.coordinates[:, coordinate] - value
+        if offset[0] == 0.0:
+            return 0.0
+        crossed = np.flatnonzero(np.sign(offset[1:]) != np.sign(offset[0]))
+        if not len(crossed):
+            return None
+        low, high = self.times[crossed[0]], self.times[crossed[0] + 1]
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2.0
+            beyond = np.sign(self.states(np.array([middle]))[0][0, coordinate] - value) != np.sign(offset[0])
+            low, high = (low, middle) if beyond else (middle, high)
+        return float(high)
+
+
+def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, float, int, int]]:
+    """Yield rows of SWITCH."""
+    width = mark.pulse_width if mark.pulse_width is not None else np.nan
+    if mark.start is None:
+        yield _time_of(number, mark, trace), width, number, int(mark.value)
+        return
+    end = mark.end if mark.end is not None else trace.length
+    for name, length in (("start", mark.start), ("end", end)):
+        _check_length(number, mark, name, length, trace.length)
+    if mark.increment is None:
+        begins, ends = trace.times_at(np.array([mark.start, end])).tolist()
+        yield begins, np.nan, number, int(mark.value)
+        yield ends, np.nan, number, int(not mark.value)
+        return
+    count = int((end - mark.start) / mark.increment * (1.0 + 1e-12)) + 1
+    if count > MAX_SWITCHES:
+        raise _refusal(number, mark, f"has {count:,} pulses; a goal has {MAX_SWITCHES:,} at most")
+    for s in trace.times_at(mark.start + mark.increment * np.arange(count)).tolist():
+        yield s, width, number, int(mark.value)
+
+
+def _time_of(number: int, mark: Mark, trace: _Trace) -> float:
+    """Return the time along the path of a mark that is one place."""
+    if mark.at is not None:
+        coordinate, value = mark.at.coordinate
+        s = trace.crossing(coordinate, value)
+        if s is None:
+            here = trace.coordinates[:, coordinate]
+            name = ("x", "y", "phi")[coordinate]
+            scale, unit = (1e3, "mm") if coordinate < 2 else (1.0, "rad")
+            text = (
+                f"is at {name} = {value * scale:g} {unit}; the path goes from {here.min() * scale:g} to "
+                f"{here.max() * scale:g} {unit}"
+            )
+            raise _refusal(number, mark, text)
+        return s
+    for name, time in (("after_start_s", mark.after_start_s), ("before_target_s", mark.before_target_s)):
+        if time is not None:
+            if time > trace.duration:
+                raise _refusal(number, mark, f"is at {name} = {time:g} s; the path takes {trace.duration:g} s")
+            return time if name == "after_start_s" else trace.duration - time
+    for name, length in (("after_start", mark.after_start), ("before_target", mark.before_target)):
+        if length is not None:
+            _check_length(number, mark, name, length, trace.length)
+            travelled = length if name == "after_start" else max(0.0, trace.length - length)
+            return float(trace.times_at(np.array([travelled]))[0])
+    share = mark.at_path_fraction or 0.0
+    if trace.length < LEAST_LENGTH:
+        raise _refusal(number, mark, "has a share of a path on which the tool does not travel: use after_start_s, or at")
+    return float(trace.times_at(np.array([share * trace.length]))[0])
+
+
+def _check_length(number: int, mark: Mark, name: str, length: float, whole: float) -> None:
+    if length > whole * (1.0 + 1e-9) + LEAST_LENGTH:
+        raise _refusal(number, mark, f"is at {name} = {length * 1e3:g} mm; the path has {whole * 1e3:g} mm")
+
+
+def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: float) -> None:
+    """Refuse switches of one output that full speed would bring into one cycle, or before a pulse has ended."""
+    for output in {mark.output for mark in marks}:
+        own = switches[[marks[number].output == output for number in switches["mark"]]]
+        if len(own) < 2:
+            continue
+        spacing = np.diff(own["s"])
+        needed = np.where(np.isnan(own["width"][:-1]), period, own["width"][:-1] + period)
+        k = int(np.argmin(spacing - needed))
+        if spacing[k] < needed[k]:
+            number = int(own["mark"][k + 1])
+            text = (
+                f"switches {spacing[k] * 1e3:.3g} ms after the switch before it; at full speed {needed[k] * 1e3:.3g} ms "
+                "is the least: lower the speed, or move the marks apart"
+            )
+            raise _refusal(number, marks[number], text, float(spacing[k]), float(needed[k]))
+
+
+def _refusal(
+    number: int, mark: Mark, text: str, value: float | None = None, limit: float | None = None
+) -> RefusedError:
+    return RefusedError(RefusalCode.BAD_MARK, f"mark {number} of output {mark.output!r} {text}", value=value, limit=limit)

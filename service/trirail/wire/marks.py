@@ -1,0 +1,168 @@
+"""Marks of a goal: where on its path an output switches, and the table of where it has switched. SI units, radians."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct
+from trirail_drivers.interface import Triple
+
+from trirail.wire.sizes import MAX_NAME
+
+Length = Annotated[float, Meta(ge=0.0, le=1e3)]
+Duration = Annotated[float, Meta(ge=0.0, le=86_400.0)]
+OutputName = Annotated[str, Meta(pattern=rf"^[A-Za-z][A-Za-z0-9_-]{{0,{MAX_NAME - 1}}}$")]
+PLACES = ("after_start", "after_start_s", "before_target", "before_target_s", "at_path_fraction", "at", "start")
+"""Fields that say where a mark is: a mark has exactly one of them."""
+
+
+class Crossing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Value of one coordinate at which a path is crossed for the first time."""
+
+    x: Annotated[float, Meta(ge=-1e3, le=1e3)] | None = None
+    """Coordinate of the tool in the base frame [m]."""
+    y: Annotated[float, Meta(ge=-1e3, le=1e3)] | None = None
+    """Coordinate of the tool in the base frame [m]."""
+    phi: Annotated[float, Meta(ge=-1e3, le=1e3)] | None = None
+    """Angle of the platform [rad]."""
+
+    def __post_init__(self) -> None:
+        if sum(value is not None for value in (self.x, self.y, self.phi)) != 1:
+            raise ValueError("at takes one coordinate: x, y or phi")
+
+    @property
+    def coordinate(self) -> tuple[int, float]:
+        """Index of the coordinate, 0 to 2 for x, y, phi, and its value [m] or [rad]."""
+        values = self.x, self.y, self.phi
+        return next((number, value) for number, value in enumerate(values) if value is not None)
+
+
+class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Place on a goal's path at which an output switches, or a stretch of the path on which it does so repeatedly.
+
+    Lengths are those of the path of the goal's tool; seconds are the path's own time, at full speed.
+    """
+
+    output: OutputName
+    """Name of an output of the configuration."""
+    value: bool = True
+    """Value to which it switches; of a repetition, the value of its pulses."""
+    after_start: Length | None = None
+    """Length of the path from its start [m]."""
+    after_start_s: Duration | None = None
+    """Time along the path from its start [s]."""
+    before_target: Length | None = None
+    """Length of the path that is left to its end [m]."""
+    before_target_s: Duration | None = None
+    """Time along the path that is left to its end [s]."""
+    at_path_fraction: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
+    """Share of the path's length."""
+    at: Crossing | None = None
+    """Value of one coordinate: the first crossing switches."""
+    start: Length | None = None
+    """Length of the path at which a repetition starts [m]."""
+    end: Length | None = None
+    """Length at which it ends [m]; the end of the path if absent."""
+    increment: Annotated[float, Meta(ge=1e-7, le=1e3)] | None = None
+    """Length from pulse to pulse [m]; without it, the output keeps `value` from `start` to `end`."""
+    pulse_width: Annotated[float, Meta(ge=1e-4, le=3600.0)] | None = None
+    """Duration after which a pulse ends [s], rounded to whole cycles; without it, the value stays."""
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            number = getattr(self, name)
+            if isinstance(number, float) and not math.isfinite(number):
+                raise ValueError(f"{name} is {number}: it must be a finite number")
+        given = [name for name in PLACES if getattr(self, name) is not None]
+        if len(given) != 1:
+            has = " and ".join(given) if given else "none"
+            raise ValueError(f"a mark of {self.output!r} has {has}: exactly one of {', '.join(PLACES)} is needed")
+        if self.start is None and (self.end is not None or self.increment is not None):
+            raise ValueError(f"a mark of {self.output!r} has an end or increment without a start")
+        if self.increment is not None and self.pulse_width is None:
+            raise ValueError(f"a repetition of {self.output!r} needs a pulse_width beside its increment")
+        if self.start is not None and self.increment is None and self.pulse_width is not None:
+            raise ValueError(f"a mark of {self.output!r} has a start and a pulse_width: it needs an increment too")
+        if self.start is not None and self.end is not None and self.end <= self.start:
+            raise ValueError(f"a repetition of {self.output!r} ends at {self.end:g} m: behind its start is right")
+
+    @property
+    def closes(self) -> bool:
+        """Whether the output returns by itself: a pulse, or the end of a stretch."""
+        return self.pulse_width is not None or self.start is not None
+
+
+Marks = Annotated[
+    tuple[Mark, ...],
+    Meta(max_length=100, description="places on the path at which outputs switch"),
+]
+
+
+class StopAt(Struct, frozen=True, forbid_unknown_fields=True):
+    """Edge of an input at which a goal ends: a controlled stop, and the goal is done."""
+
+    input: OutputName
+    """Name of an input of the configuration."""
+    edge: Literal["rising", "falling"] = "rising"
+    """Direction of the change."""
+
+
+StopAtEdge = Annotated[
+    StopAt | None,
+    Meta(description="edge of an input at which it ends, by a controlled stop"),
+]
+
+
+class PlacedMark(Struct, frozen=True, omit_defaults=True):
+    """Mark of an accepted goal, with the place at which it will switch first."""
+
+    mark: int
+    """Index of the mark in the goal."""
+    output: str
+    value: bool
+    pose: Triple
+    """Commanded pose of the platform there: x, y [m], phi [rad]."""
+    path: float
+    """Length of the tool's path from its start [m]."""
+    time: float
+    """Time along the path from its start, at full speed [s]."""
+    number: int = 1
+    """Number of switches to `value`."""
+
+
+class Switch(Struct, frozen=True, omit_defaults=True):
+    """An output that has switched on the path of a goal."""
+
+    goal: str
+    """Id of the goal."""
+    mark: int
+    """Index of the mark in the goal."""
+    output: str
+    value: bool
+    cycle: int
+    """Cycle whose setpoints, and the switch, the drives take up at the next SYNC."""
+    t: float
+    """Nominal time since the start of the loop [s], as in records."""
+    time: float
+    """Wall clock [s since 1970]."""
+    commanded: Triple
+    """Commanded pose in that cycle: x, y [m], phi [rad]."""
+    measured: Triple
+    """Pose measured in that cycle: x, y [m], phi [rad]."""
+    closed: bool = False
+    """Whether it was switched back because its goal had ended or stopped, not by a mark."""
+
+
+def switch_rows(switches: tuple[Switch, ...]) -> list[dict[str, Any]]:
+    """Return a table of switches with one number per column, for CSV, Parquet and data frames."""
+    rows = []
+    for switch in switches:
+        row: dict[str, Any] = {
+            name: getattr(switch, name) for name in ("goal", "mark", "output", "value", "cycle", "t", "time", "closed")
+        }
+        for kind in ("commanded", "measured"):
+            for name, value in zip(("x", "y", "phi"), getattr(switch, kind), strict=True):
+                row[f"{kind}_{name}"] = value
+        rows.append(row)
+    return rows

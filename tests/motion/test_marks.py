@@ -1,0 +1,162 @@
+"""Places of marks on planned paths, compared with an integration that shares nothing with theirs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from control_rig import CONFIG
+from numpy.typing import NDArray
+from trirail.config import SIM, corrected_geometry, load
+from trirail.errors import RefusalCode, RefusedError
+from trirail.kinematics.robot import inverse
+from trirail.motion.goal_planner import GoalPlanner
+from trirail.motion.marks import MAX_SWITCHES, GoalMarks, Placed, place_marks
+from trirail.motion.runs import ZERO_RATES, Run, rest
+from trirail.motion.schedule import Schedule
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal
+from trirail.wire.marks import Crossing, Mark
+
+ROBOTS = {"3-PRP": load(SIM), "3-PPR": load(SIM.with_name("uvw-ppr.toml"))}
+FINE = 20_000
+"""Samples of a path by which a test measures it."""
+
+
+def planned(kind: str, goal: Goal) -> Run:
+    """Return the motion from the middle of the workspace to a goal."""
+    config = ROBOTS[kind]
+    planner = GoalPlanner(corrected_geometry(config), config.limits, config.period)
+    return planner.plan(goal, Schedule(rest(ZERO_RATES), config.period), 1.0, 3).run
+
+
+def traced(run: Run, tool: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return times along the path (n,), poses of the platform's centre (n, 3), and places of the tool (n, 2)."""
+    s = np.linspace(0.0, run.path.duration, FINE)
+    poses = np.array([run.state(at, ZERO_RATES).pose for at in s])
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return s, poses, poses[:, :2] + np.stack([cos * tool[0] - sin * tool[1], sin * tool[0] + cos * tool[1]], axis=1)
+
+
+def placed(kind: str, run: Run, *marks: Mark) -> Placed:
+    return place_marks(marks, run.path, corrected_geometry(ROBOTS[kind]).packed(), ZERO_RATES, ROBOTS[kind].period)
+
+
+def random_goal(kind: str, rng: np.random.Generator) -> tuple[Goal, tuple[float, float]]:
+    """Return a goal within reach, and its tool [m]."""
+    x, y, phi = rng.uniform(-1.0, 1.0, 3) * ((0.05, 0.05, 0.3) if kind == "3-PRP" else (0.004, 0.004, 0.02))
+    speed = rng.uniform(0.1, 1.0)
+    match rng.integers(3):
+        case 0:
+            tool = float(rng.uniform(-0.05, 0.05)), float(rng.uniform(-0.05, 0.05))
+            return MoveGoal(x, y, phi, tool=tool, speed=speed), tool
+        case 1:
+            return PoseGoal(x, y, phi, speed=speed), (0.0, 0.0)
+        case _:
+            goal = inverse(corrected_geometry(ROBOTS[kind]), (x, y, phi))
+            return SlidersGoal(tuple(map(float, goal)), speed=speed), (0.0, 0.0)
+
+
+@pytest.mark.parametrize("kind", ROBOTS)
+@pytest.mark.generated(*range(20))
+def test_marks_lie_where_an_independent_integration_has_them(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    goal, tool = random_goal(kind, rng)
+    if isinstance(goal, MoveGoal):
+        goal = PoseGoal(goal.x, goal.y, goal.phi, tool=tool, speed=goal.speed)
+    run = planned(kind, goal)
+    s, poses, places = traced(run, tool)
+    lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(places, axis=0).T)))
+    share, time = rng.uniform(0.02, 0.98), rng.uniform(0.0, run.path.duration)
+    coordinate = int(np.argmax(np.abs(poses[-1])))
+    tool_poses = np.column_stack([places, poses[:, 2]])
+    value = float(tool_poses[0, coordinate] + rng.uniform(0.1, 0.9) * (tool_poses[-1, coordinate] - tool_poses[0, coordinate]))
+    marks = (
+        Mark("a", after_start=share * lengths[-1]),
+        Mark("b", before_target=share * lengths[-1]),
+        Mark("c", at_path_fraction=share),
+        Mark("d", after_start_s=time),
+        Mark("e", before_target_s=time),
+        Mark("f", at=Crossing(**{("x", "y", "phi")[coordinate]: value})),
+    )
+    found = placed(kind, run, *marks)
+    step = float(np.max(np.diff(lengths))) + 1e-9
+    for mark, length in zip(found.marks[:3], (share, 1.0 - share, share), strict=True):
+        assert mark.path == pytest.approx(length * lengths[-1], abs=step)
+        assert float(np.interp(mark.time, s, lengths)) == pytest.approx(length * lengths[-1], abs=2 * step)
+    assert (found.marks[3].time, found.marks[4].time) == (pytest.approx(time), pytest.approx(run.path.duration - time))
+    crossed = float(np.interp(found.marks[5].time, s, tool_poses[:, coordinate]))
+    assert crossed == pytest.approx(value, abs=1e-7)
+    for mark in found.marks:
+        assert mark.pose == pytest.approx([np.interp(mark.time, s, poses[:, i]) for i in range(3)], abs=1e-6)
+    times = found.switches["s"]
+    assert np.all(np.diff(times) >= 0.0)
+
+
+@pytest.mark.parametrize("kind", ROBOTS)
+def test_a_repetition_has_its_pulses_an_increment_apart(kind: str) -> None:
+    run = planned(kind, PoseGoal(0.004, 0.0, 0.0, speed=0.2))
+    s, _, places = traced(run, (0.0, 0.0))
+    lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(places, axis=0).T)))
+    found = placed(kind, run, Mark("laser", start=0.001, end=0.003, increment=0.0005, pulse_width=0.002))
+    assert found.marks[0].number == len(found.switches) == 5
+    assert np.interp(found.switches["s"], s, lengths) == pytest.approx(np.arange(1, 3.1, 0.5) * 1e-3, abs=1e-6)
+    assert np.all(found.switches["width"] == 0.002)
+
+
+def test_a_stretch_opens_and_closes() -> None:
+    run = planned("3-PRP", PoseGoal(0.05, 0.0, 0.0))
+    found = placed("3-PRP", run, Mark("valve", start=0.01, end=0.03))
+    assert found.switches["on"].tolist() == [1, 0]
+    assert placed("3-PRP", run, Mark("valve", value=False, start=0.01)).switches["on"].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("mark", "words"),
+    [
+        (Mark("valve", after_start=0.06), "mark 0 of output 'valve' is at after_start = 60 mm; the path has 50 mm"),
+        (Mark("valve", before_target_s=60.0), "is at before_target_s = 60 s; the path takes"),
+        (Mark("valve", at=Crossing(y=0.01)), "is at y = 10 mm; the path goes from 0 to 0 mm"),
+        (Mark("valve", start=0.0, increment=1e-6, pulse_width=1e-3), "has 50,001 pulses; a goal has 10,000 at most"),
+        (Mark("valve", start=0.0, increment=1e-5, pulse_width=1e-3), "is the least: lower the speed, or move"),
+    ],
+)
+def test_marks_that_the_path_does_not_pass_are_refused(mark: Mark, words: str) -> None:
+    run = planned("3-PRP", PoseGoal(0.05, 0.0, 0.0))
+    with pytest.raises(RefusedError, match=".") as refused:
+        placed("3-PRP", run, mark)
+    assert refused.value.code is RefusalCode.BAD_MARK
+    assert words in str(refused.value)
+
+
+def test_a_path_on_which_the_tool_only_turns_has_no_share_of_its_length() -> None:
+    run = planned("3-PRP", PoseGoal(0.0, 0.0, 0.2))
+    with pytest.raises(RefusedError, match="the tool does not travel"):
+        placed("3-PRP", run, Mark("valve", at_path_fraction=0.5))
+    assert placed("3-PRP", run, Mark("valve", at=Crossing(phi=0.1))).marks[0].pose[2] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"after_start": 0.01, "before_target": 0.01},
+        {"start": 0.0, "increment": 0.01},
+        {"start": 0.02, "end": 0.01},
+        {"end": 0.01, "after_start": 0.0},
+        {"start": 0.0, "pulse_width": 0.1},
+        {"after_start": math.nan},
+    ],
+)
+def test_a_mark_that_says_no_place_or_two_is_refused(given: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="valve|finite"):
+        Mark("valve", **given)  # type: ignore[arg-type]
+
+
+def test_switches_of_other_marks_are_refused() -> None:
+    run = planned("3-PRP", PoseGoal(0.05, 0.0, 0.0))
+    switches = placed("3-PRP", run, Mark("valve", after_start=0.01)).switches.tobytes()
+    assert GoalMarks("g", (Mark("valve", after_start=0.01),), switches).has_switches
+    with pytest.raises(ValueError, match="do not belong to the 0 marks"):
+        GoalMarks("g", (), switches)
+    assert MAX_SWITCHES > 1
