@@ -15,7 +15,7 @@ from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.marks import MAX_SWITCHES, GoalMarks, Placed, place_marks
 from trirail.motion.runs import ZERO_RATES, Run, rest
 from trirail.motion.schedule import Schedule
-from trirail.wire.goals import Goal, MoveGoal, PoseGoal, SlidersGoal
+from trirail.wire.goals import Goal, PoseGoal, SlidersGoal
 from trirail.wire.marks import Crossing, Mark
 
 ROBOTS = {"3-PRP": load(SIM), "3-PPR": load(SIM.with_name("uvw-ppr.toml"))}
@@ -48,13 +48,13 @@ def random_goal(kind: str, rng: np.random.Generator) -> tuple[Goal, tuple[float,
     speed = rng.uniform(0.1, 1.0)
     match rng.integers(3):
         case 0:
-            tool = float(rng.uniform(-0.05, 0.05)), float(rng.uniform(-0.05, 0.05))
-            return MoveGoal(x, y, phi, tool=tool, speed=speed), tool
+            u, v = map(float, rng.uniform(-0.05, 0.05, 2))  # where the tool is at its start, so that it moves by x, y
+            return PoseGoal(u + x, v + y, phi, tool=(u, v), speed=speed), (u, v)
         case 1:
             return PoseGoal(x, y, phi, speed=speed), (0.0, 0.0)
         case _:
             goal = inverse(corrected_geometry(ROBOTS[kind]), (x, y, phi))
-            return SlidersGoal(tuple(map(float, goal)), speed=speed), (0.0, 0.0)
+            return SlidersGoal(tuple(map(float, goal.position)), speed=speed), (0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", ROBOTS)
@@ -62,8 +62,6 @@ def random_goal(kind: str, rng: np.random.Generator) -> tuple[Goal, tuple[float,
 def test_marks_lie_where_an_independent_integration_has_them(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     goal, tool = random_goal(kind, rng)
-    if isinstance(goal, MoveGoal):
-        goal = PoseGoal(goal.x, goal.y, goal.phi, tool=tool, speed=goal.speed)
     run = planned(kind, goal)
     s, poses, places = traced(run, tool)
     lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(places, axis=0).T)))

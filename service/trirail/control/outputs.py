@@ -21,7 +21,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.motion.marks import GoalMarks
-from trirail.motion.paths import law_at
+from trirail.motion.paths import constant_law, law_at
 from trirail.motion.runs import Run
 from trirail.wire.marks import Mark, Switch
 from trirail.wire.messages import Outcome
@@ -78,6 +78,7 @@ TABLE_DELAY = 0.1
 TABLE_LENGTH = 50
 """Switches in one message."""
 
+_AT_REST = constant_law(0.0)
 OUTPUTS, PLAN, LOG = from_dtype(OUTPUT)[::1], from_dtype(PLANNED)[::1], from_dtype(SWITCHED)[::1]
 RECORDS = from_dtype(DTYPE)[::1]
 
@@ -317,9 +318,9 @@ class Outputs:
         if not self._names:
             return
         self.prepare(run, version)
-        knots, pieces = (run.law.knots, run.law.pieces) if run is not None else (_NO_LAW_KNOTS, _NO_LAW_PIECES)
+        law = run.law if run is not None else _AT_REST
         self.logged = switch(
-            *(self.state, self.planned, self.words, self.log, self.logged, knots, pieces),
+            *(self.state, self.planned, self.words, self.log, self.logged, law.knots, law.pieces),
             *(run is not None, time, self._period, cycle, record),
         )
 
