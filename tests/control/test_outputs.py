@@ -1,0 +1,281 @@
+"""Outputs of the drives: set by users, switched on the path, safe without power; and inputs that end a goal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from control_rig import CONFIG, ControlRig, PerfectDrives
+from numpy.typing import NDArray
+from trirail.config import SIM, Config, Input, Output, load
+from trirail.errors import RefusalCode
+from trirail.wire.goals import PoseGoal
+from trirail.wire.marks import Mark, StopAt, Switch
+from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused, Request
+from trirail.wire.vocabulary import Command, Mode, SetOutput
+
+OUTPUTS = {
+    "valve": Output("A", 16),
+    "light": Output("B", 17, safe=True, always=True),
+    "late": Output("C", 31, delay=0.0053),
+}
+INPUTS = {"part": Input("B", 16)}
+
+
+def with_outputs(config: Config) -> Config:
+    missed = msgspec.structs.replace(config.drives, missed_positions=3)
+    return msgspec.structs.replace(config, drives=missed, outputs=OUTPUTS, inputs=INPUTS)
+
+
+ROBOTS = {"3-PRP": with_outputs(CONFIG), "3-PPR": with_outputs(load(SIM.with_name("uvw-ppr.toml")))}
+REACH = {"3-PRP": (0.05, 0.05, 0.3), "3-PPR": (0.004, 0.004, 0.02)}
+BITS = {"valve": (0, 16), "light": (1, 17), "late": (2, 31)}
+
+
+class Rig(ControlRig):
+    """A robot with outputs; what each cycle commanded, and the words of its drives."""
+
+    def __init__(self, kind: str = "3-PRP") -> None:
+        self.poses: list[NDArray[np.float64]] = []
+        self.words: list[tuple[int, ...]] = []
+        super().__init__(ROBOTS[kind])
+
+    @property
+    def drives(self) -> PerfectDrives:
+        assert isinstance(self.driver, PerfectDrives)
+        return self.driver
+
+    def cycle(self, request: Request | None = None) -> None:
+        super().cycle(request)
+        record = self.control.measured.record[0]
+        self.poses.append(record["commanded_pose"].copy())
+        self.words.append(tuple(self.drives.outputs))
+        assert tuple(record["outputs"]) == self.words[-1]
+
+    def set(self, output: str, value: bool) -> Answer:
+        self.cycle(CommandRequest(7_000_000 + len(self.words), "ann", Command.SET_OUTPUT, SetOutput(output, value)))
+        return self.answers[-1]
+
+    def value(self, name: str) -> bool:
+        drive, bit = BITS[name]
+        return bool(self.drives.outputs[drive] >> bit & 1)
+
+    def changes(self, name: str) -> list[tuple[int, bool]]:
+        """Return the cycles, from 1, whose setpoints came with another value of an output, and that value."""
+        drive, bit = BITS[name]
+        values = [word[drive] >> bit & 1 for word in self.words]
+        return [(k + 1, bool(now)) for k, (before, now) in enumerate(zip(values, values[1:], strict=False), 1) if before != now]
+
+    @property
+    def switches(self) -> list[Switch]:
+        return [switch for notice in self.notices for switch in notice.marks]
+
+
+@pytest.fixture
+def rig() -> Rig:
+    rig = Rig()
+    rig.enable()
+    return rig
+
+
+def test_an_output_is_set_with_the_next_setpoints(rig: Rig) -> None:
+    assert isinstance(rig.set("valve", True), Confirmed)
+    assert rig.value("valve")
+    assert [notice.message for notice in rig.notices if notice.kind == "output"] == ["output valve on by ann"]
+    rig.set("valve", False)
+    assert not rig.value("valve")
+
+
+def test_an_unknown_output_is_refused(rig: Rig) -> None:
+    refused = rig.set("pump", True)
+    assert isinstance(refused, Refused)
+    assert (refused.code, refused.message) == (
+        RefusalCode.UNKNOWN_OUTPUT,
+        "there is no output 'pump': the robot has valve, light, late",
+    )
+
+
+@pytest.mark.parametrize("how", ["disable", "quick_stop"])
+def test_outputs_are_safe_without_power(rig: Rig, how: str) -> None:
+    rig.set("valve", True)
+    rig.set("light", False)
+    rig.order(how)
+    rig.cycles(3)
+    assert (rig.value("valve"), rig.value("light")) == (False, True)
+    refused = rig.set("valve", True)
+    assert isinstance(refused, Refused)
+    assert refused.code in (RefusalCode.NOT_ENABLED, RefusalCode.FAULT)
+    assert "output 'valve' stays off" in refused.message
+    assert isinstance(rig.set("light", False), Confirmed)  # always = true
+    assert not rig.value("light")
+
+
+def test_a_fault_makes_outputs_safe_in_its_cycle(rig: Rig) -> None:
+    rig.set("valve", True)
+    rig.drives.write((0.3, 0.0, 0.0), (0.0, 0.0, 0.0))  # a slider that is not where it should be
+    rig.drives.write((0.3, 0.0, 0.0), (0.0, 0.0, 0.0))
+    rig.cycle()
+    assert rig.mode is Mode.FAULT
+    assert not rig.value("valve")
+
+
+def nearest(rig: Rig, pose: tuple[float, float, float], delay: float = 0.0, since: int = 0) -> int:
+    """Return the cycle, from 1, whose commanded pose, a delay later, is nearest to a pose."""
+    poses = np.array(rig.poses)[since:]
+    ahead = delay / rig.config.period
+    at = np.arange(len(poses)) + ahead
+    shifted = np.array([np.interp(at, np.arange(len(poses)), poses[:, i]) for i in range(3)]).T
+    return since + int(np.argmin(np.linalg.norm((shifted - pose) / REACH["3-PRP"], axis=1))) + 1
+
+
+@pytest.mark.parametrize("kind", ROBOTS)
+@pytest.mark.generated(*range(25))
+def test_each_mark_switches_once_in_the_cycle_nearest_to_its_place(kind: str, seed: int) -> None:
+    """Random goals, marks, overrides and pauses: places are kept, whatever the speed."""
+    rng = np.random.default_rng(seed)
+    rig = Rig(kind)
+    rig.enable()
+    if rng.random() < 0.5:
+        rig.command("override", float(rng.uniform(0.1, 2.0)))
+    x, y, phi = rng.uniform(-1.0, 1.0, 3) * REACH[kind]
+    shares = np.sort(rng.uniform(0.02, 0.98, 3))
+    shares = shares[np.append(True, np.diff(shares) > 0.1)]
+    marks = tuple(
+        Mark(name, value=bool(k % 2 == 0), at_path_fraction=float(share))
+        for name in ("valve", "late")
+        for k, share in enumerate(shares)
+    )
+    since = len(rig.poses)
+    answer = rig.send("g", PoseGoal(x, y, phi, speed=float(rng.uniform(0.1, 1.0)), marks=marks))
+    assert isinstance(answer, Accepted), answer
+    for _ in range(int(rng.integers(3))):
+        rig.cycles(int(rng.integers(1, 200)))
+        if rig.mode is not Mode.MOVING:
+            break
+        match rng.integers(3):
+            case 0:
+                rig.command("override", float(rng.uniform(0.05, 2.0)))
+            case 1:
+                rig.command("pause")
+                rig.cycles(int(rng.integers(1, 50)))
+                rig.command("resume")
+            case _:
+                rig.order("pause")
+                rig.cycle()
+                rig.order("resume")
+    rig.until(rig.holds, 60_000)
+    assert rig.outcomes() == [("g", "done")]
+    rows = rig.switches
+    assert sorted((row.mark, row.value) for row in rows) == [(k, mark.value) for k, mark in enumerate(marks)]
+    for row, placed in ((row, answer.reply.marks[row.mark]) for row in rows):
+        assert row.goal == "g"
+        assert (row.cycle, row.value) in rig.changes(row.output) or len(rows) > len(set(rows))
+        delay = OUTPUTS[row.output].delay
+        best = nearest(rig, placed.pose, delay, since)
+        assert abs(row.cycle - best) <= (1 if delay else 0) or _as_near(rig, row, placed.pose, best)
+        assert row.commanded == tuple(rig.poses[row.cycle - 1])
+
+
+def _as_near(rig: Rig, row: Switch, pose: tuple[float, float, float], best: int) -> bool:
+    """Whether a cycle is as near to a pose as the best one, but for rounding: where the robot waits, many are."""
+    here, there = (np.linalg.norm((rig.poses[cycle - 1] - pose) / REACH["3-PRP"]) for cycle in (row.cycle, best))
+    return bool(here <= there + 1e-6)
+
+
+def test_pulses_last_their_width_and_are_closed_by_a_stop(rig: Rig) -> None:
+    mark = Mark("valve", start=0.0, increment=0.005, pulse_width=0.01)
+    answer = rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, marks=(mark,)))
+    assert isinstance(answer, Accepted)
+    assert answer.reply.marks[0].number == 11
+    rig.until(rig.holds, 20_000)
+    rig.cycles(200)
+    changes = rig.changes("valve")
+    assert [value for _, value in changes] == [True, False] * 11
+    widths = np.diff([cycle for cycle, _ in changes])[::2]
+    assert np.all(widths == round(0.01 / rig.config.period))
+
+
+@pytest.mark.parametrize("how", ["stop", "quick_stop", "disable"])
+def test_a_stretch_is_closed_where_its_goal_is_stopped(rig: Rig, how: str) -> None:
+    rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, marks=(Mark("valve", start=0.002), Mark("late", after_start=0.03))))
+    rig.until(lambda: rig.value("valve"))
+    rig.cycles(20)
+    rig.order(how)
+    rig.until(lambda: rig.mode in (Mode.HOLDING, Mode.FAULT, Mode.DISABLED), 5000)
+    rig.cycles(300)
+    assert not rig.value("valve")
+    assert not rig.changes("late")  # not reached
+    assert [(row.output, row.value, row.closed) for row in rig.switches][:1] == [("valve", True, False)]
+
+
+def test_marks_of_blended_goals(rig: Rig) -> None:
+    """Each in its own goal; those that a blend cuts off do not switch, unless the next goal is cancelled in time."""
+    first = PoseGoal(0.05, 0.0, 0.0, speed=0.3, blend=0.02, marks=(Mark("valve", after_start=0.01), Mark("late", before_target=0.001)))
+    rig.send("g1", first)
+    rig.send("g2", PoseGoal(0.05, 0.04, 0.0, marks=(Mark("valve", value=False, before_target=0.01),)))
+    rig.until(rig.holds, 20_000)
+    rig.cycles(200)
+    assert rig.outcomes() == [("g1", "done"), ("g2", "done")]
+    assert [(row.goal, row.mark) for row in rig.switches] == [("g1", 0), ("g2", 0)]
+    assert not rig.changes("late")
+
+
+def test_marks_that_a_cancelled_blend_had_cut_off_switch_again(rig: Rig) -> None:
+    first = PoseGoal(0.05, 0.0, 0.0, speed=0.1, blend=0.02, marks=(Mark("valve", after_start=0.01), Mark("late", before_target=0.001)))
+    rig.send("g1", first)
+    rig.send("g2", PoseGoal(0.05, 0.04, 0.0, valid_for=0.3))
+    rig.until(rig.holds, 20_000)
+    rig.cycles(200)
+    assert rig.outcomes() == [("g2", "expired"), ("g1", "done")]
+    assert [(row.goal, row.mark) for row in rig.switches] == [("g1", 0), ("g1", 1)]
+
+
+def test_marks_of_a_preempted_goal_do_not_switch(rig: Rig) -> None:
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.3, marks=(Mark("valve", after_start=0.04),)))
+    rig.cycles(10)
+    rig.send("g2", PoseGoal(0.0, 0.03, 0.0))
+    rig.until(rig.holds, 20_000)
+    assert rig.switches == []
+
+
+def test_a_goal_ends_at_an_edge(rig: Rig) -> None:
+    rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, stop_at=StopAt("part"), marks=(Mark("valve", after_start=0.045),)))
+    rig.cycles(200)
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycle()
+    edge = [notice for notice in rig.notices if notice.kind == "input"]
+    assert len(edge) == 1
+    assert edge[0].params["value"] == 1.0
+    rig.until(rig.holds, 5000)
+    (end,) = (notice for notice in rig.notices if notice.kind == "goal")
+    assert (end.outcome, end.reason) == ("done", "input part rising")
+    assert end.params["x"] == pytest.approx(edge[0].params["x"])
+    assert rig.poses[-1][0] < 0.045
+    assert not rig.switches
+
+
+def test_other_edges_are_events_alone(rig: Rig) -> None:
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.send("g", PoseGoal(0.01, 0.0, 0.0, stop_at=StopAt("part")))
+    rig.drives.inputs = (0, 0, 0)
+    rig.until(rig.holds, 5000)
+    (end,) = (notice for notice in rig.notices if notice.kind == "goal")
+    assert (end.outcome, end.reason) == ("done", "arrived") or end.outcome == "done"
+    assert [notice.params["value"] for notice in rig.notices if notice.kind == "input"] == [1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("goal", "code"),
+    [
+        ({"marks": (Mark("pump", after_start=0.01),)}, RefusalCode.UNKNOWN_OUTPUT),
+        ({"stop_at": StopAt("door")}, RefusalCode.UNKNOWN_OUTPUT),
+        ({"marks": (Mark("valve", after_start=1.0),)}, RefusalCode.BAD_MARK),
+    ],
+)
+def test_impossible_marks_are_refused_and_nothing_moves(rig: Rig, goal: dict[str, Any], code: RefusalCode) -> None:
+    refused = rig.send("g", PoseGoal(0.05, 0.0, 0.0, **goal))
+    assert isinstance(refused, Refused)
+    assert refused.code is code
+    assert rig.mode is Mode.HOLDING
