@@ -30,18 +30,22 @@ if TYPE_CHECKING:
     from trirail.kinematics.geometry import CrossLeg, Geometry, Leg
     from trirail.kinematics.robot import forward, inverse, jacobians
     from trirail.telemetry.reading import read
+    from trirail.wire.marks import Crossing, Mark, StopAt
 
 __all__ = [
     "AsyncRobot",
     "ConfigError",
     "CrossLeg",
+    "Crossing",
     "Geometry",
     "KinematicsError",
     "Leg",
+    "Mark",
     "RefusalCode",
     "RefusedError",
     "Robot",
     "ServiceError",
+    "StopAt",
     "TrirailError",
     "WaitTimeoutError",
     "__version__",
@@ -61,6 +65,7 @@ _NAMES_BY_MODULE = {
     "trirail.kinematics.geometry": ("Geometry", "Leg", "CrossLeg"),
     "trirail.kinematics.robot": ("forward", "inverse", "jacobians"),
     "trirail.telemetry.reading": ("read",),
+    "trirail.wire.marks": ("Crossing", "Mark", "StopAt"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import msgspec
@@ -66,7 +67,11 @@ class Rig(ControlRig):
         """Return the cycles, from 1, whose setpoints came with another value of an output, and that value."""
         drive, bit = BITS[name]
         values = [word[drive] >> bit & 1 for word in self.words]
-        return [(k + 1, bool(now)) for k, (before, now) in enumerate(zip(values, values[1:], strict=False), 1) if before != now]
+        return [
+            (k + 1, bool(now))
+            for k, (before, now) in enumerate(itertools.pairwise(values), 1)
+            if before != now
+        ]
 
     @property
     def switches(self) -> list[Switch]:
@@ -107,7 +112,7 @@ def test_outputs_are_safe_without_power(rig: Rig, how: str) -> None:
     refused = rig.set("valve", True)
     assert isinstance(refused, Refused)
     assert refused.code in (RefusalCode.NOT_ENABLED, RefusalCode.FAULT)
-    assert "output 'valve' stays off" in refused.message
+    assert "output 'valve' keeps its safe value, off" in refused.message
     assert isinstance(rig.set("light", False), Confirmed)  # always = true
     assert not rig.value("light")
 
@@ -199,7 +204,9 @@ def test_pulses_last_their_width_and_are_closed_by_a_stop(rig: Rig) -> None:
 
 @pytest.mark.parametrize("how", ["stop", "quick_stop", "disable"])
 def test_a_stretch_is_closed_where_its_goal_is_stopped(rig: Rig, how: str) -> None:
-    rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, marks=(Mark("valve", start=0.002), Mark("late", after_start=0.03))))
+    rig.send(
+        "g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, marks=(Mark("valve", start=0.002), Mark("late", after_start=0.03)))
+    )
     rig.until(lambda: rig.value("valve"))
     rig.cycles(20)
     rig.order(how)
@@ -212,7 +219,14 @@ def test_a_stretch_is_closed_where_its_goal_is_stopped(rig: Rig, how: str) -> No
 
 def test_marks_of_blended_goals(rig: Rig) -> None:
     """Each in its own goal; those that a blend cuts off do not switch, unless the next goal is cancelled in time."""
-    first = PoseGoal(0.05, 0.0, 0.0, speed=0.3, blend=0.02, marks=(Mark("valve", after_start=0.01), Mark("late", before_target=0.001)))
+    first = PoseGoal(
+        0.05,
+        0.0,
+        0.0,
+        speed=0.3,
+        blend=0.02,
+        marks=(Mark("valve", after_start=0.01), Mark("late", before_target=0.001)),
+    )
     rig.send("g1", first)
     rig.send("g2", PoseGoal(0.05, 0.04, 0.0, marks=(Mark("valve", value=False, before_target=0.01),)))
     rig.until(rig.holds, 20_000)
@@ -223,7 +237,14 @@ def test_marks_of_blended_goals(rig: Rig) -> None:
 
 
 def test_marks_that_a_cancelled_blend_had_cut_off_switch_again(rig: Rig) -> None:
-    first = PoseGoal(0.05, 0.0, 0.0, speed=0.1, blend=0.02, marks=(Mark("valve", after_start=0.01), Mark("late", before_target=0.001)))
+    first = PoseGoal(
+        0.05,
+        0.0,
+        0.0,
+        speed=0.1,
+        blend=0.02,
+        marks=(Mark("valve", after_start=0.01), Mark("late", before_target=0.001)),
+    )
     rig.send("g1", first)
     rig.send("g2", PoseGoal(0.05, 0.04, 0.0, valid_for=0.3))
     rig.until(rig.holds, 20_000)
@@ -241,7 +262,9 @@ def test_marks_of_a_preempted_goal_do_not_switch(rig: Rig) -> None:
 
 
 def test_a_goal_ends_at_an_edge(rig: Rig) -> None:
-    rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, stop_at=StopAt("part"), marks=(Mark("valve", after_start=0.045),)))
+    rig.send(
+        "g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, stop_at=StopAt("part"), marks=(Mark("valve", after_start=0.045),))
+    )
     rig.cycles(200)
     rig.drives.inputs = (0, 1 << 16, 0)
     rig.cycle()

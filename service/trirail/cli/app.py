@@ -206,8 +206,9 @@ for command in robot_commands.COMMANDS:
     app.command(command)
 app.command(robot_commands.override, name=Command.OVERRIDE, help=Command.OVERRIDE.help)
 app.command(robot_commands.acquire, name=Command.ACQUIRE, help=Command.ACQUIRE.help)
+app.command(robot_commands.output, help=Command.SET_OUTPUT.help)
 for each in Command:
-    if each not in (Command.OVERRIDE, Command.ACQUIRE):
+    if each not in (Command.OVERRIDE, Command.ACQUIRE, Command.SET_OUTPUT):
         made = stop_commands.stopping(each) if each in STOPS else robot_commands.command_line_of(each)
         app.command(made, name=each.replace("_", "-"), help=each.help)
 app.command(config_commands.app)

@@ -72,6 +72,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "pause": ("trirail pause",),
         "resume": ("trirail resume",),
         "override": ("trirail override 50",),
+        "output": ("trirail output valve on", "trirail output valve off"),
     },
     "Look": {
         "status": ("trirail status", "trirail status --json"),

@@ -312,6 +312,22 @@ def override(percent: notation.Percent, /, *, service: Service = HERE) -> int:
     return 0
 
 
+def output(name: str, value: Literal["on", "off"], /, *, service: Service = HERE) -> int:
+    """Set a digital output of a drive from the next setpoints on.
+
+    Parameters
+    ----------
+    name
+        Name of an output of the configuration.
+    value
+        New value.
+    """
+    with service.open() as robot:
+        robot.set_output(name, value == "on")
+    show(service, {"output": name, "value": value == "on"}, f"output {name}: {value}")
+    return 0
+
+
 WAKE_EVERY = 0.2
 """How often who waits looks for a signal: the kernel may have handed it to another thread, which wakes nobody [s]."""
 

@@ -31,11 +31,12 @@ from trirail.client.trajectory import Points, check_arrived, first_pose, points_
 from trirail.errors import ServiceError
 from trirail.wire.goals import Goal, MoveGoal, NamedGoal, OwnLimits, PoseGoal, SlidersGoal, Tool, TrajectoryGoal
 from trirail.wire.looks import AlignmentLook
+from trirail.wire.marks import MarkLike, StopAtLike, marks_of, stop_at_of
 from trirail.wire.messages import CommandReply, Event, GoalReply, RoleReply
 from trirail.wire.state import Info, NamedPose, NamedPoses, State
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import check_name, check_new_pose
-from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, Role, Stop
+from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, Role, SetOutput, Stop
 
 if TYPE_CHECKING:  # numpy, which most programs do without
     from trirail.alignment.alignment_request import AlignmentRequest, Observation
@@ -125,6 +126,8 @@ class AsyncRobot:
         valid_for: float | None = None,
         tool: Tool | None = None,
         frame: str = "base",
+        marks: Sequence[MarkLike] = (),
+        stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Send a pose goal, x, y [m] and phi [rad] in the base frame; return once it is accepted.
@@ -136,6 +139,8 @@ class AsyncRobot:
         With a `tool`, a point of the platform in its own frame, (u, v) [m], or a name of [frames.tool], this point
         moves to x, y, straight and within the platform's limits, while the platform turns. `frame` is one of
         [frames.work] in which x, y and phi are given.
+        At `marks` on the path outputs switch: trirail.Mark, or dicts of its fields; the result has the table of what
+        has switched. At the edge `stop_at` of an input it ends, by a controlled stop: trirail.StopAt, or a dict.
         The `id` must be new; one is made if absent. Raises RefusedError: out of reach, not enabled, stopping, ….
         """
         return await self.send(
@@ -150,6 +155,8 @@ class AsyncRobot:
                 blend=blend,
                 tool=tool,
                 frame=frame,
+                marks=marks_of(marks),
+                stop_at=stop_at_of(stop_at),
             ),
             id,
         )
@@ -167,6 +174,8 @@ class AsyncRobot:
         limits: OwnLimits | None = None,
         blend: float | None = None,
         valid_for: float | None = None,
+        marks: Sequence[MarkLike] = (),
+        stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Move the platform by x, y [m] and turn it by phi [rad] about its `tool`, or its centre; return when accepted.
@@ -188,6 +197,8 @@ class AsyncRobot:
                 valid_for=valid_for,
                 limits=limits,
                 blend=blend,
+                marks=marks_of(marks),
+                stop_at=stop_at_of(stop_at),
             ),
             id,
         )
@@ -200,6 +211,8 @@ class AsyncRobot:
         limits: OwnLimits | None = None,
         blend: float | None = None,
         valid_for: float | None = None,
+        marks: Sequence[MarkLike] = (),
+        stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Move the platform to a named pose, one of `poses`; the rest is as for move_to.
@@ -214,6 +227,8 @@ class AsyncRobot:
                 valid_for=valid_for,
                 limits=limits,
                 blend=blend,
+                marks=marks_of(marks),
+                stop_at=stop_at_of(stop_at),
             ),
             id,
         )
@@ -226,6 +241,8 @@ class AsyncRobot:
         *,
         speed: float = 1.0,
         valid_for: float | None = None,
+        marks: Sequence[MarkLike] = (),
+        stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Send a goal for the sliders A, B, C, their lambda_10 [m]; return once it is accepted.
@@ -233,7 +250,17 @@ class AsyncRobot:
         The motion is straight in slider space where the start allows; it also leads out of a pose that move_to refuses.
         `speed`, `valid_for` and `id` are as for move_to.
         """
-        return await self.send(lambda name: SlidersGoal((a, b, c), speed=speed, valid_for=valid_for, id=name), id)
+        return await self.send(
+            lambda name: SlidersGoal(
+                (a, b, c),
+                speed=speed,
+                valid_for=valid_for,
+                id=name,
+                marks=marks_of(marks),
+                stop_at=stop_at_of(stop_at),
+            ),
+            id,
+        )
 
     async def follow(
         self,
@@ -242,13 +269,20 @@ class AsyncRobot:
         stretch: bool = False,
         settle: bool = True,
         go_there: bool = False,
+        marks: Sequence[MarkLike] = (),
+        stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Send a timed trajectory that begins at the robot's pose; see trirail.client.client.Robot.follow."""
         meant = points_of(points)
         if go_there:
             check_arrived(await (await self.send(first_pose(meant))).wait())
-        return await self.send(lambda name: TrajectoryGoal(meant, stretch=stretch, settle=settle, id=name), id)
+        return await self.send(
+            lambda name: TrajectoryGoal(
+                meant, stretch=stretch, settle=settle, id=name, marks=marks_of(marks), stop_at=stop_at_of(stop_at)
+            ),
+            id,
+        )
 
     def jog(
         self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2, tool: Tool | None = None
@@ -407,6 +441,15 @@ class AsyncRobot:
         content = made_content(Command.OVERRIDE, lambda: Override(number(percent, "override")))
         await self.command(Command.OVERRIDE, content)
 
+    async def set_output(self, name: str, value: bool) -> None:
+        """Set a digital output of the configuration, from the next setpoints on.
+
+        Raises RefusedError: `unknown_output`; `not_enabled` or `fault` while the robot is disabled or in fault, unless
+        the output is configured as `always = true`.
+        """
+        content = made_content(Command.SET_OUTPUT, lambda: SetOutput(name, value))
+        await self.command(Command.SET_OUTPUT, content)
+
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> AsyncLease:
         """Hold the lease while the context lasts: only this user's goals and commands move the robot.
 
@@ -505,5 +548,6 @@ class AsyncRobot:
         return self._open
 
     def _on_event(self, event: Event) -> None:
+        self._goals.note_switches(event.marks)
         if (result := result_of(event)) is not None:
             self._goals.end(result)

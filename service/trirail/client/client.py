@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterator
+from collections.abc import AsyncGenerator, Callable, Coroutine, Generator, Iterator, Sequence
 from html import escape
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +22,7 @@ from trirail.client.blocking import GoalHandle, Jog, Lease, LoopThread, Track
 from trirail.client.goal import AsyncGoalHandle, Result
 from trirail.client.trajectory import Points, points_of
 from trirail.errors import TrirailError
+from trirail.wire.marks import MarkLike, StopAtLike
 from trirail.wire.messages import CommandReply
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import CommandContent
@@ -220,6 +221,7 @@ class Robot:
     pause = _call(AsyncRobot.pause)
     resume = _call(AsyncRobot.resume)
     override = _call(AsyncRobot.override)
+    set_output = _call(AsyncRobot.set_output)
     lease = _context(AsyncRobot.lease, Lease)
     acquire = _call(AsyncRobot.acquire)
     release = _call(AsyncRobot.release)
@@ -239,6 +241,8 @@ class Robot:
         stretch: bool = False,
         settle: bool = True,
         go_there: bool = False,
+        marks: Sequence[MarkLike] = (),
+        stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> GoalHandle:
         """Send a timed trajectory that begins at the robot's pose; return once it is accepted.
@@ -253,7 +257,7 @@ class Robot:
         is done when its path has ended, whether or not the robot is measured to be there.
         """
         points = points_of(points)  # in the caller's thread: an iterator of theirs may call this robot
-        how = {"stretch": stretch, "settle": settle, "go_there": go_there}
+        how: dict[str, Any] = {"stretch": stretch, "settle": settle, "go_there": go_there, "marks": marks, "stop_at": stop_at}
         return GoalHandle(self._loop.call(self._robot.follow(points, **how, id=id)), self._loop, self.command)
 
     # ------------------------------------------------------------------ what the service tells

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import uuid
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import NamedTuple, Self
 
 import msgspec
@@ -14,6 +14,7 @@ import msgspec
 from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, TrirailError, WaitTimeoutError
 from trirail.wire.goals import Goal, Tool, VelocityGoal
+from trirail.wire.marks import Switch
 from trirail.wire.messages import Event, GoalReply, Residual
 from trirail.wire.vocabulary import Command, Stop
 
@@ -42,6 +43,8 @@ class Result(NamedTuple):
     """Distance from the target at its end, done or unsettled: `sliders` [m], and `pose` [m, m, rad]."""
     overshoot: tuple[float, float, float] | None = None
     """Greatest overshoot of the sliders A, B, C since the end of the path [m]."""
+    marks: tuple[Switch, ...] = ()
+    """Switches of outputs on its path, in the order in which they happened."""
 
 
 def result_of(event: Event) -> Result | None:
@@ -125,6 +128,7 @@ class OpenGoals:
         self._handles: dict[str, AsyncGoalHandle] = {}
         self._calls: Counter[str] = Counter()
         self._accepted: set[str] = set()
+        self._switches: dict[str, list[Switch]] = {}
 
     def __len__(self) -> int:
         return len(self._handles)
@@ -146,13 +150,20 @@ class OpenGoals:
         self._end_call(goal_id)
         if goal_id in self._accepted or goal_id in self._calls:
             return False
+        self._switches.pop(goal_id, None)
         return self._handles.pop(goal_id, None) is not None
 
     def end(self, result: Result) -> None:
         """End the handle of a goal, if it is one of these."""
         self._accepted.discard(result.id)
         if (handle := self._handles.pop(result.id, None)) is not None:
-            handle.end(result)
+            handle.end(result._replace(marks=tuple(self._switches.pop(result.id, ()))))
+
+    def note_switches(self, switches: Iterable[Switch]) -> None:
+        """Add switches to the results of their goals, of those that are followed here."""
+        for switch in switches:
+            if switch.goal in self._handles:
+                self._switches.setdefault(switch.goal, []).append(switch)
 
     def _end_call(self, goal_id: str) -> None:
         self._calls[goal_id] -= 1

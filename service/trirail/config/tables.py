@@ -10,12 +10,12 @@ from typing import Annotated, Literal, cast
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct, structs
-from trirail.config.digital import Input, Output
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
 from trirail_drivers.interface import NAMES, Triple
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
+from trirail.config.digital import Input, Output
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import CrossLeg, Geometry, Leg, Room
 from trirail.kinematics.leg import AnyLeg

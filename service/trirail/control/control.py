@@ -83,7 +83,9 @@ class Control:
         self.ledger = Ledger(self._goal_ended)
         frames, queue = NamedFrames(config.frames), config.motion.queue
         self.lease = LeaseArbiter(config.control.lease, config.period)
-        self.goal_queue = GoalQueue(self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period, self.outputs)
+        self.goal_queue = GoalQueue(
+            self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period, self.outputs
+        )
         legs, step_length = robot.packed(), config.limits.slider.fastest * config.period
         self._following_error_limit = config.limits.slider.following_error
         taken = reserve_for_backlash(config.correction.backlash, config.limits.slider)
@@ -304,7 +306,9 @@ class Control:
         goal, pose = self.ledger.goal, self.measured.pose
         x, y, phi = pose
         for name, value in self.outputs.edges(before.inputs, now.inputs):
-            words = f"input {name} {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi {phi:.5f} rad"
+            words = (
+                f"input {name} {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi {phi:.5f} rad"
+            )
             text = coded(words, EventCode.INPUT_CHANGED, input=name, value=float(value), x=x, y=y, phi=phi)
             self.ledger.notices.append(Notice("input", "info", text.text, **text.fields))
             if goal is not None and goal.stop_at is not None and self.state.mode is Mode.MOVING:

@@ -149,7 +149,16 @@ class Ledger:
         passes = at_end and last is not None and last.blend is not None and goal.follows
         if not taken.reply.queued and not passes:
             self.end("preempted", coded(f"preempted by goal {request.id}", EventCode.PREEMPTED, goal=request.id))
-        begun = ActiveGoal(request.id, request.user, type(goal), goal.blend, expires, alive_until, settles=goal.settle, stop_at=goal.stop_at)
+        begun = ActiveGoal(
+            request.id,
+            request.user,
+            type(goal),
+            goal.blend,
+            expires,
+            alive_until,
+            settles=goal.settle,
+            stop_at=goal.stop_at,
+        )
         self.goals.append(begun)
         if passes:
             self.pass_on()

@@ -8,7 +8,7 @@ place is taken that will be commanded when the delay has passed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -206,7 +206,9 @@ class Outputs:
     def values(self) -> dict[str, bool]:
         """Return the wanted value of each output."""
         words = self.words.tolist()
-        return {name: bool(words[row["axis"]] & int(row["bit"])) for name, row in zip(self._names, self.state, strict=True)}
+        return {
+            name: bool(words[row["axis"]] & int(row["bit"])) for name, row in zip(self._names, self.state, strict=True)
+        }
 
     def set(self, name: str, value: bool, mode: Mode) -> None:
         """Set an output now. Raises RefusedError for an unknown one, and where the mode does not allow it."""
@@ -216,7 +218,7 @@ class Outputs:
             safe = "on" if output.safe else "off"
             raise RefusedError(
                 code,
-                f"output {name!r} stays {safe}, its safe value, while the robot is {'in ' * (mode is Mode.FAULT)}{mode}: "
+                f"output {name!r} keeps its safe value, {safe}, while the robot is {'in ' * (mode is Mode.FAULT)}{mode}: "
                 "send enable first, or set always = true in its section of the configuration",
             )
         row = self.state[self._names.index(name)]
@@ -255,7 +257,9 @@ class Outputs:
     def edges(self, before: Sequence[int], now: Sequence[int]) -> list[tuple[str, bool]]:
         """Return the inputs that have changed between two readings of the drives' words, with their new values."""
         return [
-            (name, bool(now[axis] & bit)) for name, (axis, bit) in self._inputs.items() if (before[axis] ^ now[axis]) & bit
+            (name, bool(now[axis] & bit))
+            for name, (axis, bit) in self._inputs.items()
+            if (before[axis] ^ now[axis]) & bit
         ]
 
     def check_input(self, name: str) -> None:
@@ -273,8 +277,8 @@ class Outputs:
             if not self._path_allowed[NAMES.index(drive)]:
                 raise RefusedError(
                     RefusalCode.BAD_MARK,
-                    f"output {mark.output!r} cannot switch on a path: drive {drive} takes 60FEh by SDO only, not with a "
-                    "setpoint; use set_output, or an output of another drive",
+                    f"output {mark.output!r} cannot switch on a path: drive {drive} takes 60FEh by SDO only, not with "
+                    "a setpoint; use set_output, or an output of another drive",
                 )
 
     def prepare(self, run: Run | None, version: int) -> None:

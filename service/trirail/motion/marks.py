@@ -218,18 +218,18 @@ def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, f
     if mark.start is None:
         yield _time_of(number, mark, trace), width, number, int(mark.value)
         return
-    end = mark.end if mark.end is not None else trace.length
+    begin, end = mark.start, mark.end if mark.end is not None else trace.length
     for name, length in (("start", mark.start), ("end", end)):
         _check_length(number, mark, name, length, trace.length)
     if mark.increment is None:
-        begins, ends = trace.times_at(np.array([mark.start, end])).tolist()
+        begins, ends = trace.times_at(np.array([begin, end], np.float64)).tolist()
         yield begins, np.nan, number, int(mark.value)
         yield ends, np.nan, number, int(not mark.value)
         return
     count = int((end - mark.start) / mark.increment * (1.0 + 1e-12)) + 1
     if count > MAX_SWITCHES:
         raise _refusal(number, mark, f"has {count:,} pulses; a goal has {MAX_SWITCHES:,} at most")
-    for s in trace.times_at(mark.start + mark.increment * np.arange(count)).tolist():
+    for s in trace.times_at(begin + mark.increment * np.arange(count, dtype=np.float64)).tolist():
         yield s, width, number, int(mark.value)
 
 
@@ -260,7 +260,9 @@ def _time_of(number: int, mark: Mark, trace: _Trace) -> float:
             return float(trace.times_at(np.array([travelled]))[0])
     share = mark.at_path_fraction or 0.0
     if trace.length < LEAST_LENGTH:
-        raise _refusal(number, mark, "has a share of a path on which the tool does not travel: use after_start_s, or at")
+        raise _refusal(
+            number, mark, "has a share of a path on which the tool does not travel: use after_start_s, or at"
+        )
     return float(trace.times_at(np.array([share * trace.length]))[0])
 
 
@@ -281,8 +283,8 @@ def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: fl
         if spacing[k] < needed[k]:
             number = int(own["mark"][k + 1])
             text = (
-                f"switches {spacing[k] * 1e3:.3g} ms after the switch before it; at full speed {needed[k] * 1e3:.3g} ms "
-                "is the least: lower the speed, or move the marks apart"
+                f"switches {spacing[k] * 1e3:.3g} ms after the switch before it; at full speed {needed[k] * 1e3:.3g} "
+                "ms is the least: lower the speed, or move the marks apart"
             )
             raise _refusal(number, marks[number], text, float(spacing[k]), float(needed[k]))
 
@@ -290,4 +292,6 @@ def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: fl
 def _refusal(
     number: int, mark: Mark, text: str, value: float | None = None, limit: float | None = None
 ) -> RefusedError:
-    return RefusedError(RefusalCode.BAD_MARK, f"mark {number} of output {mark.output!r} {text}", value=value, limit=limit)
+    return RefusedError(
+        RefusalCode.BAD_MARK, f"mark {number} of output {mark.output!r} {text}", value=value, limit=limit
+    )

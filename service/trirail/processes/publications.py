@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,11 @@ class Publications:
         self._event.put(msgspec.json.encode(event))
 
 
+def _bits(named: Mapping[str, tuple[int, int]], words: NDArray[np.uint32]) -> dict[str, bool]:
+    """Return the values of named bits, each with the index of its drive and its mask."""
+    return {name: bool(int(words[axis]) & bit) for name, (axis, bit) in named.items()}
+
+
 WINDOW = 60.0
 """Span of the timing statistics [s]."""
 
@@ -92,6 +98,8 @@ class StateMaker:
 
     def __init__(self, config: Config) -> None:
         self._period = config.period
+        self._outputs = {name: (NAMES.index(each.drive), 1 << each.bit) for name, each in config.outputs.items()}
+        self._inputs = {name: (NAMES.index(each.drive), 1 << each.bit) for name, each in config.inputs.items()}
         self._rate_hz = config.loop.rate_hz
         self._lateness = _Recent(round(WINDOW / config.period))
         self._cycle = _Recent(round(WINDOW / config.period))
@@ -177,6 +185,8 @@ class StateMaker:
             settled=bool(row["settled"]),
             override=self._status.override,
             lease=self._status.lease,
+            outputs=_bits(self._outputs, row["outputs"]),
+            inputs=_bits(self._inputs, row["inputs"]),
             faults=tuple(dict.fromkeys(filter(None, (self._status.fault, *self._status.unready)))),
             warnings=(*warnings, self._status.unrecorded) if self._status.unrecorded else warnings,
             loop=LoopState(
@@ -239,6 +249,8 @@ def info(config: Config) -> Info:
         live=f"rerun+http://127.0.0.1:{live}/proxy" if live else "",
         lease=config.control.lease,
         takeover=config.control.takeover.value,
+        outputs=tuple(config.outputs),
+        inputs=tuple(config.inputs),
         homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
         versions=versions(),
         correction=as_built.summary(config.correction.map, config.correction.as_built, config.correction.backlash),

@@ -222,8 +222,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 
     `moment` (2,) is room for a struct timespec, `bus` (3,) a BusAccess, `doors` (n, 2) an array for poll, the
     gateway's first, `hearts` the counters of trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made`
-    (SIZE,) the bytes of `record`; `switches`, `planned`, `words` and `log` are those of control.outputs.switch. All else
-    as in control.cycle and cycle_frames.
+    (SIZE,) the bytes of `record`; `switches`, `planned`, `words` and `log` are as in control.outputs.switch. All else as
+    in control.cycle and cycle_frames.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
+import msgspec
 from msgspec import Meta, Struct
 from trirail_drivers.interface import Triple
 
@@ -93,6 +95,15 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
         return self.pulse_width is not None or self.start is not None
 
 
+MarkLike = Mark | Mapping[str, Any]
+"""A mark, or a mapping of its fields."""
+
+
+def marks_of(marks: Sequence[MarkLike]) -> tuple[Mark, ...]:
+    """Return marks that may be given by mappings. Raises ValueError for impossible ones."""
+    return tuple(mark if isinstance(mark, Mark) else msgspec.convert(dict(mark), Mark) for mark in marks)
+
+
 Marks = Annotated[
     tuple[Mark, ...],
     Meta(max_length=100, description="places on the path at which outputs switch"),
@@ -106,6 +117,15 @@ class StopAt(Struct, frozen=True, forbid_unknown_fields=True):
     """Name of an input of the configuration."""
     edge: Literal["rising", "falling"] = "rising"
     """Direction of the change."""
+
+
+StopAtLike = StopAt | Mapping[str, Any]
+"""An edge, or a mapping of its fields."""
+
+
+def stop_at_of(edge: StopAtLike | None) -> StopAt | None:
+    """Return an edge that may be given by a mapping. Raises ValueError for an impossible one."""
+    return edge if edge is None or isinstance(edge, StopAt) else msgspec.convert(dict(edge), StopAt)
 
 
 StopAtEdge = Annotated[
