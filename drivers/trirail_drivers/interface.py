@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
@@ -87,6 +87,21 @@ class Unready(NamedTuple):
         return f"{self.reason} ({self.objects}{of} {self.counted})" if self.objects else self.reason
 
 
+class DigitalIO(NamedTuple):
+    """Digital outputs and inputs of one drive that the robot uses, as bits of objects 60FEh and 60FDh."""
+
+    outputs: int = 0
+    """Mask of the outputs."""
+    safe: int = 0
+    """Safe values of the outputs: at set-up, and at the end of the service."""
+    inputs: int = 0
+    """Mask of the inputs."""
+
+
+NO_IO = DigitalIO(), DigitalIO(), DigitalIO()
+"""Drives without outputs and inputs."""
+
+
 UnreadyDrives = tuple[Unready | None, Unready | None, Unready | None]
 """Reason for which each drive cannot be reset yet; None if it is configured."""
 
@@ -115,6 +130,7 @@ class Feedback(NamedTuple):
     """Reason for which each drive cannot be reset yet; None if it is configured. A drive without a position since the
     start is reported at its zero, and as not homed."""
     inputs: tuple[int, int, int] = (0, 0, 0)
+    """Newest digital inputs of each drive, without the bits that are not in its mask (`DigitalIO.inputs`)."""
 
 
 class DriveGroup(Protocol):
@@ -130,6 +146,10 @@ class DriveGroup(Protocol):
     @property
     def missing_protections(self) -> tuple[MissingProtection, ...]:
         """Protections that the configured drives lack."""
+
+    @property
+    def path_outputs(self) -> tuple[bool, bool, bool]:
+        """Whether each drive adopts its outputs with a setpoint; otherwise they may not switch on a path."""
 
     @property
     def traffic(self) -> int:
@@ -161,7 +181,16 @@ class DriveGroup(Protocol):
         """Handle every frame that has arrived; return the feedback."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC."""
+        """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC.
+
+        Changed outputs are sent behind them, also if the setpoints are not, and adopted at the same SYNC.
+        """
+
+    def set_outputs(self, words: Sequence[int]) -> None:
+        """Set the wanted outputs of the drives A, B, C, as bits of 60FEh: the next `write` sends those that differ.
+
+        Bits that are not in a drive's mask (`DigitalIO.outputs`) are ignored.
+        """
 
     def enable(self, alone: str | None = None) -> None:
         """Begin to power up all drives, or only the drive `alone`, the others staying without power.

@@ -12,9 +12,10 @@ from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
 from trirail_drivers.config import Drives
 from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.axis_row import NOTHING_SENT
 from trirail_drivers.driver.cyclic import expected_row
 from trirail_drivers.driver.scaling import Scale
-from trirail_drivers.interface import DriveFault, PowerState
+from trirail_drivers.interface import DigitalIO, DriveFault, PowerState
 
 MISSED_STATUSES = 3
 FOLLOW_TIME = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
@@ -93,9 +94,16 @@ class Cia402Axis(Axis):
         self._unfollowed_since: float | None = None
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
 
+    def assign_io(self, io: DigitalIO) -> None:
+        """Set the digital outputs and inputs that the robot uses, and the exchange that the driver expects then."""
+        super().assign_io(io)
+        self.set_up(process_data.default_exchange(self.node, io), self.units)
+
     def set_up(self, exchange: process_data.Exchange, units: Units) -> None:
-        """Set the frames and units of the exchange."""
+        """Set the frames and units of the exchange. The set-up has left the outputs safe."""
         self.exchange, self.units = exchange, units
+        self.maps_outputs, self.outputs_kept = exchange.outputs is not None, exchange.outputs_kept
+        self.outputs_sent = NOTHING_SENT
         self.velocity_per_metre = units.velocity_per_metre
         self.position_at, self.velocity_at = exchange.setpoints.offset(0), exchange.setpoints.offset(1)
 
@@ -182,6 +190,7 @@ class Cia402Axis(Axis):
         decides = canopen_frames.STATUSWORD.pack(
             _STATE_BITS | (canopen_frames.FOLLOWS_SETPOINTS if exchange.tells_following else 0)
         )
+        inputs = canopen_frames.INPUTS.pack(self.inputs), canopen_frames.INPUTS.pack(self.io.inputs)
         feedback, offset = exchange.feedback, exchange.feedback.offset(process_data.STATUSWORD)
         data, mask = bytearray(feedback.size), bytearray(feedback.size)
         if offset >= 0:
@@ -189,7 +198,10 @@ class Cia402Axis(Axis):
         position, identifier = feedback.offset(process_data.ACTUAL_POSITION), feedback.identifier
         rows = [expected_row(identifier, number, bytes(data), bytes(mask), position_at=position, status_at=offset)]
         if exchange.status is not None:
-            rows.append(expected_row(exchange.status, number, word, decides, status_at=0))
+            beside = inputs if exchange.inputs == exchange.status else (b"", b"")
+            rows.append(expected_row(exchange.status, number, word + beside[0], decides + beside[1], status_at=0))
+        if exchange.inputs not in (None, exchange.status):
+            rows.append(expected_row(exchange.inputs or 0, number, *inputs))
         alive = canopen_frames.NMT_STATE.pack(canopen_frames.OPERATIONAL)
         bits = bytes([canopen_frames.NMT_STATE_BITS if exchange.guarded else 0xFF])
         rows.append(expected_row(canopen_frames.HEARTBEAT + self.node, number, alive, bits, lives=exchange.heard))
@@ -212,7 +224,10 @@ class Cia402Axis(Axis):
         if data[:4] == canopen_frames.MODE_DISPLAY_UPLOADED and self.awaits_mode:
             self._update_mode(data[4])
         elif data[:4] == canopen_frames.STATUSWORD_UPLOADED:
-            self.on_status(data[4:6], now)
+            self._on_statusword(data[4:6], now)
+        elif data[:4] == canopen_frames.OUTPUTS_REFUSED:
+            code = int.from_bytes(data[4:8], "little")
+            self.note_fault("state", 0, f"refuses its digital outputs, object 60FE:01 (SDO abort {code:08X})")
         elif data[:4] == canopen_frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
             self._register_until = -math.inf
             if data[4] == 0:
@@ -241,7 +256,18 @@ class Cia402Axis(Axis):
         return self.held if self.mode.shown or self.held is not None else self.actual
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
-        """Handle TPDO1: the statusword, on change and every STATUS_PERIOD."""
+        """Handle TPDO1: the statusword, and the inputs if they are mapped there, on change and every STATUS_PERIOD."""
+        if self.exchange.inputs is not None and self.exchange.inputs == self.exchange.status:
+            self.on_inputs(data[2:], now)
+            data = data[:2]
+        self._on_statusword(data, now)
+
+    def on_inputs(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
+        """Handle TPDO3: the digital inputs, on change and every STATUS_PERIOD."""
+        (inputs,) = canopen_frames.INPUTS.unpack(data)
+        self.inputs = inputs & self.io.inputs
+
+    def _on_statusword(self, data: bytes | bytearray, now: float) -> None:
         (statusword,) = canopen_frames.STATUSWORD.unpack(data)
         self.status_heard = now
         self.update_status(statusword)

@@ -17,6 +17,8 @@ TPDO1: Final = 0x180
 RPDO1: Final = 0x200
 TPDO2: Final = 0x280
 RPDO2: Final = 0x300
+TPDO3: Final = 0x380
+RPDO3: Final = 0x400
 SDO_ANSWER: Final = 0x580
 SDO_REQUEST: Final = 0x600
 HEARTBEAT: Final = 0x700
@@ -31,6 +33,10 @@ CONTROLWORD: Final = Struct("<H")
 """RPDO1: controlword 6040h."""
 STATUSWORD: Final = Struct("<H")
 """TPDO1: statusword 6041h."""
+OUTPUTS: Final = Struct("<I")
+"""RPDO3: digital outputs 60FEh:01."""
+INPUTS: Final = Struct("<I")
+"""Digital inputs 60FDh: in TPDO1 behind the statusword, or in TPDO3."""
 EMERGENCY: Final = Struct("<HB5s")
 """Error code, error register 1001h, manufacturer-specific bytes."""
 NMT_STATE: Final = Struct("<B")
@@ -46,6 +52,10 @@ MODE_DISPLAY_UPLOAD: Final = b"\x40\x61\x60\x00" + bytes(4)
 """SDO request for the modes of operation display 6061h."""
 CONTROLWORD_DOWNLOAD: Final = b"\x2b\x40\x60\x00"
 """Beginning of the SDO that writes the controlword 6040h; its two bytes and two empty ones follow."""
+OUTPUTS_DOWNLOAD: Final = b"\x23\xfe\x60\x01"
+"""Beginning of the SDO that writes the digital outputs 60FEh:01; their four bytes follow."""
+OUTPUTS_REFUSED: Final = b"\x80\xfe\x60\x01"
+"""Beginning of the answer that refuses it; the abort code follows."""
 MODE_DISPLAY_UPLOADED: Final = b"\x4f\x61\x60\x00"
 """Beginning of the answer with the mode display; the byte of the mode follows."""
 STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 import time
+from collections.abc import Sequence
 from functools import partial
 
 import can
@@ -24,11 +25,11 @@ from trirail_drivers.cia402.objects import describe_protection
 from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, Start
 from trirail_drivers.cia402.other_masters import OtherMasters
 from trirail_drivers.cia402.returning import ReturningCia402
-from trirail_drivers.driver.axis_row import NOWHERE
+from trirail_drivers.driver.axis_row import NOTHING_SENT, NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
-from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
+from trirail_drivers.interface import NO_IO, Clock, DigitalIO, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
 """SYNCs after which a controlword without effect is sent again: the frame may be lost."""
@@ -44,8 +45,10 @@ class Cia402(Driver[Cia402Axis]):
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
+        io: Sequence[DigitalIO] = NO_IO,
     ) -> None:
-        super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening)
+        """`reopening` reopens a lost bus; `io`: digital outputs and inputs of each drive."""
+        super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening, io=io)
         self._other_masters = OtherMasters(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
             self._listen(axis)
@@ -57,11 +60,12 @@ class Cia402(Driver[Cia402Axis]):
             )
         ]
         self._setpoints = tuple(axis.exchange.setpoints.frame() for axis in self._axes)
+        self._outputs = self._output_frames()
         self._heartbeat_due: float | None = None
         self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
-        self._lent_state: list[tuple[int, int]] = []
-        """Controlwords and statuswords for which the tables are filled."""
+        self._lent_state: list[tuple[int, int, int]] = []
+        """Controlwords, statuswords and inputs for which the tables are filled."""
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
@@ -73,9 +77,10 @@ class Cia402(Driver[Cia402Axis]):
         DriveError if a drive's unit of velocity does not fit the sliders' limit `fastest` [m/s], if that is given.
         A drive in fault raises nothing: the feedback reports it and `reset` clears it.
         """
-        self._set_period(period, canopen_frames.TRAFFIC)
+        self._set_period(period, process_data.traffic(axis.exchange for axis in self._axes))
         scales = tuple(axis.scale for axis in self._axes)
-        ones = setup.setup_tasks(self._wire.bus, self._drives, scales, period, self._clock)
+        io = [axis.io for axis in self._axes]
+        ones = setup.setup_tasks(self._wire.bus, self._drives, scales, period, self._clock, io)
         configure = partial(setup.configure, self._wire.bus, self._drives, ones, fastest, awaits=awaits)
         done, lost = self._set_up(configure, awaits=awaits)
         each = [
@@ -101,6 +106,7 @@ class Cia402(Driver[Cia402Axis]):
         """Adopt the state that a drive had at the end of its set-up."""
         self._listen(axis)
         axis.update_position(start.counts)
+        axis.inputs = start.inputs & axis.io.inputs
         axis.error_code = start.error_code
         axis.update_status(start.statusword)
 
@@ -108,6 +114,7 @@ class Cia402(Driver[Cia402Axis]):
         """Create the frames that each cycle sends."""
         self._set_period(self._period, process_data.traffic(axis.exchange for axis in self._axes))
         self._setpoints = tuple(axis.exchange.setpoints.frame() for axis in self._axes)
+        self._outputs = self._output_frames()
         guarded = (axis.node for axis in self._axes if axis.exchange.guarded)
         self._beats[1:] = [Frame(canopen_frames.HEARTBEAT + node, b"\0", remote=True) for node in guarded]
         self._tables.end, self._lent_state = self._tables.end[:0], []
@@ -124,6 +131,8 @@ class Cia402(Driver[Cia402Axis]):
         listen(exchange.feedback.identifier, axis, axis.on_position)
         if exchange.status is not None:
             listen(exchange.status, axis, axis.on_status)
+        if exchange.inputs not in (None, exchange.status):
+            listen(exchange.inputs or 0, axis, axis.on_inputs)
         listen(exchange.emergency, axis, axis.on_emergency)
         listen(canopen_frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
         listen(canopen_frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
@@ -196,16 +205,21 @@ class Cia402(Driver[Cia402Axis]):
             (a.follows, b.follows, c.follows),
             (a.homed, b.homed, c.homed),
             self._unready,
+            (a.inputs, b.inputs, c.inputs),
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC.
 
         Setpoints that are not finite or beyond 32-bit counts latch a fault of cause "setpoint" instead. The next
-        controlwords of powering up follow the setpoints, so that no drive gets power without one.
+        controlwords of powering up follow the setpoints, so that no drive gets power without one. Outputs follow last,
+        also without setpoints.
         """
-        if self._stopped_in_this_cycle:
-            return
+        if not self._stopped_in_this_cycle:
+            self._write_setpoints(position, velocity)
+        self._send_outputs()
+
+    def _write_setpoints(self, position: Triple, velocity: Triple) -> None:
         late = self._clock() - self._synced > self._period
         if self._wanted is not PowerState.OPERATION_ENABLED:
             self._command()  # if frames have to wait, stop commands go first
@@ -233,6 +247,41 @@ class Cia402(Driver[Cia402Axis]):
         self._command()
         self._recover()
 
+    def _output_frames(self) -> tuple[Frame, ...]:
+        """Return a frame of outputs for each drive, or none if no drive takes its outputs by a frame."""
+        if not any(axis.maps_outputs for axis in self._axes):
+            return ()
+        return tuple(Frame(axis.exchange.outputs or 0, bytes(canopen_frames.OUTPUTS.size)) for axis in self._axes)
+
+    def _send_outputs(self) -> None:
+        """Send outputs that differ from those sent last; the drives adopt them at the next SYNC, or by SDO."""
+        for number, axis in enumerate(self._axes):
+            if not (axis.outputs_pending and axis.configured):
+                continue
+            word, wanted = axis.outputs | axis.outputs_kept, axis.outputs
+            if axis.maps_outputs:
+                frame = self._outputs[number]
+                frame.fill(canopen_frames.OUTPUTS, word)
+                sent = self._wire.send(frame)
+            elif axis.unanswered or self._is_being_configured(axis):  # a server takes one request at a time (CiA 301)
+                continue
+            else:
+                sent = self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + canopen_frames.OUTPUTS.pack(word))
+            if sent:
+                axis.outputs_sent = wanted
+
+    def _make_outputs_safe(self) -> None:
+        """Write the safe values of the outputs by SDO, which also works in pre-operational; wait for the answers."""
+        self.set_outputs([axis.io.safe for axis in self._axes])
+        asked = [axis for axis in self._axes if axis.has_outputs and axis.configured]
+        for axis in asked:
+            word = canopen_frames.OUTPUTS.pack(axis.outputs | axis.outputs_kept)
+            axis.unanswered = 0
+            self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + word)
+        deadline = self._clock() + self._drives.sdo_timeout
+        while any(axis.unanswered for axis in asked) and (left := deadline - self._clock()) > 0:
+            self._wire.wait(left, self._clock)
+
     def lend(self) -> Cyclic | None:
         """Return the tables of a cycle; None unless every drive is in its target state and nothing else is pending."""
         due = self._heartbeat_due
@@ -242,12 +291,15 @@ class Cia402(Driver[Cia402Axis]):
             axis.is_steady(_target_of(axis, self._wanted)) for axis in self._axes
         ):
             return None
+        if any(axis.outputs_pending and not axis.maps_outputs for axis in self._axes):
+            return None
         lent, beats = self._tables, len(self._beats)
         if not len(lent.end):
             lent.begin, lent.beats, lent.setpoints = map(packed_frames, ([self._sync], self._beats, self._setpoints))
+            lent.outputs = packed_frames(self._outputs)
             lent.end = lent.setpoints.headers
         lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NOWHERE, lent.times[0]["traffic"]
-        words = [(axis.controlword, axis.statusword) for axis in self._axes]
+        words = [(axis.controlword, axis.statusword, axis.inputs) for axis in self._axes]
         if words != self._lent_state:
             self._lent_state = words
             for axis, frame in zip(self._axes, self._setpoints, strict=True):
@@ -269,9 +321,10 @@ class Cia402(Driver[Cia402Axis]):
         return feedback
 
     def send_on(self, first: int) -> None:
-        """Send the setpoints in the tables that the bus has refused, one at a time."""
+        """Send the setpoints in the tables that the bus has refused, one at a time, and changed outputs."""
         for axis, packed in zip(self._axes[first:], self._tables.setpoints.frames[first:], strict=True):
             axis.setpoints_lost += not self._wire.send(Frame.from_packed(packed.tobytes()))
+        self._send_outputs()
 
     def enable(self, alone: str | None = None) -> None:
         """Begin to power up all drives, or one `alone`; the following writes carry it out, as the states show.
@@ -327,6 +380,7 @@ class Cia402(Driver[Cia402Axis]):
                 continue
             if axis.left_operational:  # its set-up is still valid: only a restarted drive needs a new one
                 self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
+                axis.outputs_sent = NOTHING_SENT  # it may have missed them, or changed them by itself
             axis.clear_faults(now)
             if axis.register_wanted:
                 axis.register_wanted = False
@@ -387,10 +441,12 @@ class Cia402(Driver[Cia402Axis]):
         data = canopen_frames.CONTROLWORD_DOWNLOAD + canopen_frames.CONTROLWORD.pack(word) + bytes(2)
         self._ask(axis, data)
 
-    def _ask(self, axis: Cia402Axis, request: bytes) -> None:
-        """Send a request by SDO."""
-        if self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, request)):
+    def _ask(self, axis: Cia402Axis, request: bytes) -> bool:
+        """Send a request by SDO; return whether the bus took it."""
+        sent = self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, request))
+        if sent:
             axis.note_request(self._clock())
+        return sent
 
     @property
     def _next(self) -> canopen_frames.TargetState:

@@ -74,6 +74,8 @@ USES: Final = {
     "60C1": ObjectUse(_N, "Interpolation data record", "setpoints of mode 7", "refused"),
     "60C2": ObjectUse(_R, "Interpolation time period", "its interpolation", "the time from SYNC to SYNC"),
     "60C4": ObjectUse(_R, "Interpolation data configuration", "an empty buffer", "its own"),
+    "60FD": ObjectUse(_N, "Digital inputs", "digital inputs, where configured", "refused"),
+    "60FE": ObjectUse(_N, "Digital outputs", "digital outputs, where configured", "refused"),
     "6502": ObjectUse(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried, then 7"),
 }
 """Objects by index, or index and subindex, of CiA 301 or, from 6000h on, of CiA 402-2. 605B (shutdown) and 605C

@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Difference, Differences
+from trirail_drivers.cia402.digital_io import check_inputs, configure_outputs
 from trirail_drivers.cia402.drive_units import read_units
 from trirail_drivers.cia402.dry_run import DryRun
 from trirail_drivers.cia402.guarding import configure_watchdogs
@@ -27,7 +28,7 @@ from trirail_drivers.config import Drive, Drives
 from trirail_drivers.driver.conversations import LOG
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
-from trirail_drivers.interface import PowerState
+from trirail_drivers.interface import NO_IO, DigitalIO, PowerState
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""
@@ -79,6 +80,8 @@ class Start(NamedTuple):
     """6041h."""
     error_code: int
     """603Fh if the drive is in fault, else 0."""
+    inputs: int = 0
+    """60FDh if the robot uses digital inputs of the drive, else 0."""
 
 
 class SetupTask(NamedTuple):
@@ -90,6 +93,7 @@ class SetupTask(NamedTuple):
     scale: Scale
     period: float
     """Cycle period [s]."""
+    io: DigitalIO = NO_IO[0]
 
 
 async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
@@ -101,7 +105,7 @@ async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
     dry_run = DryRun(one.remote, read_only=read_only)
     await _switch_off(dry_run if read_only else one.remote, one.drives.stop_timeout)
     made = await configure_drive(one, dry_run)
-    await read_start(dry_run)
+    await read_start(dry_run, one.io)
     return made
 
 
@@ -118,9 +122,13 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
     mode, shown = await configure_mode(differences, modes)
     if drive.homing is not None:
         await configure_homing(differences, drive.homing, units)
+    kept = await configure_outputs(differences, one.io)
+    if one.io.inputs:
+        await check_inputs(differences)
     pdos = Pdos(differences, drive.node)
     setpoints, controlword = await pdos.setpoints(mode)
-    feedback, status, polled = await pdos.feedback()
+    feedback, status, polled, inputs = await pdos.feedback(inputs=bool(one.io.inputs))
+    outputs = await pdos.outputs() if one.io.outputs else None
     await pdos.switch_off_others()
     for key in ((0x603F, 0), (0x1001, 0)):
         if not await remote.has(*key):
@@ -139,6 +147,9 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
         watched.emergency,
         FOLLOWING_BIT not in drive.accept_without,
         shown,
+        outputs,
+        kept,
+        inputs,
     )
     vendor, product, revision, serial = [await remote.peek(0x1018, subindex) for subindex in range(1, 5)]
     device_type = await remote.peek(0x1000) or 0
@@ -201,7 +212,7 @@ async def _switch_off(remote: Remote, seconds: float) -> None:
         )
 
 
-async def read_start(remote: Remote) -> Start:
+async def read_start(remote: Remote, io: DigitalIO) -> Start:
     """Read the present state of a drive."""
     statusword = await remote.read(0x6041)
     in_fault = canopen_frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
@@ -211,4 +222,5 @@ async def read_start(remote: Remote) -> Start:
             error_code = await remote.read(0x603F)
         except SdoRefused:
             error_code = 0
-    return Start(await remote.read(0x6064), statusword, error_code)
+    inputs = await remote.read(0x60FD) if io.inputs else 0
+    return Start(await remote.read(0x6064), statusword, error_code, inputs)

@@ -38,8 +38,9 @@ class OtherMasters:
             self.listen_to(axis)
 
     def listen_to(self, axis: Cia402Axis) -> None:
-        """Listen for setpoints and controlwords of another sender to a drive."""
-        for identifier in {axis.exchange.setpoints.identifier, axis.exchange.controlword} - {None}:
+        """Listen for setpoints, controlwords and outputs of another sender to a drive."""
+        exchange = axis.exchange
+        for identifier in {exchange.setpoints.identifier, exchange.controlword, exchange.outputs} - {None}:
             self._wire.listen(identifier or 0, self, self._sends(f"sends drive {axis.name} PDOs ({identifier:03X})"))
 
     def note_fault(self, cause: str, code: int, text: str) -> None:

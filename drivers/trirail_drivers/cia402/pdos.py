@@ -12,6 +12,8 @@ from trirail_drivers.cia402.process_data import (
     ACTUAL_POSITION,
     CONTROLWORD,
     CYCLIC_SYNCHRONOUS_POSITION,
+    DIGITAL_INPUTS,
+    DIGITAL_OUTPUTS,
     POSITIONS,
     STATUSWORD,
     VELOCITY_OFFSET,
@@ -109,8 +111,57 @@ class Pdos:
             self._drive.lack((0x60B1, 0), "it cannot be mapped into the setpoint's PDO")
         return chosen, control
 
-    async def feedback(self) -> tuple[FeedbackPdo, int | None, bool]:
-        """Return the position's TPDO, with SYNC; the identifier of the statusword's, or None; and whether to poll."""
+    async def outputs(self) -> int | None:
+        """Return the identifier of the digital outputs' RPDO, with SYNC, or None if the drive has none for them."""
+        entries, number = (DIGITAL_OUTPUTS,), canopen_frames.RPDO3 + self._node
+        for index in (RPDO + 2, RPDO + 3, RPDO):
+            if (
+                index not in self._used
+                and (identifier := await self._map(index, number, EVERY_SYNC, entries)) is not None
+            ):
+                return identifier
+        pdo = await self._first_fixed(RPDO, entries, EVERY_SYNC)
+        if pdo is None:
+            self._drive.add_note("its digital outputs are written by SDO, since no RPDO takes 60FE:01: not on a path")
+        return None if pdo is None else pdo.identifier
+
+    async def feedback(self, *, inputs: bool = False) -> tuple[FeedbackPdo, int | None, bool, int | None]:
+        """Return the position's TPDO, with SYNC; the identifier of the statusword's, or None; whether to poll; inputs'.
+
+        The last is the identifier of the TPDO of the digital `inputs`, if they are wanted, which may be the
+        statusword's. DriveError if no TPDO takes them.
+        """
+        chosen, status, polled, beside = await self._feedback_and_status(inputs=inputs)
+        if not inputs or beside:
+            return chosen, status, polled, status if beside else None
+        return chosen, status, polled, await self._inputs()
+
+    async def _inputs(self) -> int:
+        """Return the identifier of a TPDO of the digital inputs alone; DriveError if there is none."""
+        entries, number = (DIGITAL_INPUTS,), canopen_frames.TPDO3 + self._node
+        for index in (TPDO + 2, TPDO + 3, TPDO):
+            if (
+                index not in self._used
+                and (identifier := await self._map(index, number, ON_CHANGE, entries)) is not None
+            ):
+                return identifier
+        if (pdo := await self._first_fixed(TPDO, entries, ON_CHANGE)) is not None:
+            return pdo.identifier
+        raise DriveError(
+            f"drive {self._remote.name}: no TPDO takes its digital inputs 60FD; use inputs of another drive in [inputs]"
+        )
+
+    async def _first_fixed(self, base: int, entries: tuple[int, ...], kind: int) -> PdoParameters | None:
+        """Return an unused PDO that has exactly this mapping, or None."""
+        for index in await self._all(base):
+            pdo = await self._pdo(index)
+            if index not in self._used and pdo.valid and pdo.entries == entries and await self._has_kind(pdo, kind):
+                self._used.add(index)
+                return pdo
+        return None
+
+    async def _feedback_and_status(self, *, inputs: bool) -> tuple[FeedbackPdo, int | None, bool, bool]:
+        """Return position and statusword as `feedback` does, and whether wanted inputs are beside the statusword."""
         timed = await self._remote.has(TPDO, 5) and await self._can_be_prompt(TPDO)
         wanted = [(ACTUAL_POSITION,)] if timed else [(ACTUAL_POSITION, STATUSWORD), (ACTUAL_POSITION,)]
         for entries in wanted:
@@ -126,12 +177,12 @@ class Pdos:
                 self._drive.add_note(
                     f"{title((0x1800, 5))}: it has none that can be used; its statusword comes with the position"
                 )
-            return chosen, None, False
-        status = await self._status()
+            return chosen, None, False, False
+        status, beside = await self._status(inputs=inputs)
         polled = status is None or not await self._timer()
         if polled:
             self._drive.add_note(f"its statusword is also requested by SDO, every {canopen_frames.POLL_PERIOD:g} s")
-        return chosen, status, polled
+        return chosen, status, polled, beside
 
     async def switch_off_others(self) -> None:
         """Switch off unused PDOs: they add bus load that is not budgeted, or accept frames of other senders."""
@@ -313,21 +364,18 @@ class Pdos:
 
     # ------------------------------------------------------------------ the statusword
 
-    async def _status(self) -> int | None:
-        identifier = await self._map(TPDO, canopen_frames.TPDO1 + self._node, ON_CHANGE, (STATUSWORD,))
+    async def _status(self, *, inputs: bool) -> tuple[int | None, bool]:
+        """Return the identifier of the statusword's TPDO, or None, and whether wanted inputs are mapped beside it."""
+        number = canopen_frames.TPDO1 + self._node
+        if inputs:
+            identifier = await self._map(TPDO, number, ON_CHANGE, (STATUSWORD, DIGITAL_INPUTS))
+            if identifier is not None:
+                return identifier, True
+        identifier = await self._map(TPDO, number, ON_CHANGE, (STATUSWORD,))
         if identifier is not None:
-            return identifier
-        for index in await self._all(TPDO):
-            pdo = await self._pdo(index)
-            if (
-                index not in self._used
-                and pdo.valid
-                and pdo.entries == (STATUSWORD,)
-                and await self._has_kind(pdo, ON_CHANGE)
-            ):
-                self._used.add(index)
-                return pdo.identifier
-        return None
+            return identifier, False
+        pdo = await self._first_fixed(TPDO, (STATUSWORD,), ON_CHANGE)
+        return (None if pdo is None else pdo.identifier), False
 
     async def _timer(self) -> bool:
         """Whether the drive repeats its statusword periodically."""

@@ -10,6 +10,7 @@ from typing import Final
 from trirail_drivers.bus.frames import Frame, frame_bits
 from trirail_drivers.bus.load import Traffic
 from trirail_drivers.cia402 import canopen_frames
+from trirail_drivers.interface import NO_IO, DigitalIO
 
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8
@@ -20,6 +21,8 @@ ACTUAL_POSITION: Final = 0x6064_00_20
 TARGET_POSITION: Final = 0x607A_00_20
 VELOCITY_OFFSET: Final = 0x60B1_00_20
 INTERPOLATION_DATA: Final = 0x60C1_01_20
+DIGITAL_INPUTS: Final = 0x60FD_00_20
+DIGITAL_OUTPUTS: Final = 0x60FE_01_20
 """Entries of PDO mappings: index, subindex, bits (CiA 301, 1600h)."""
 
 POSITIONS: Final = {CYCLIC_SYNCHRONOUS_POSITION: TARGET_POSITION, INTERPOLATED_POSITION: INTERPOLATION_DATA}
@@ -135,6 +138,32 @@ class Exchange:
     """Whether bit 12 of its statusword must show that it follows setpoints."""
     mode_shown: bool = True
     """Whether 6061h shows the mode without power too."""
+    outputs: int | None = None
+    """Identifier of the RPDO of the digital outputs, which take effect at the SYNC; None if there are none, or if
+    an SDO writes them."""
+    outputs_kept: int = 0
+    """Bits of 60FEh:01 that are sent as they were at set-up, beside the outputs."""
+    inputs: int | None = None
+    """Identifier of the event-driven TPDO of the digital inputs: the statusword's if they are mapped beside it, else
+    one of their own; None if there are none."""
+
+    @property
+    def status_size(self) -> int:
+        """Length of the statusword's TPDO [bytes]."""
+        return 6 if self.inputs is not None and self.inputs == self.status else 2
+
+    @property
+    def identifiers(self) -> set[int]:
+        """Identifiers of all its PDOs."""
+        each = (
+            self.setpoints.identifier,
+            self.controlword,
+            self.outputs,
+            self.feedback.identifier,
+            self.status,
+            self.inputs,
+        )
+        return {identifier for identifier in each if identifier is not None}
 
     @property
     def name(self) -> str:
@@ -146,7 +175,7 @@ class Exchange:
         return f"{mode}{offset}, statusword {status}{polled}, {'node guarding' if self.guarded else 'heartbeat'}"
 
 
-def default_exchange(node: int) -> Exchange:
+def default_exchange(node: int, io: DigitalIO = NO_IO[0]) -> Exchange:
     """Return the exchange of a drive that has every optional object of CiA 301 and CiA 402-2."""
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
@@ -155,6 +184,8 @@ def default_exchange(node: int) -> Exchange:
         FeedbackPdo(canopen_frames.TPDO2 + node, (ACTUAL_POSITION,)),
         canopen_frames.TPDO1 + node,
         emergency=canopen_frames.EMCY + node,
+        outputs=canopen_frames.RPDO3 + node if io.outputs else None,
+        inputs=canopen_frames.TPDO1 + node if io.inputs else None,
     )
 
 
@@ -164,11 +195,16 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
     cycle = frame_bits(0) + sum(
         frame_bits(exchange.setpoints.size) + frame_bits(exchange.feedback.size) for exchange in exchanges
     )
-    status = sum(frame_bits(2) for exchange in exchanges if exchange.status) / canopen_frames.STATUS_PERIOD
+    # Outputs may change in every cycle.
+    mapped = sum(exchange.outputs is not None for exchange in exchanges)
+    cycle += mapped * frame_bits(canopen_frames.OUTPUTS.size)
+    repeated = [exchange.status_size for exchange in exchanges if exchange.status]
+    repeated += [canopen_frames.INPUTS.size for exchange in exchanges if exchange.inputs not in (None, exchange.status)]
+    status = sum(map(frame_bits, repeated)) / canopen_frames.STATUS_PERIOD
     polls = sum(2 * frame_bits(8) for exchange in exchanges if exchange.polled) / canopen_frames.POLL_PERIOD
     lives = frame_bits(1) * (1 + sum(1 + exchange.guarded for exchange in exchanges))
     return Traffic(
         cycle_bits=cycle,
         background=lambda heartbeat: status + polls + lives / heartbeat,
-        most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
+        most_sent=11 + mapped + sum(exchange.guarded + exchange.polled for exchange in exchanges),
     )

@@ -29,7 +29,7 @@ INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID: the PDO is not used."""
 NO_REMOTE_REQUEST: Final = 1 << 30
 """Bit of a TPDO's COB-ID; some drives always report it, some never."""
-_BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x6502)
+_BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x60FD, 0x60FE, 0x6502)
 
 
 class SdoRefused(DriveError):

@@ -17,7 +17,7 @@ from trirail_drivers.config import Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError
-from trirail_drivers.interface import NAMES, Clock
+from trirail_drivers.interface import NAMES, NO_IO, Clock, DigitalIO
 
 
 def configure(
@@ -47,7 +47,8 @@ def configure(
     raise_combined([error for error in (_velocity_refused(made, fastest) for made in done) if error is not None])
     for one in each:
         send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_START, one.drive.node))
-    starts = run_setups(bus, clock, [one.remote for one in each], "starting", [read_start(one.remote) for one in each])
+    states = [read_start(one.remote, one.io) for one in each]
+    starts = run_setups(bus, clock, [one.remote for one in each], "starting", states)
     raise_combined([each for each in starts if isinstance(each, DriveError)])
     pairs = iter([(made, each) for made, each in zip(done, starts, strict=True) if isinstance(each, Start)])
     return tuple(None if away else next(pairs) for away in absent)
@@ -65,7 +66,7 @@ async def configure_one(one: SetupTask, fastest: float | None, check: Callable[[
     if (refused := _velocity_refused(made, fastest)) is not None:
         raise refused
     send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_START, node))
-    return made, await read_start(one.remote)
+    return made, await read_start(one.remote, one.io)
 
 
 def survey(
@@ -75,31 +76,44 @@ def survey(
     period: float,
     clock: Clock,
     fastest: float | None = None,
+    io: Sequence[DigitalIO] = NO_IO,
 ) -> list[SetUp | DriveError]:
     """Read the drives' identities and the changes of their set-up; nothing is written, and no state changes."""
-    each = _drives(bus, drives, scales, period, clock)
+    each = _drives(bus, drives, scales, period, clock, io)
     conversations = [rehearse_setup(one, read_only=True) for one in each]
     ends = run_setups(bus, clock, [one.remote for one in each], "reading", conversations)
     return [end if isinstance(end, DriveError) else _velocity_refused(end, fastest) or end for end in ends]
 
 
 def setup_tasks(
-    bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock
+    bus: can.BusABC,
+    drives: Drives,
+    scales: tuple[Scale, ...],
+    period: float,
+    clock: Clock,
+    io: Sequence[DigitalIO] = NO_IO,
 ) -> list[SetupTask]:
-    """Return the set-up tasks of the three drives, for a cycle of `period` seconds.
+    """Return the set-up tasks of the three drives, for a cycle of `period` seconds and their digital `io`.
 
     Raises DriveError for settings that no drive can take.
     """
     check_nodes(drives)
     heartbeat_period_ms(drives)
     interpolation_periods(period)
-    return _drives(bus, drives, scales, period, clock)
+    return _drives(bus, drives, scales, period, clock, io)
 
 
-def _drives(bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock) -> list[SetupTask]:
+def _drives(
+    bus: can.BusABC,
+    drives: Drives,
+    scales: tuple[Scale, ...],
+    period: float,
+    clock: Clock,
+    io: Sequence[DigitalIO],
+) -> list[SetupTask]:
     asked = remotes(bus, drives, clock)
-    each = zip(asked, drives.each, scales, strict=True)
-    return [SetupTask(remote, drive, drives, scale, period) for remote, drive, scale in each]
+    each = zip(asked, drives.each, scales, io, strict=True)
+    return [SetupTask(remote, drive, drives, scale, period, digital) for remote, drive, scale, digital in each]
 
 
 def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
@@ -125,15 +139,7 @@ def check_identifiers(done: Sequence[SetUp]) -> None:
     """Raise DriveError if two drives have PDOs of one identifier, as drives with fixed, equal defaults do."""
     owners: dict[int, str] = {}
     for made in done:
-        exchange = made.exchange
-        for identifier in (
-            exchange.setpoints.identifier,
-            exchange.controlword,
-            exchange.feedback.identifier,
-            exchange.status,
-        ):
-            if identifier is None:
-                continue
+        for identifier in sorted(made.exchange.identifiers):
             if identifier in owners:
                 raise DriveError(
                     f"drives {owners[identifier]} and {made.name}: both have a PDO with identifier {identifier:03X}h "

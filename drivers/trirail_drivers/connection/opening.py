@@ -17,7 +17,7 @@ from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.errors import BusAbsentError, BusError, DriveError
-from trirail_drivers.interface import Clock, DriveGroup
+from trirail_drivers.interface import NO_IO, Clock, DigitalIO, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.carriages import Mounted
@@ -77,8 +77,9 @@ def connect(
     capture: Capture | None = None,
     *,
     awaits: bool = False,
+    io: Sequence[DigitalIO] = NO_IO,
 ) -> DriveGroup:
-    """Return the three drives on their bus, not set up yet; `capture` captures every frame.
+    """Return the three drives on their bus, not set up yet, with their digital `io`; `capture` captures every frame.
 
     With `awaits`, a lost bus is reopened in the background of the cycle, and a missing bus is opened when it appears.
 
@@ -99,7 +100,7 @@ def connect(
             raise
         bus = AbsentBus(reopening.name, str(error))
     try:
-        return protocol.driver(bus, section.bitrate, drives, clock, reopening)
+        return protocol.driver(bus, section.bitrate, drives, clock, reopening, io)
     except DriveError:
         bus.shutdown()
         raise

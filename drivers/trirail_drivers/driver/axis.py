@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trirail_drivers.config import Drives
-from trirail_drivers.driver.axis_row import AXIS, AxisRow
+from trirail_drivers.driver.axis_row import AXIS, NOTHING_SENT, AxisRow
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
-from trirail_drivers.interface import Counts, DriveFault
+from trirail_drivers.interface import Counts, DigitalIO, DriveFault
 
 
 class Answers(AxisRow):
@@ -98,6 +98,18 @@ class Axis(Answers):
         self.status_within = self.follows_within = math.inf
         self.counts_per_metre, self.zero = scale.counts_per_metre, scale.offset
         self._missed_positions = drives.missed_positions
+        self.io = DigitalIO()
+        """Digital outputs and inputs that the robot uses."""
+
+    def assign_io(self, io: DigitalIO) -> None:
+        """Set the digital outputs and inputs that the robot uses; the outputs have their safe values."""
+        self.io = io
+        self.has_outputs, self.outputs, self.outputs_sent = bool(io.outputs), io.safe, NOTHING_SENT
+
+    @property
+    def outputs_pending(self) -> bool:
+        """Whether its wanted outputs were not sent yet, or differ from those sent last."""
+        return self.has_outputs and self.outputs != self.outputs_sent
 
     @classmethod
     def in_row(cls, rows: NDArray[np.void], number: int, name: str, node: int, scale: Scale, drives: Drives) -> Self:

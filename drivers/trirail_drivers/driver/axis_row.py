@@ -10,6 +10,8 @@ import numpy as np
 
 NOWHERE: Final = -1
 """Offset of a number that a frame does not have."""
+NOTHING_SENT: Final = -1
+"""Value of `outputs_sent` before any outputs were sent."""
 
 
 class AxisRow(ctypes.Structure):
@@ -65,6 +67,12 @@ class AxisRow(ctypes.Structure):
     """Velocity sent by the last SYNC, if setpoints wait for one [m/s]."""
     in_force: float
     """Position that the bus took last [m]; NaN if it took none."""
+    outputs: int
+    """Wanted digital outputs: bits of 60FEh:01, within the mask."""
+    outputs_sent: int
+    """Digital outputs that the bus took last; NOTHING_SENT if it took none since the set-up."""
+    inputs: int
+    """Newest digital inputs: bits of 60FDh, within the mask."""
 
     # Constant while cycles are quiet.
     floats: bool
@@ -93,6 +101,12 @@ class AxisRow(ctypes.Structure):
     """Offset of the position in the setpoint's frame [bytes]."""
     velocity_at: int
     """Offset of the velocity in the setpoint's frame [bytes]; NOWHERE for none."""
+    has_outputs: bool
+    """Whether it has digital outputs."""
+    maps_outputs: bool
+    """Whether a frame of its own carries them; otherwise an SDO does, which only Python sends."""
+    outputs_kept: int
+    """Other bits of 60FEh:01, which are sent as they were at set-up: those of a drive without a mask 60FEh:02."""
 
 
 _KINDS: Final[dict[str, Any]] = {"float": ctypes.c_double, "int": ctypes.c_int64, "bool": ctypes.c_bool}

@@ -20,7 +20,16 @@ from trirail_drivers.driver.recovery import AnyAxis, Recovery
 from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection, Unready, UnreadyDrives
+from trirail_drivers.interface import (
+    NAMES,
+    NO_IO,
+    Clock,
+    DigitalIO,
+    DriveFault,
+    MissingProtection,
+    Unready,
+    UnreadyDrives,
+)
 
 Result = TypeVar("Result")
 
@@ -41,8 +50,9 @@ class Driver(ABC, Generic[AnyAxis]):
         axis: type[AnyAxis],
         history: int = 0,
         reopening: Reopening | None = None,
+        io: Sequence[DigitalIO] = NO_IO,
     ) -> None:
-        """`history`: number of sent setpoints to keep. `reopening` reopens a lost bus."""
+        """`history`: number of sent setpoints to keep. `reopening` reopens a lost bus. `io`: that of each drive."""
         self.bus_load = 0.0
         self._wire = Wire(bus, self._stop, reopening)
         self._bitrate = bitrate
@@ -53,6 +63,8 @@ class Driver(ABC, Generic[AnyAxis]):
             axis.in_row(self._tables.axes, number, name, drive.node, scale_of(name, drive), drives)
             for number, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True))
         )
+        for each, digital in zip(self._axes, io, strict=True):
+            each.assign_io(digital)
         self._recovery: Recovery[AnyAxis, Any, Any] | None = None
         self._period = 0.0
         self._synced = 0.0
@@ -113,6 +125,17 @@ class Driver(ABC, Generic[AnyAxis]):
             self._recovery.abandon()
 
     @property
+    def path_outputs(self) -> tuple[bool, bool, bool]:
+        """Whether each drive adopts its outputs with a setpoint; otherwise they may not switch on a path."""
+        a, b, c = self._axes
+        return bool(a.maps_outputs), bool(b.maps_outputs), bool(c.maps_outputs)
+
+    def set_outputs(self, words: Sequence[int]) -> None:
+        """Set the wanted outputs, as bits of 60FEh; the next `write` sends those that differ."""
+        for axis, word in zip(self._axes, words, strict=True):
+            axis.outputs = word & axis.io.outputs
+
+    @property
     def traffic(self) -> int:
         """Bits of all frames sent and received since the start, each with worst-case stuffing."""
         return self._wire.traffic + int(self._tables.times[0]["traffic"])
@@ -134,6 +157,7 @@ class Driver(ABC, Generic[AnyAxis]):
             if self._powered():
                 self.quick_stop()
                 self._wait_for_standstill(self._clock() + self._drives.stop_timeout)
+            self._make_outputs_safe()
         self._cut_power()
         self._wire.close()
 
@@ -157,6 +181,9 @@ class Driver(ABC, Generic[AnyAxis]):
     @abstractmethod
     def _wait_for_standstill(self, deadline: float) -> None:
         """Run cycles until the stopping drives have lost their power, or until `deadline` [s]."""
+
+    def _make_outputs_safe(self) -> None:
+        """Set the outputs to their safe values and wait for the answers, if the protocol has outputs."""
 
     @abstractmethod
     def _cut_power(self) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from functools import partial
 
 import can
@@ -23,7 +24,7 @@ from trirail_drivers.driver.axis_row import NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
-from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
+from trirail_drivers.interface import NO_IO, Clock, DigitalIO, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
@@ -51,9 +52,10 @@ class Odrive(Driver[OdriveAxis]):
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
+        io: Sequence[DigitalIO] = NO_IO,
     ) -> None:
         setup.check_nodes(drives)
-        super().__init__(bus, bitrate, drives, clock, OdriveAxis, drives.missed_positions, reopening)
+        super().__init__(bus, bitrate, drives, clock, OdriveAxis, drives.missed_positions, reopening, io)
         for axis in self._axes:
             for number, handler in (
                 (cansimple.GET_VERSION, axis.ignore_answer),

@@ -25,8 +25,8 @@ class Protocol:
     name: str
     """Name in `drives.protocol` of the configuration."""
     driver: Callable[..., DriveGroup]
-    """Return the driver of three drives, from the bus, its bitrate, section [drives], the clock and, if a lost bus can
-    be reopened, a Reopening."""
+    """Return the driver of three drives, from the bus, its bitrate, section [drives], the clock, a Reopening if a
+    lost bus can be reopened, and the digital outputs and inputs of each drive."""
     rules: Callable[[config.Drives, Requirements], Iterator[Rule]]
     """Yield checks for settings that the drives cannot carry out."""
     files: Callable[[config.Drives], Iterator[Rule]]

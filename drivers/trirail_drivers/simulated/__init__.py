@@ -3,6 +3,7 @@
 from trirail_drivers.simulated.bus import SimulatedBus
 from trirail_drivers.simulated.carriages import Carriages
 from trirail_drivers.simulated.devices import SimulatedDevice
+from trirail_drivers.simulated.digital import OutputChange
 from trirail_drivers.simulated.drive import EDS, SimulatedDrive
 from trirail_drivers.simulated.factor_group import Mechanics
 from trirail_drivers.simulated.faultlines import Frames
@@ -14,6 +15,7 @@ __all__ = [
     "Carriages",
     "Frames",
     "Mechanics",
+    "OutputChange",
     "Servo",
     "SimulatedBus",
     "SimulatedDevice",

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from trirail_drivers.interface import PowerState
+from trirail_drivers.simulated.digital import DigitalPins
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.servo import Servo
 
@@ -29,6 +30,10 @@ class SimulatedDevice(Protocol):
     @property
     def emergencies(self) -> Emergencies | None:
         """Errors that it reports by EMCY; None if its protocol has no such message."""
+
+    @property
+    def pins(self) -> DigitalPins | None:
+        """Its digital outputs and inputs; None if its protocol has none."""
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
         """Put it on a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""

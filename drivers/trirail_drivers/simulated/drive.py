@@ -9,6 +9,7 @@ from typing import Final
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated.device import Device, Nmt
 from trirail_drivers.simulated.dictionary import ObjectEntry
+from trirail_drivers.simulated.digital import DigitalPins, Moment
 from trirail_drivers.simulated.factor_group import Mechanics
 from trirail_drivers.simulated.homing import HomingMode
 from trirail_drivers.simulated.power import FAULT_RESET, STATUS, commanded
@@ -70,6 +71,9 @@ class SimulatedDrive(Device):
         self._setpoint_given = False
         self._beyond_window: float | None = None
         self._profile = Profile(self.objects, mechanics, self._mode_changed)
+        self.syncs = 0
+        """Number of SYNCs received since power-on."""
+        self.pins = DigitalPins(self.objects, lambda: Moment(self._now, self.syncs, self.servo.position))
         self.objects.on_write(0x6040, self._control)
         self.objects.on_write(0x607A, self._setpoint_written)
         self.objects.on_write(0x60C1, self._setpoint_written)
@@ -81,7 +85,7 @@ class SimulatedDrive(Device):
 
     def press(self, switches: int) -> None:
         """Press these switches of its slider: bits of the digital inputs 60FDh, if it has that object."""
-        self._profile.inputs.value = switches
+        self.pins.press(switches, self._now)
         self._up_to_date = False
 
     def fail(self, code: int) -> None:
@@ -101,12 +105,15 @@ class SimulatedDrive(Device):
         self._synchronised = self._setpoint_given = False
         self._moved_at = self._now
         self._heard_period = 0.0
+        self.syncs = 0
         self.homing.forget()
         self._profile.restarted()
+        self.pins.restarted()
         self._change(PowerState.SWITCH_ON_DISABLED)
 
     def before_sync(self) -> None:
         """Move from one setpoint to the next, except at the first SYNC: the axis has already moved with time."""
+        self.syncs += 1
         if self._synchronised:
             self._heard_period = self._now - self._moved_at
             self._move(self._step, self._profile.feed_forward)
@@ -114,7 +121,8 @@ class SimulatedDrive(Device):
         self._moved_at = self._now
 
     def time_passed(self, now: float) -> None:
-        """Move with time if no SYNC sets the pace; a velocity offset has no meaning then."""
+        """Move with time if no SYNC sets the pace; a velocity offset has no meaning then. Inputs bounce."""
+        self.pins.poll(now)
         if not self._synchronised and now > self._moved_at:
             self._move(now - self._moved_at, 0.0)
             self._moved_at = now

@@ -30,6 +30,9 @@ faults of a drive:
   fault CODE        breaks down with an EMCY      reboot        loses its supply and its set-up
   stuck             the slider does not move      lag SECONDS   the slider is so far behind
   runaway SPEED     the slider moves with SPEED [m/s] whatever it is told, until it has no power
+faults of its digital outputs and inputs, by their BIT in 60FEh and 60FDh:
+  output-stuck BIT  keeps its state         input-bounces BIT  for 5 ms after each edge
+  reserves BIT      is the maker's: it cannot be switched, and is not in the mask that is read back
 faults of its mechanics and wiring, as a rule beside the rail shows them:
   reversed          the slider goes the other way         scale RATIO    it goes RATIO times as far as counted
   swapped DRIVE     it moves that drive's slider          loose          its encoder does not turn with it
@@ -151,6 +154,7 @@ _OF_FRAMES: Final = {
     "dlc": _Kind("a length from 0 to 8", _between(0, 8, 10), "3"),
 }
 _CODE: Final = _Kind("an error code, four hexadecimal digits", _between(1, 0xFFFF, 16), "4310", momentary=True)
+_BIT: Final = _Kind("a bit from 0 to 31", _between(0, 31, 10), "16")
 _OF_DRIVES: Final = {
     "silent": _Kind(),
     "emcy": _CODE,
@@ -167,8 +171,13 @@ _OF_DRIVES: Final = {
     "loose": _Kind(),
     "slips": _Kind("a share from 0 to 1", _number(lambda share: 0.0 <= share <= 1.0), "0.3"),
     "against": _Kind(),
+    "output-stuck": _BIT,
+    "input-bounces": _BIT,
+    "reserves": _BIT,
     "play": _Kind("metres", _NOT_NEGATIVE, "0.00005"),
 }
+OF_PINS: Final = ("output-stuck", "input-bounces", "reserves")
+"""Faults of digital outputs and inputs."""
 OF_SLIDERS: Final = ("node", "counts")
 """Faults whose DRIVE is a slider, and that override its configuration."""
 _OF_BUS: Final = {

@@ -18,7 +18,7 @@ from trirail_drivers.interface import NAMES, Clock, PowerState
 from trirail_drivers.simulated.carriages import Carriages, Mounted
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.emergency import Emergencies
-from trirail_drivers.simulated.faultlines import OF_SLIDERS, Condition, Fault, FaultSyntaxError, Frames, parse
+from trirail_drivers.simulated.faultlines import OF_PINS, OF_SLIDERS, Condition, Fault, FaultSyntaxError, Frames, parse
 from trirail_drivers.simulated.servo import SOUND
 
 MOVING: Final = 1e-3
@@ -120,6 +120,10 @@ class Faults:
             for index in fault.drives:
                 if self._drives[index].emergencies is None:
                     raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no EMCY; as in: {NAMES[index]} fault 200")
+        if fault.name in OF_PINS:
+            for index in fault.drives:
+                if self._drives[index].pins is None:
+                    raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no digital outputs and inputs")
         if self.idle:
             self._now = self._clock()
         self._active.append(_Active(fault, self._now))
@@ -297,6 +301,12 @@ class Faults:
             drive.servo.forced_velocity = fault["runaway"].value * scale if "runaway" in fault else None
             if "stuck" in fault:
                 drive.servo.forced_velocity = 0.0
+            if drive.pins is not None:
+                stuck, bouncing, reserved = (
+                    sum({1 << round(each.value) for each in begun if each.name == name and index in each.drives})
+                    for name in OF_PINS
+                )
+                drive.pins.apply_faults(stuck=stuck, bouncing=bouncing, reserved=reserved)
             drive.servo.motor = -1.0 if "against" in fault else 1.0
             drive.servo.encoder = self._encoder(fault, scale)
             drive.servo.play = fault["play"].value * scale if "play" in fault else 0.0

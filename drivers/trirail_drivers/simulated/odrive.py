@@ -155,6 +155,11 @@ class SimulatedOdrive:
                 if self._due[name] <= now:  # the next one is overdue as well: skip it
                     self._due[name] = now + period
 
+    @property
+    def pins(self) -> None:
+        """None: CANSimple has no message for its GPIO."""
+        return None
+
     def press(self, switches: int) -> None:
         """Do nothing: CANSimple does not report switches."""
 

@@ -105,7 +105,6 @@ class Profile:
         self._velocity_offset = o.internal(0x60B1, 0)
         self._data_record = o.internal(0x60C1, 1)
         self._period, self._exponent = o.internal(0x60C2, 1), o.internal(0x60C2, 2, -3)
-        self.inputs = o.internal(0x60FD, 0)
         self._following_error = o.internal(0x60F4, 0)
         interpolates = (0x60C1, 1) in o
         supported = sum(1 << mode - 1 for mode in _MODES if mode != INTERPOLATED_POSITION or interpolates)

@@ -244,15 +244,19 @@ class _RecordedDrives:
     bus_load = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
+    path_outputs = (True, True, True)
 
     def __init__(self, records: NDArray[np.void]) -> None:
         positions: list[Any] = records["position"].tolist()
         flags: list[Any] = [map(tuple, records[name].astype(kind).tolist()) for name, kind in _FLAG_FIELDS]
         homing = records["homing"].astype(bool).tolist()
+        inputs: list[Any] = list(map(tuple, records["inputs"].tolist()))
         states: list[Any] = [tuple(map(PowerState, state)) for state in records["drive_state"].tolist()]
         self._feedback = [
-            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now)
-            for position, state, age, follows, homed, now in zip(positions, states, *flags, homing, strict=True)
+            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now, inputs=given)
+            for position, state, age, follows, homed, now, given in zip(
+                positions, states, *flags, homing, inputs, strict=True
+            )
         ]
         self._row = -1
         self._fault: DriveFault | None = None
@@ -288,6 +292,9 @@ class _RecordedDrives:
 
     def home(self) -> None:
         """See trirail_drivers.interface.DriveGroup."""
+
+    def set_outputs(self, words: Sequence[int]) -> None:
+        """Do nothing."""
 
     def stop_homing(self) -> None:
         """See trirail_drivers.interface.DriveGroup."""
@@ -330,6 +337,6 @@ def _simulated_drives(records: NDArray[np.void], config: Config, clock: _Simulat
     start: Any = tuple(records["position"][0].tolist())
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
-    drives = connect(can, config.drives, clock)
+    drives = connect(can, config.drives, clock, io=config.digital_io)
     drives.configure(config.period, config.limits.slider.fastest)
     return drives

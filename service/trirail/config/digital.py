@@ -1,18 +1,122 @@
+"""Sections [outputs] and [inputs] of a configuration file: digital outputs and inputs of the drives, by name."""
+
 from __future__ import annotations
 
-from typing import Literal
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from typing import Annotated, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
+from trirail_drivers.driver.requirements import Rule
+from trirail_drivers.interface import NAMES, DigitalIO
+
+from trirail.errors import ConfigError
+from trirail.wire.marks import OutputName
+
+__all__ = ["Input", "Output", "OutputName", "digital_io", "digital_rules"]
+
+FIRST_BIT = 16
+"""First bit that CiA 402-2 leaves to the maker, in 60FDh and 60FEh."""
+LAST_BIT = 31
 
 
 class Output(Struct, frozen=True, forbid_unknown_fields=True):
+    """A digital output of a drive: section [outputs.NAME]."""
+
     drive: Literal["A", "B", "C"]
-    bit: int
+    """Drive that has the output."""
+    bit: Annotated[int, Meta(ge=0, le=LAST_BIT)]
+    """Its bit of object 60FEh, from the maker's manual: 16 to 31, since CiA 402 reserves the others; bit 0 sets the
+    brake."""
     safe: bool = False
-    delay: float = 0.0
+    """Value while the robot is disabled or in fault, and at the end of the service."""
+    delay: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.0
+    """Switching delay of the device at the output, as a valve's [s]: on a path it switches earlier by it."""
     always: bool = False
+    """Whether it may also be set while the robot is disabled or in fault."""
 
 
 class Input(Struct, frozen=True, forbid_unknown_fields=True):
+    """A digital input of a drive: section [inputs.NAME]."""
+
     drive: Literal["A", "B", "C"]
-    bit: int
+    """Drive that has the input."""
+    bit: Annotated[int, Meta(ge=0, le=LAST_BIT)]
+    """Its bit of object 60FDh, from the maker's manual: 16 to 31, since CiA 402 reserves the others; bits 0 to 3 are
+    limit switches, home switch and interlock."""
+
+
+_RESERVED = {0: "sets the brake"}
+"""Meaning of reserved bits of 60FEh (CiA 402-2)."""
+_RESERVED_INPUTS = {
+    0: "is the negative limit switch",
+    1: "is the positive limit switch",
+    2: "is the home switch",
+    3: "is the interlock",
+}
+"""Meaning of reserved bits of 60FDh (CiA 402-2)."""
+
+
+def digital_rules(outputs: Mapping[str, Output], inputs: Mapping[str, Input], protocol: str) -> Iterator[Rule]:
+    """Yield the checks of all outputs and inputs."""
+    for section, named in (("outputs", outputs), ("inputs", inputs)):
+        for name, each in named.items():
+            key = f"{section}.{name}"
+            yield Rule(key, ("drives.protocol",), partial(_check_protocol, key, protocol))
+            yield Rule(f"{key}.bit", (), partial(_check_bit, section, name, each))
+    for name, output in outputs.items():
+        yield Rule(f"outputs.{name}.bit", ("outputs",), partial(_check_single, name, output, outputs))
+    for name in inputs:
+        yield Rule(f"inputs.{name}", (), partial(_check_name, name, outputs))
+
+
+def _check_protocol(key: str, protocol: str) -> None:
+    if protocol == "odrive":
+        raise ConfigError(
+            f'{key}: drives.protocol = "odrive" has none: CANSimple has no message for an ODrive\'s GPIO; leave the '
+            "section out, or use CiA 402 drives"
+        )
+
+
+def _check_bit(section: str, name: str, each: Output | Input) -> None:
+    if each.bit >= FIRST_BIT:
+        return
+    index, reserved = ("60FEh", _RESERVED) if section == "outputs" else ("60FDh", _RESERVED_INPUTS)
+    meaning = reserved.get(each.bit, "is reserved")
+    raise ConfigError(
+        f"{section}.{name}.bit = {each.bit}: bit {each.bit} of object {index} {meaning} in CiA 402; use one of "
+        f"{FIRST_BIT} to {LAST_BIT}, from the maker's manual"
+    )
+
+
+def _check_single(name: str, output: Output, outputs: Mapping[str, Output]) -> None:
+    """Refuse an output that is another name for an earlier one."""
+    for other, each in itertools.takewhile(lambda item: item[0] != name, outputs.items()):
+        if (each.drive, each.bit) == (output.drive, output.bit):
+            raise ConfigError(
+                f"outputs.{name}.bit = {output.bit}: bit {output.bit} of drive {output.drive} is output {other} "
+                "already; use another bit, or one of the two names"
+            )
+
+
+def _check_name(name: str, outputs: Mapping[str, Output]) -> None:
+    if name in outputs:
+        raise ConfigError(f"inputs.{name}: an output is called {name} already; use another name")
+
+
+def digital_io(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) -> tuple[DigitalIO, DigitalIO, DigitalIO]:
+    """Return the digital outputs and inputs of the drives A, B, C."""
+    a, b, c = (
+        DigitalIO(
+            _bits(output.bit for output in outputs.values() if output.drive == name),
+            _bits(output.bit for output in outputs.values() if output.drive == name and output.safe),
+            _bits(each.bit for each in inputs.values() if each.drive == name),
+        )
+        for name in NAMES
+    )
+    return a, b, c
+
+
+def _bits(numbers: Iterable[int]) -> int:
+    return sum({1 << number for number in numbers})

@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct, structs
 from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
-from trirail_drivers.interface import NAMES, Triple
+from trirail_drivers.interface import NAMES, DigitalIO, Triple
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
-from trirail.config.digital import Input, Output
+from trirail.config.digital import Input, Output, OutputName, digital_io
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import CrossLeg, Geometry, Leg, Room
 from trirail.kinematics.leg import AnyLeg
@@ -345,8 +345,15 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
     """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. Taught poses are not here; the
     service stores them."""
-    outputs: dict[str, Output] = {}
-    inputs: dict[str, Input] = {}
+    outputs: dict[OutputName, Output] = {}
+    """Digital outputs by name."""
+    inputs: dict[OutputName, Input] = {}
+    """Digital inputs by name, each other than an output's."""
+
+    @property
+    def digital_io(self) -> tuple[DigitalIO, DigitalIO, DigitalIO]:
+        """Digital outputs and inputs of the drives A, B, C."""
+        return digital_io(self.outputs, self.inputs)
 
     @property
     def period(self) -> float:

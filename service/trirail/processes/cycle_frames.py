@@ -274,6 +274,36 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
 
 
 @compiled()
+def needs_python(axes: NDArray[np.void], words: NDArray[np.int64]) -> bool:
+    """Whether wanted outputs, words (3,) of bits of 60FEh, differ from those of a drive that takes them by SDO only."""
+    for i in range(3):
+        axis = axes[i]
+        if axis.has_outputs and not axis.maps_outputs and words[i] != axis.outputs_sent:
+            return True
+    return False
+
+
+@compiled()
+def send_outputs(
+    bus: NDArray[np.int64],
+    headers: NDArray[np.uint64],
+    frames: NDArray[np.uint8],
+    axes: NDArray[np.void],
+    times: NDArray[np.void],
+) -> None:
+    """Send the outputs that differ from those sent last, each in the frame of its drive.
+
+    `headers` and `frames` are of PackedFrames, with a frame for each drive, or none. A refused frame stays to be sent.
+    """
+    for i in range(len(headers)):
+        axis = axes[i]
+        if axis.has_outputs and axis.maps_outputs and axis.outputs != axis.outputs_sent:
+            _put(frames[i], 0, axis.outputs | axis.outputs_kept, 4)
+            if send_frames(bus, headers[i : i + 1], frames[i : i + 1], times):
+                axis.outputs_sent = axis.outputs
+
+
+@compiled()
 def exchange_frames(
     bus: NDArray[np.int64],
     period_ns: int,

@@ -30,8 +30,10 @@ from trirail.processes.cycle_frames import (
     TIMINGS,
     begin_cycle,
     end_read,
+    needs_python,
     receive_frames,
     send_frames,
+    send_outputs,
     set_frames,
     take_frames,
 )
@@ -52,7 +54,8 @@ class Reached(IntEnum):
     OBSERVED = 2
     """A following error beyond its limit has been found."""
     SOLVED = 3
-    """The sliders have been solved; the last gate has refused that, it is late, or a frame cannot hold a setpoint."""
+    """The sliders have been solved; the last gate has refused that, it is late, a frame cannot hold a setpoint, or an
+    output must be set by SDO."""
     WRITTEN = 4
     """All is done, except for setpoints that the bus has not taken."""
     DONE = 5
@@ -165,7 +168,7 @@ def _receive(
 @compiled(
     i8(
         *(_STATE, i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
+        *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND),
         *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
@@ -187,6 +190,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     beats: NDArray[np.uint64],
     setpoints: NDArray[np.uint8],
     departures: NDArray[np.uint64],
+    pins: NDArray[np.uint8],
+    switchings: NDArray[np.uint64],
     expected: NDArray[np.void],
     axes: NDArray[np.void],
     times: NDArray[np.void],
@@ -220,10 +225,10 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 ) -> int:
     """Run cycles; return the stage that the newest has reached: Reached.
 
-    `moment` (2,) is room for a struct timespec, `bus` (3,) a BusAccess, `doors` (n, 2) an array for poll, the
-    gateway's first, `hearts` the counters of trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made`
-    (SIZE,) the bytes of `record`; `switches`, `planned`, `words` and `log` are as in control.outputs.switch. All else as
-    in control.cycle and cycle_frames.
+    `moment` (2,) is room for a struct timespec, `bus` (3,) a BusAccess, `pins` and `switchings` the frames of the
+    drives' outputs, `doors` (n, 2) an array for poll, the gateway's first, `hearts` the counters of
+    trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`; `switches`,
+    `planned`, `words` and `log` are as in control.outputs.switch. All else as in control.cycle and cycle_frames.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
@@ -299,6 +304,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         late = _now_ns(state, moment) / 1e9 - s.synced > s.period
         if code >> 2 != 0 or late or not set_frames(setpoints, axes, sliders[0]):
             return Reached.SOLVED
+        if len(switches) and needs_python(axes, words):
+            return Reached.SOLVED
         if len(switches):
             s.logged = outputs.switch(
                 *(switches, planned, words, log, s.logged, law_knots, law_pieces, s.source == COMMAND),
@@ -310,6 +317,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.KINEMATICS)
 
         s.sent = send_frames(bus, departures, setpoints, times)
+        if s.sent == len(departures):
+            send_outputs(bus, switchings, pins, axes, times)
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1

@@ -1,0 +1,77 @@
+"""Set-up of a drive's digital outputs 60FEh and check of its digital inputs 60FDh (CiA 402-2)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from trirail_drivers.cia402.differences import Differences
+from trirail_drivers.cia402.objects import Key, title
+from trirail_drivers.cia402.sdo import SdoRefused, shown
+from trirail_drivers.errors import DriveError
+from trirail_drivers.interface import DigitalIO
+
+INPUTS: Final[Key] = 0x60FD, 0
+OUTPUTS: Final[Key] = 0x60FE, 1
+MASK: Final[Key] = 0x60FE, 2
+
+
+async def configure_outputs(drive: Differences, io: DigitalIO) -> int:
+    """Write the safe values of the outputs, and allow exactly these bits; return the bits that must be kept.
+
+    A drive without the mask 60FEh:02, which is optional, would take every bit: its other bits are kept as they are.
+
+    Raises DriveError if the drive lacks 60FEh:01, or if bits read back differently: those are the maker's.
+    """
+    if not io.outputs:
+        return 0
+    remote = drive.remote
+    if not await remote.has(*OUTPUTS):
+        drive.lack(OUTPUTS, "it has no such object")
+    found = await remote.peek(*OUTPUTS)
+    has_mask = await remote.has(*MASK)
+    kept = 0 if has_mask else (found or 0) & ~io.outputs
+    # The value first: with the new mask it takes effect.
+    await _write(drive, OUTPUTS, kept | io.safe, io.outputs, "safe values")
+    if has_mask:
+        await _write(drive, MASK, io.outputs, 0xFFFF_FFFF, "the named outputs, and no others")
+    held, _ = await remote.wait_until(OUTPUTS, lambda value: not (value ^ io.safe) & io.outputs)
+    if held is not None and (held ^ io.safe) & io.outputs:
+        # Some drives show, or store, only the bits that the mask allowed at the time of the write.
+        await remote.write(*OUTPUTS, kept | io.safe)
+        held, _ = await remote.wait_until(OUTPUTS, lambda value: not (value ^ io.safe) & io.outputs)
+        _refuse_differing(drive, OUTPUTS, held, io.safe, io.outputs)
+    return kept
+
+
+async def check_inputs(drive: Differences) -> None:
+    """Raise DriveError if the drive lacks 60FDh."""
+    if not await drive.remote.has(*INPUTS):
+        drive.lack(INPUTS, "it has no such object")
+
+
+async def _write(drive: Differences, key: Key, value: int, bits: int, why: str) -> None:
+    """Write an object unless it holds a value in these bits; DriveError if a mask reads back differently."""
+    remote = drive.remote
+    current = await remote.peek(*key)
+    if current is not None and not (current ^ value) & bits:
+        return
+    try:
+        await remote.write(*key, value)
+    except SdoRefused as refusal:
+        raise DriveError(f"{refusal}; it is needed for [outputs] of drive {remote.name}") from refusal
+    drive.note(key, current, value, why)
+    if key == MASK:
+        held, _ = await remote.wait_until(key, lambda held: held == value)
+        _refuse_differing(drive, key, held, value, bits)
+
+
+def _refuse_differing(drive: Differences, key: Key, held: int | None, wanted: int, bits: int) -> None:
+    """Raise DriveError if an object, which may be unreadable, holds other values of these bits."""
+    differing = 0 if held is None else (held ^ wanted) & bits
+    if not differing or held is None:
+        return
+    names = ", ".join(str(bit) for bit in range(32) if differing >> bit & 1)
+    raise DriveError(
+        f"drive {drive.remote.name}: {title(key)} stays {shown(*key, held)}, wanted {shown(*key, wanted)}: its maker "
+        f"reserves bit {names}; use other bits in [outputs], from its maker's manual"
+    )

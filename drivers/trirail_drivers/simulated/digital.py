@@ -1,0 +1,96 @@
+"""Digital outputs and inputs of a simulated drive (CiA 402-2, 60FEh and 60FDh), and their faults."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
+
+MAX_CHANGES: Final = 100_000
+"""Changes of outputs that are kept."""
+BOUNCE_TIME_S: Final = 0.005
+"""Time for which a bouncing input bounces after an edge."""
+BOUNCE_PERIOD_S: Final = 0.0007
+"""Time after which it changes meanwhile."""
+_WIDTH: Final = 0xFFFF_FFFF
+
+
+class OutputChange(NamedTuple):
+    """A change of a drive's outputs."""
+
+    time: float
+    """Time of the change [s]."""
+    sync: int
+    """Number of SYNCs received since power-on, including the one at which it happened."""
+    bits: int
+    """New state of all outputs, as bits of 60FEh."""
+    position: float
+    """Position of the drive's axis at the change [counts]."""
+
+
+class Moment(NamedTuple):
+    """Present state of the drive, for a change of its outputs."""
+
+    time: float
+    sync: int
+    position: float
+
+
+class DigitalPins:
+    """Outputs and inputs of a drive.
+
+    An output has the value of its bit in 60FEh:01 where the mask 60FEh:02 allows it, else 0; a drive without the mask
+    allows every bit. Values come by SDO or by an RPDO, which takes effect at the SYNC.
+    """
+
+    def __init__(self, objects: Dictionary, moment: Callable[[], Moment]) -> None:
+        """`moment` returns the present state of the drive."""
+        self._moment = moment
+        self._values = objects.internal(0x60FE, 1)
+        self._mask = objects.internal(0x60FE, 2, 0 if (0x60FE, 2) in objects else _WIDTH)
+        self._inputs = objects.internal(0x60FD, 0)
+        self.bits = 0
+        """Present state of the outputs, as bits of 60FEh."""
+        self.history: deque[OutputChange] = deque(maxlen=MAX_CHANGES)
+        """Changes of the outputs, the newest last."""
+        self._stuck = self._bouncing = self._reserved = 0
+        self._pressed = self._before = 0
+        self._pressed_at = -BOUNCE_TIME_S
+        objects.on_write(0x60FE, self._written)
+
+    def restarted(self) -> None:
+        """Switch the outputs as after power-on. The inputs are what is wired to them."""
+        self._update()
+        self._inputs.value = self._pressed
+
+    def press(self, inputs: int, now: float) -> None:
+        """Set all inputs, as bits of 60FDh, at time `now` [s]."""
+        self._before, self._pressed, self._pressed_at = self._inputs.value, inputs, now
+        self.poll(now)
+
+    def poll(self, now: float) -> None:
+        """Let the inputs bounce until time `now` [s]."""
+        since = now - self._pressed_at
+        value = self._pressed
+        if since < BOUNCE_TIME_S and int(since / BOUNCE_PERIOD_S) % 2:
+            value ^= (self._before ^ self._pressed) & self._bouncing
+        self._inputs.value = value
+
+    def apply_faults(self, *, stuck: int, bouncing: int, reserved: int) -> None:
+        """Set the faults in force, as bits: outputs that stick, inputs that bounce, outputs that the maker reserves."""
+        self._stuck, self._bouncing, self._reserved = stuck, bouncing, reserved
+        self._update()
+
+    def _written(self, entry: ObjectEntry, _old: int) -> None:
+        entry.value &= ~self._reserved
+        self._update()
+
+    def _update(self) -> None:
+        wanted = self._values.value & self._mask.value & ~self._reserved
+        bits = (wanted & ~self._stuck) | (self.bits & self._stuck)
+        if bits != self.bits:
+            self.bits = bits
+            moment = self._moment()
+            self.history.append(OutputChange(moment.time, moment.sync, bits, moment.position))
