@@ -96,7 +96,9 @@ class Rig(ControlRig):
         self.seen: list[list[tuple[int, int]]] = []
         self._send = self.bus.send
         self.bus.send = self._note  # type: ignore[assignment,method-assign]
-        driver = PROTOCOLS[config.drives.protocol].driver(self.bus, config.can.bitrate, config.drives, lambda: self.now)
+        driver = PROTOCOLS[config.drives.protocol].driver(
+            self.bus, config.can.bitrate, config.drives, lambda: self.now, None, config.digital_io
+        )
         driver.configure(config.period)
         if delay is not None:
             delay_answers(self.bus, delay, lambda: self.now)

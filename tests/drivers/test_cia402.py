@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from trirail_drivers.cia402.settings import interpolation_periods
 from trirail_drivers.config import Drive, Drives, Homing
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import ConfigurationRefused, DriveError
-from trirail_drivers.interface import PowerState
+from trirail_drivers.interface import NO_IO, DigitalIO, PowerState
 from trirail_drivers.simulated import SimulatedDrive
 from trirail_drivers.simulated.dictionary import ObjectEntry
 
@@ -50,8 +51,8 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
     first_asked = r"object 1000:00 \(Device type\)"
     keeps_power = "is operation enabled 1 s after {}; expected switch on disabled"
 
-    def __init__(self, config: Drives = CONFIG) -> None:
-        super().__init__(config, Cia402)
+    def __init__(self, config: Drives = CONFIG, io: Sequence[DigitalIO] = NO_IO) -> None:
+        super().__init__(config, partial(Cia402, io=io))
 
     def device(self, drive: Drive, counts: float) -> SimulatedDrive:
         return SimulatedDrive(drive.node, ideal_servo(drive, round(counts)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.objects import FOLLOWING_BIT, PROTECTIONS, USES
 from trirail_drivers.config import Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
-from trirail_drivers.interface import Feedback, PowerState, Triple
+from trirail_drivers.interface import NO_IO, DigitalIO, Feedback, PowerState, Triple
 from trirail_drivers.protocols import PROTOCOLS
 
 PERIOD = 0.002
@@ -63,7 +63,14 @@ class Rig(Cycles[Cia402]):
     period = PERIOD
 
     def __init__(
-        self, name: str, habits: Habits | None = None, truth: Truth | None = None, *, rebased: bool = True, **keys: Any
+        self,
+        name: str,
+        habits: Habits | None = None,
+        truth: Truth | None = None,
+        *,
+        rebased: bool = True,
+        io: Sequence[DigitalIO] = NO_IO,
+        **keys: Any,
     ) -> None:
         make = MAKES[name]
         drives = alike(**{"counts_per_metre": COUNTS, **make.keys, **keys})
@@ -71,7 +78,7 @@ class Rig(Cycles[Cia402]):
         self.wires, self.clock = three(
             name, dict.fromkeys((1, 2, 3), truth or make.truth), habits=habits, rebased=rebased
         )
-        self.drives = Cia402(self.wires, 1_000_000, self.config, self.clock)
+        self.drives = Cia402(self.wires, 1_000_000, self.config, self.clock, io=io)
         self.warnings: list[str] = []
 
     @property

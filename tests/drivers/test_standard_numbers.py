@@ -33,6 +33,8 @@ CANOPEN: dict[str, dict[str, object]] = {
         "RPDO1": 0x200,
         "TPDO2": 0x280,
         "RPDO2": 0x300,
+        "TPDO3": 0x380,
+        "RPDO3": 0x400,
         "SDO_ANSWER": 0x580,
         "SDO_REQUEST": 0x600,
         "HEARTBEAT": 0x700,
@@ -53,6 +55,11 @@ CANOPEN: dict[str, dict[str, object]] = {
         "STATUSWORD_UPLOADED": bytes.fromhex("4b416000"),
         "CONTROLWORD_DOWNLOAD": bytes.fromhex("2b406000"),
     },
+    "CiA 301, 7.2.4 SDO: expedited with four bytes, and abort; CiA 402-2 digital outputs 60FEh:01": {
+        "OUTPUTS_DOWNLOAD": bytes.fromhex("23fe6001"),
+        "OUTPUTS_REFUSED": bytes.fromhex("80fe6001"),
+    },
+    "CiA 402-2, types of 60FDh and 60FEh:01": {"INPUTS": "<I", "OUTPUTS": "<I"},
     "CiA 301, 7.2.4 SDO: expedited with one byte; CiA 402-2 modes of operation display 6061h": {
         "MODE_DISPLAY_UPLOAD": bytes.fromhex("4061600000000000"),
         "MODE_DISPLAY_UPLOADED": bytes.fromhex("4f616000"),

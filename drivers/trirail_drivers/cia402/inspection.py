@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import can
@@ -14,15 +14,23 @@ from trirail_drivers.config import Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.interface import NAMES, Clock
+from trirail_drivers.interface import NAMES, NO_IO, Clock, DigitalIO
 
 
 def inspect(
-    bus: can.BusABC, drives: Drives, period: float, clock: Clock, fastest: float | None = None, *, apply: bool
+    bus: can.BusABC,
+    drives: Drives,
+    period: float,
+    clock: Clock,
+    fastest: float | None = None,
+    *,
+    apply: bool,
+    io: Sequence[DigitalIO] = NO_IO,
 ) -> list[dict[str, Any]]:
     """Return a description of each drive, with the differences between its values and those that the cycle needs.
 
-    `fastest` is the sliders' velocity limit [m/s], which must fit the drives' units.
+    `fastest` is the sliders' velocity limit [m/s], which must fit the drives' units; `io` the digital outputs and
+    inputs of each drive.
 
     With `apply` the differences are written to all three drives or none, without power, and not stored in the drives;
     otherwise nothing is written. "refused" has the reason for a drive that does not answer or is refused. Raises
@@ -30,14 +38,14 @@ def inspect(
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     if apply:
-        results = inspect(bus, drives, period, clock, fastest, apply=False)
+        results = inspect(bus, drives, period, clock, fastest, apply=False, io=io)
         refused = dict.fromkeys(each["refused"] for each in results if each["refused"])
         raise_combined([DriveError(text) for text in refused])
-        done = setup.configure(bus, drives, setup.setup_tasks(bus, drives, scales, period, clock), fastest)
+        done = setup.configure(bus, drives, setup.setup_tasks(bus, drives, scales, period, clock, io), fastest)
         for drive in drives.each:
             bus.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node).message())
         return [_as_json(result[0]) for result in done if result is not None]
-    ends = setup.survey(bus, drives, scales, period, clock, fastest)
+    ends = setup.survey(bus, drives, scales, period, clock, fastest, io)
     looked = [end for end in ends if not isinstance(end, DriveError)]
     results = [
         {"name": name, "node": drive.node, "refused": str(end)} if isinstance(end, DriveError) else _as_json(end)

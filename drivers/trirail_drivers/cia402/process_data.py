@@ -195,9 +195,6 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
     cycle = frame_bits(0) + sum(
         frame_bits(exchange.setpoints.size) + frame_bits(exchange.feedback.size) for exchange in exchanges
     )
-    # Outputs may change in every cycle.
-    mapped = sum(exchange.outputs is not None for exchange in exchanges)
-    cycle += mapped * frame_bits(canopen_frames.OUTPUTS.size)
     repeated = [exchange.status_size for exchange in exchanges if exchange.status]
     repeated += [canopen_frames.INPUTS.size for exchange in exchanges if exchange.inputs not in (None, exchange.status)]
     status = sum(map(frame_bits, repeated)) / canopen_frames.STATUS_PERIOD
@@ -206,5 +203,5 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
     return Traffic(
         cycle_bits=cycle,
         background=lambda heartbeat: status + polls + lives / heartbeat,
-        most_sent=11 + mapped + sum(exchange.guarded + exchange.polled for exchange in exchanges),
-    )
+        most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
+    ).with_outputs(sum(exchange.outputs is not None for exchange in exchanges))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 from trirail_drivers.config import Can, Drives
@@ -37,6 +37,12 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
         yield rule._replace(reads=("drives.protocol", *rule.reads))
 
 
+def io_rules(protocol: str, keys: Iterable[str]) -> Iterator[Rule]:
+    """Yield checks for digital outputs and inputs, at these keys, of drives whose protocol has none."""
+    for key in keys:
+        yield Rule(key, ("drives.protocol",), partial(_check_io, key, protocol))
+
+
 def files(drives: Drives) -> Iterator[Rule]:
     """Yield checks that read the files that the settings name."""
     return PROTOCOLS[drives.protocol].files(drives)
@@ -55,6 +61,11 @@ def _check_option(section: Can, name: str) -> None:
         raise DriveError(f'can.options.{name}: "{section.interface}" has no options, python-can\'s interfaces have')
     if name in _RESERVED_OPTIONS:
         raise DriveError(f"can.options.{name}: not an option; set interface, channel and bitrate in [can]")
+
+
+def _check_io(key: str, protocol: str) -> None:
+    if reason := PROTOCOLS[protocol].without_io:
+        raise DriveError(f'{key}: not with drives.protocol = "{protocol}": {reason}; leave the section out')
 
 
 def _check_heartbeat(drives: Drives, required: Requirements) -> None:

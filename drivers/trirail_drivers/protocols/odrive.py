@@ -44,6 +44,7 @@ ODRIVE = Protocol(
     save=None,
     restore=None,
     protections={name: describe_protection(name) for name in PROTECTIONS},
+    without_io="CANSimple has no message for an ODrive's GPIO",
     states=lambda node: {
         cansimple.identifier(node, cansimple.HEARTBEAT),
         cansimple.identifier(node, cansimple.GET_ENCODER_ESTIMATES),

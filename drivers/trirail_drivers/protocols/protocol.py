@@ -37,7 +37,8 @@ class Protocol:
     """Return one simulated drive, its slider at rest at a position [m]."""
     inspect: Callable[..., list[dict[str, Any]]] | None
     """Return a description of each drive and the changes of its set-up, from the bus, section [drives], the period [s],
-    the clock, the sliders' velocity limit [m/s], and whether to `apply` them; None if drives cannot be inspected."""
+    the clock, the sliders' velocity limit [m/s], whether to `apply` them, and each drive's digital outputs and inputs
+    `io`; None if drives cannot be inspected."""
     save: Callable[..., dict[str, SavedParameters | DriveError]] | None
     """Read the parameters of drives, from the bus, section [drives], the clock and the drives' names; None if they have
     no object dictionary."""
@@ -48,6 +49,8 @@ class Protocol:
     inputs: Callable[[can.BusABC, config.Drives, Clock], Callable[[str], int | None]] | None
     """Return a function that reads a drive's digital inputs by its name, as bits of object 60FDh; None if drives do not
     report them."""
+    without_io: str
+    """Reason for which its drives have no digital outputs and inputs in the cycle; "" if they have."""
     states: Callable[[int], set[int]]
     """Return the identifiers of the state frames of a node."""
     fault_frames: Mapping[str, Frames]

@@ -55,7 +55,8 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
         raise DriveError(f"drives of protocol {protocol} have no objects to be shown; trirail commission finds them")
     with open_bus(settings.can, settings.drives) as bus:
         fastest = settings.limits.slider.fastest
-        found = inspect(bus, settings.drives, settings.period, time.monotonic, fastest, apply=apply)
+        timing = settings.period, time.monotonic, fastest
+        found = inspect(bus, settings.drives, *timing, apply=apply, io=settings.digital_io)
     fit = not any(each["refused"] for each in found)
     if json:
         terminal.json({"ok": fit, "applied": apply, "drives": found})

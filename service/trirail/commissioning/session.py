@@ -67,9 +67,8 @@ class Session:
             words = (f"drives of protocol {drives.protocol} have no objects to inspect; the next step finds them",)
             return Judgement("ok", words), {}
         fastest = self._config.limits.slider.fastest
-        self._inspected = inspect(
-            self.environment.bus, drives, self._config.period, time.monotonic, fastest, apply=False
-        )
+        timing = self._config.period, time.monotonic, fastest
+        self._inspected = inspect(self.environment.bus, drives, *timing, apply=False, io=self._config.digital_io)
         lines = tuple(
             line
             for each in self._inspected

@@ -58,36 +58,31 @@ _RESERVED_INPUTS = {
 """Meaning of reserved bits of 60FDh (CiA 402-2)."""
 
 
-def digital_rules(outputs: Mapping[str, Output], inputs: Mapping[str, Input], protocol: str) -> Iterator[Rule]:
+def named_io(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) -> list[str]:
+    """Return the keys of all outputs and inputs."""
+    return [*(f"outputs.{name}" for name in outputs), *(f"inputs.{name}" for name in inputs)]
+
+
+def digital_rules(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) -> Iterator[Rule]:
     """Yield the checks of all outputs and inputs."""
-    for section, named in (("outputs", outputs), ("inputs", inputs)):
-        for name, each in named.items():
-            key = f"{section}.{name}"
-            yield Rule(key, ("drives.protocol",), partial(_check_protocol, key, protocol))
-            yield Rule(f"{key}.bit", (), partial(_check_bit, section, name, each))
+    for name, output in outputs.items():
+        yield Rule(f"outputs.{name}.bit", (), partial(_check_bit, f"outputs.{name}", output.bit, "60FEh", _RESERVED))
+    for name, given in inputs.items():
+        yield Rule(
+            f"inputs.{name}.bit", (), partial(_check_bit, f"inputs.{name}", given.bit, "60FDh", _RESERVED_INPUTS)
+        )
     for name, output in outputs.items():
         yield Rule(f"outputs.{name}.bit", ("outputs",), partial(_check_single, name, output, outputs))
     for name in inputs:
         yield Rule(f"inputs.{name}", (), partial(_check_name, name, outputs))
 
 
-def _check_protocol(key: str, protocol: str) -> None:
-    if protocol == "odrive":
+def _check_bit(key: str, bit: int, index: str, reserved: Mapping[int, str]) -> None:
+    if bit < FIRST_BIT:
         raise ConfigError(
-            f'{key}: drives.protocol = "odrive" has none: CANSimple has no message for an ODrive\'s GPIO; leave the '
-            "section out, or use CiA 402 drives"
+            f"{key}.bit = {bit}: bit {bit} of object {index} {reserved.get(bit, 'is reserved')} in CiA 402; use one of "
+            f"{FIRST_BIT} to {LAST_BIT}, from the maker's manual"
         )
-
-
-def _check_bit(section: str, name: str, each: Output | Input) -> None:
-    if each.bit >= FIRST_BIT:
-        return
-    index, reserved = ("60FEh", _RESERVED) if section == "outputs" else ("60FDh", _RESERVED_INPUTS)
-    meaning = reserved.get(each.bit, "is reserved")
-    raise ConfigError(
-        f"{section}.{name}.bit = {each.bit}: bit {each.bit} of object {index} {meaning} in CiA 402; use one of "
-        f"{FIRST_BIT} to {LAST_BIT}, from the maker's manual"
-    )
 
 
 def _check_single(name: str, output: Output, outputs: Mapping[str, Output]) -> None:

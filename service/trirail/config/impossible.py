@@ -13,7 +13,7 @@ from trirail_drivers.errors import DriveError, TrirailError
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
-from trirail.config.digital import digital_rules
+from trirail.config.digital import digital_rules, named_io
 from trirail.config.explained import Mistake, overlap
 from trirail.config.network_checks import network_rules
 from trirail.config.tables import BASE, PLATFORM, Config, Limits, corrected_geometry, geometry, room
@@ -100,7 +100,8 @@ def rules(config: Config) -> Iterator[Rule]:
         yield Rule(f"frames.work.{name}", (), partial(_check_frame, name))
     for name in config.poses:
         yield Rule(f"poses.{name}", ("geometry", "correction", *ranges), partial(_check_pose, config, name))
-    yield from digital_rules(config.outputs, config.inputs, config.drives.protocol)
+    yield from settings_checks.io_rules(config.drives.protocol, named_io(config.outputs, config.inputs))
+    yield from digital_rules(config.outputs, config.inputs)
     yield Rule("loop.rate_hz", (), partial(_check_rate, config))
     yield from settings_checks.bus_rules(config.can)
     yield from settings_checks.rules(config.drives, _required(config))

@@ -290,17 +290,19 @@ def send_outputs(
     frames: NDArray[np.uint8],
     axes: NDArray[np.void],
     times: NDArray[np.void],
-) -> None:
-    """Send the outputs that differ from those sent last, each in the frame of its drive.
+) -> bool:
+    """Send the outputs that differ from those sent last, each in the frame of its drive, up to the first refused one.
 
-    `headers` and `frames` are of PackedFrames, with a frame for each drive, or none. A refused frame stays to be sent.
+    Return whether the bus has accepted all. `headers` and `frames` are of PackedFrames, a frame for each drive or none.
     """
     for i in range(len(headers)):
         axis = axes[i]
         if axis.has_outputs and axis.maps_outputs and axis.outputs != axis.outputs_sent:
             _put(frames[i], 0, axis.outputs | axis.outputs_kept, 4)
-            if send_frames(bus, headers[i : i + 1], frames[i : i + 1], times):
-                axis.outputs_sent = axis.outputs
+            if not send_frames(bus, headers[i : i + 1], frames[i : i + 1], times):
+                return False
+            axis.outputs_sent = axis.outputs
+    return True
 
 
 @compiled()

@@ -57,7 +57,7 @@ class Reached(IntEnum):
     """The sliders have been solved; the last gate has refused that, it is late, a frame cannot hold a setpoint, or an
     output must be set by SDO."""
     WRITTEN = 4
-    """All is done, except for setpoints that the bus has not taken."""
+    """All is done, except for setpoints or outputs that the bus has not taken."""
     DONE = 5
     """All is done."""
     CALLED = 6
@@ -317,8 +317,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.KINEMATICS)
 
         s.sent = send_frames(bus, departures, setpoints, times)
-        if s.sent == len(departures):
-            send_outputs(bus, switchings, pins, axes, times)
+        accepted = s.sent == len(departures) and send_outputs(bus, switchings, pins, axes, times)
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1
@@ -329,7 +328,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         batch[s.batched] = made
         s.batched += 1
         _mark(state, moment, Part.RECORD)
-        if s.sent < len(departures):
+        if not accepted:
             return Reached.WRITTEN
         if s.called:
             return Reached.DONE
