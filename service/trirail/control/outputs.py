@@ -71,8 +71,6 @@ SWITCHED: Final = np.dtype(
 """A switch that has happened."""
 LOG_LENGTH = 512
 """Room for switches until Python reads them."""
-LOG_ENOUGH = 128
-"""Switches after which Python is called."""
 TABLE_DELAY = 0.1
 """Time after which switches are reported that do not fill a message [s]."""
 TABLE_LENGTH = 50
@@ -329,9 +327,18 @@ class Outputs:
         )
 
     @property
+    def report_after(self) -> int:
+        """Cycles from the last one without a switch to report to the one behind which switches are reported."""
+        return math.ceil(TABLE_DELAY / self._period)
+
+    @property
     def report_due(self) -> int:
         """Cycle behind which switches are reported."""
-        return self._reported + math.ceil(TABLE_DELAY / self._period)
+        return self._reported + self.report_after
+
+    def take_log(self, logged: int, report_due: int) -> None:
+        """Continue from compiled cycles, with the rows of the log and the cycle behind which they are reported."""
+        self.logged, self._reported = logged, report_due - self.report_after
 
     def close(self, goal: str, outcome: Outcome, cycle: int, record: NDArray[np.void]) -> None:
         """Switch back what a goal has open at its end; the pulses of one that is done last as long as they should."""

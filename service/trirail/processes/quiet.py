@@ -113,6 +113,7 @@ STATE = np.dtype(
         ("sent", "<i8"),  # setpoints that the bus has accepted
         ("logged", "<i8"),  # rows in the log of switches, and the cycle behind which they are reported
         ("report_due", "<i8"),
+        ("report_after", "<i8"),
     ],
     align=True,
 )
@@ -307,11 +308,13 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         if len(switches) and needs_python(axes, words):
             return Reached.SOLVED
         if len(switches):
+            if s.logged == 0:
+                s.report_due = s.cycle + s.report_after
             s.logged = outputs.switch(
                 *(switches, planned, words, log, s.logged, law_knots, law_pieces, s.source == COMMAND),
                 *(s.time, s.period, s.cycle + 1, record),
             )
-            s.called |= s.logged > outputs.LOG_ENOUGH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
+            s.called |= s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
             for i in range(3):
                 axes[i].outputs = row.outputs[i] = words[i]
         _mark(state, moment, Part.KINEMATICS)

@@ -112,6 +112,7 @@ class QuietCycles:
         state["batched"] = self._reports.batched
         state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
         state["listens"] = listens
+        state["report_after"] = control.outputs.report_after
         state["logged"], state["report_due"] = control.outputs.logged, control.outputs.report_due
         self._doors.refresh()
         reached = Reached(quiet.run(*self._tables, *self._motion))
@@ -120,7 +121,7 @@ class QuietCycles:
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
-        control.outputs.logged = left["logged"]
+        control.outputs.take_log(left["logged"], left["report_due"])
         decides = bool(left["called"]) and reached in (Reached.WRITTEN, Reached.DONE)
         called = decides or reached is Reached.CALLED
         self._decided = self._decided or called or once
