@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta, Struct
 
@@ -162,6 +162,23 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     refused until the service is restarted."""
     write: tuple[ObjectWrite, ...] = ()
     """Objects of the maker's to write at set-up."""
+
+
+class DigitalIo(NamedTuple):
+    """Digital outputs and inputs of one drive that the robot uses, as bits of objects 60FEh and 60FDh."""
+
+    outputs: int = 0
+    """Mask of the outputs."""
+    safe: int = 0
+    """Safe values of the outputs: at set-up, and at the end of the service."""
+    inputs: int = 0
+    """Mask of the inputs."""
+
+
+DriveIo = tuple[DigitalIo, DigitalIo, DigitalIo]
+"""Those of the drives A, B, C."""
+NO_IO: DriveIo = DigitalIo(), DigitalIo(), DigitalIo()
+"""Drives without outputs and inputs."""
 
 
 class Drives(Struct, frozen=True, forbid_unknown_fields=True):

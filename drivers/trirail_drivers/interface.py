@@ -87,21 +87,6 @@ class Unready(NamedTuple):
         return f"{self.reason} ({self.objects}{of} {self.counted})" if self.objects else self.reason
 
 
-class DigitalIO(NamedTuple):
-    """Digital outputs and inputs of one drive that the robot uses, as bits of objects 60FEh and 60FDh."""
-
-    outputs: int = 0
-    """Mask of the outputs."""
-    safe: int = 0
-    """Safe values of the outputs: at set-up, and at the end of the service."""
-    inputs: int = 0
-    """Mask of the inputs."""
-
-
-NO_IO = DigitalIO(), DigitalIO(), DigitalIO()
-"""Drives without outputs and inputs."""
-
-
 UnreadyDrives = tuple[Unready | None, Unready | None, Unready | None]
 """Reason for which each drive cannot be reset yet; None if it is configured."""
 
@@ -130,7 +115,7 @@ class Feedback(NamedTuple):
     """Reason for which each drive cannot be reset yet; None if it is configured. A drive without a position since the
     start is reported at its zero, and as not homed."""
     inputs: tuple[int, int, int] = (0, 0, 0)
-    """Newest digital inputs of each drive, without the bits that are not in its mask (`DigitalIO.inputs`)."""
+    """Newest digital inputs of each drive, within its mask (trirail_drivers.config.DigitalIo)."""
 
 
 class DriveGroup(Protocol):
@@ -189,7 +174,7 @@ class DriveGroup(Protocol):
     def set_outputs(self, words: Sequence[int]) -> None:
         """Set the wanted outputs of the drives A, B, C, as bits of 60FEh: the next `write` sends those that differ.
 
-        Bits that are not in a drive's mask (`DigitalIO.outputs`) are ignored.
+        Bits that are not in a drive's mask (trirail_drivers.config.DigitalIo) are ignored.
         """
 
     def enable(self, alone: str | None = None) -> None:

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import SIM, Config, parse
 from trirail.errors import ConfigError
-from trirail_drivers.interface import NAMES, DigitalIO
+from trirail_drivers.config import DigitalIo
+from trirail_drivers.interface import NAMES
 
 TEXT = SIM.read_text()
 VALVE = '[outputs.valve]\ndrive = "A"\nbit = 16\n'
@@ -82,7 +83,7 @@ def test_bits_are_the_makers_and_each_has_one_output(pins: dict[str, tuple[bool,
         with pytest.raises(ConfigError):
             made(*sections)
         return
-    io = made(*sections).digital_io
+    io = made(*sections).drive_io
     for each, drive in zip(io, NAMES, strict=True):
         mine = [(out, bit, safe) for out, where, bit, safe in pins.values() if where == drive]
         masks = [sum({1 << bit for bit in bits}) for bits in (
@@ -90,8 +91,8 @@ def test_bits_are_the_makers_and_each_has_one_output(pins: dict[str, tuple[bool,
             [bit for out, bit, safe in mine if out and safe],
             [bit for out, bit, _ in mine if not out],
         )]  # fmt: skip
-        assert each == DigitalIO(*masks)
+        assert each == DigitalIo(*masks)
 
 
 def test_without_them_drives_have_none() -> None:
-    assert set(itertools.chain.from_iterable(made().digital_io)) == {0}
+    assert set(itertools.chain.from_iterable(made().drive_io)) == {0}

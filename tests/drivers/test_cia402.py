@@ -16,10 +16,10 @@ from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.drives import REPEAT_AFTER, Cia402
 from trirail_drivers.cia402.eds import SERVO
 from trirail_drivers.cia402.settings import interpolation_periods
-from trirail_drivers.config import Drive, Drives, Homing
+from trirail_drivers.config import NO_IO, DigitalIo, Drive, Drives, Homing
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import ConfigurationRefused, DriveError
-from trirail_drivers.interface import NO_IO, DigitalIO, PowerState
+from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated import SimulatedDrive
 from trirail_drivers.simulated.dictionary import ObjectEntry
 
@@ -51,7 +51,7 @@ class Rig(DriverRig[SimulatedDrive, Cia402]):
     first_asked = r"object 1000:00 \(Device type\)"
     keeps_power = "is operation enabled 1 s after {}; expected switch on disabled"
 
-    def __init__(self, config: Drives = CONFIG, io: Sequence[DigitalIO] = NO_IO) -> None:
+    def __init__(self, config: Drives = CONFIG, io: Sequence[DigitalIo] = NO_IO) -> None:
         super().__init__(config, partial(Cia402, io=io))
 
     def device(self, drive: Drive, counts: float) -> SimulatedDrive:

@@ -16,13 +16,13 @@ from drivers.test_foreign import Rig as ForeignRig
 from rigs import STANDSTILL, STEP, Closing
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.inspection import inspect
+from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.interface import NO_IO, DigitalIO
 from trirail_drivers.simulated.dictionary import UNSUPPORTED_ACCESS
 from trirail_drivers.simulated.faultlines import FaultSyntaxError
 
 VALVE, LAMP, PART = 1 << 16, 1 << 17, 1 << 20
-IO = DigitalIO(VALVE | LAMP, LAMP, 0), DigitalIO(0, 0, PART), DigitalIO()
+IO = DigitalIo(VALVE | LAMP, LAMP, 0), DigitalIo(0, 0, PART), DigitalIo()
 """Two outputs of A, of which one is on where it is safe; an input of B."""
 
 
@@ -95,9 +95,9 @@ def test_a_bit_that_the_maker_reserves_is_refused_by_name(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(("io", "lacks"), [(IO[0], 0x60FE), (IO[1], 0x60FD)])
-def test_a_drive_without_them_is_refused_by_the_object(io: DigitalIO, lacks: int) -> None:
+def test_a_drive_without_them_is_refused_by_the_object(io: DigitalIo, lacks: int) -> None:
     name = f"{lacks:04X}"
-    rig = ForeignRig("elmo_gold", Habits(without=frozenset((lacks,))), io=(DigitalIO(), io, DigitalIO()))
+    rig = ForeignRig("elmo_gold", Habits(without=frozenset((lacks,))), io=(DigitalIo(), io, DigitalIo()))
     with pytest.raises(DriveError, match=rf"^drive B: lacks object {name}:0\d \(Digital .*, needed for digital"):
         rig.ready()
     rig.drives.close()
@@ -112,7 +112,7 @@ def test_a_survey_shows_the_changes_and_writes_nothing(rig: Rig) -> None:
 
 
 def test_three_drives_of_outputs_do_not_fit_at_a_full_bus() -> None:
-    each = DigitalIO(VALVE)
+    each = DigitalIo(VALVE)
     loads = []
     for io in (NO_IO, (each, *NO_IO[1:]), (each, each, NO_IO[0])):
         rig = Rig(io=io)
@@ -339,7 +339,7 @@ OF_MAKES = {name: name != "pilz_prbt" for name in MAKES if name != "ros2_cia402_
 def test_outputs_of_others_switch_in_their_cycle(closing: Closing, name: str) -> None:
     """canopen's LocalNode over makers' dictionaries: each cycle's word at the next SYNC, inputs as they change."""
     chance = random.Random(name)
-    io = DigitalIO(VALVE | LAMP, LAMP, PART)
+    io = DigitalIo(VALVE | LAMP, LAMP, PART)
     habits = Habits(values={(0x60FD, 0): 0})  # what an EDS without a default leaves to the drive
     rig = closing(ForeignRig(name, habits, io=(io, io, io)))
     rig.ready()
@@ -373,7 +373,7 @@ def test_outputs_of_others_switch_in_their_cycle(closing: Closing, name: str) ->
 
 
 def test_a_drive_without_a_mask_keeps_its_other_bits(closing: Closing) -> None:
-    io = DigitalIO(VALVE, 0, 0)
+    io = DigitalIo(VALVE, 0, 0)
     rig = closing(ForeignRig("maxon_epos4_compact50_5", Habits(values={(0x60FE, 1): 0x0004_0001}), io=(io, *NO_IO[1:])))
     rig.ready()
     rig.drives.set_outputs((VALVE, 0, 0))
@@ -382,7 +382,7 @@ def test_a_drive_without_a_mask_keeps_its_other_bits(closing: Closing) -> None:
 
 
 def test_a_slave_without_60fe_is_refused_by_name(closing: Closing) -> None:
-    rig = closing(ForeignRig("ros2_cia402_slave", io=(NO_IO[0], DigitalIO(VALVE), NO_IO[0])))
+    rig = closing(ForeignRig("ros2_cia402_slave", io=(NO_IO[0], DigitalIo(VALVE), NO_IO[0])))
     with pytest.raises(DriveError, match=r"^drive B: lacks object 60FE:01"):
         rig.ready()
 
@@ -390,7 +390,7 @@ def test_a_slave_without_60fe_is_refused_by_name(closing: Closing) -> None:
 def test_inputs_have_a_pdo_of_their_own_where_the_statusword_has_none(closing: Closing) -> None:
     """An inhibit time that cannot be set: the statusword comes with the position."""
     habits = Habits(values={(0x1800, 3): 1000}, access={(0x1800, 3): "ro"})
-    rig = closing(ForeignRig("elmo_gold", habits, io=(DigitalIO(inputs=PART), *NO_IO[1:])))
+    rig = closing(ForeignRig("elmo_gold", habits, io=(DigitalIo(inputs=PART), *NO_IO[1:])))
     rig.ready()
     exchange = rig.drives._axes[0].exchange
     assert exchange.status is None

@@ -19,9 +19,9 @@ from trirail.config import SIM, load
 from trirail.errors import ConfigError
 from trirail_drivers.cia402.drives import Cia402
 from trirail_drivers.cia402.objects import FOLLOWING_BIT, PROTECTIONS, USES
-from trirail_drivers.config import Drives
+from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.errors import DriveError, DriveTimeout
-from trirail_drivers.interface import NO_IO, DigitalIO, Feedback, PowerState, Triple
+from trirail_drivers.interface import Feedback, PowerState, Triple
 from trirail_drivers.protocols import PROTOCOLS
 
 PERIOD = 0.002
@@ -69,7 +69,7 @@ class Rig(Cycles[Cia402]):
         truth: Truth | None = None,
         *,
         rebased: bool = True,
-        io: Sequence[DigitalIO] = NO_IO,
+        io: Sequence[DigitalIo] = NO_IO,
         **keys: Any,
     ) -> None:
         make = MAKES[name]

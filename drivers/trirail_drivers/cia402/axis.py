@@ -10,12 +10,12 @@ from trirail_drivers.cia402.codes import describe_error
 from trirail_drivers.cia402.duplicate_node import AnswersAfterStop, AnswersPerSync, warning
 from trirail_drivers.cia402.shown_mode import ShownMode
 from trirail_drivers.cia402.units import Units
-from trirail_drivers.config import Drives
+from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.axis_row import NOTHING_SENT
 from trirail_drivers.driver.cyclic import expected_row
 from trirail_drivers.driver.scaling import Scale
-from trirail_drivers.interface import DigitalIO, DriveFault, PowerState
+from trirail_drivers.interface import DriveFault, PowerState
 
 MISSED_STATUSES = 3
 FOLLOW_TIME = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
@@ -94,7 +94,7 @@ class Cia402Axis(Axis):
         self._unfollowed_since: float | None = None
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
 
-    def assign_io(self, io: DigitalIO) -> None:
+    def assign_io(self, io: DigitalIo) -> None:
         """Set the digital outputs and inputs that the robot uses, and the exchange that the driver expects then."""
         super().assign_io(io)
         self.set_up(process_data.default_exchange(self.node, io), self.units)

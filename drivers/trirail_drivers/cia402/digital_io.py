@@ -7,15 +7,15 @@ from typing import Final
 from trirail_drivers.cia402.differences import Differences
 from trirail_drivers.cia402.objects import Key, title
 from trirail_drivers.cia402.sdo import SdoRefused, shown
+from trirail_drivers.config import DigitalIo
 from trirail_drivers.errors import DriveError
-from trirail_drivers.interface import DigitalIO
 
 INPUTS: Final[Key] = 0x60FD, 0
 OUTPUTS: Final[Key] = 0x60FE, 1
 MASK: Final[Key] = 0x60FE, 2
 
 
-async def configure_outputs(drive: Differences, io: DigitalIO) -> int:
+async def configure_outputs(drive: Differences, io: DigitalIo) -> int:
     """Write the safe values of the outputs, and allow exactly these bits; return the bits that must be kept.
 
     A drive without the mask 60FEh:02, which is optional, would take every bit: its other bits are kept as they are.

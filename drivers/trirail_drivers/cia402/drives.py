@@ -25,11 +25,12 @@ from trirail_drivers.cia402.objects import describe_protection
 from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, Start
 from trirail_drivers.cia402.other_masters import OtherMasters
 from trirail_drivers.cia402.returning import ReturningCia402
+from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.driver.axis_row import NOTHING_SENT, NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
-from trirail_drivers.interface import NO_IO, Clock, DigitalIO, Feedback, PowerState, Triple
+from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
 """SYNCs after which a controlword without effect is sent again: the frame may be lost."""
@@ -45,7 +46,7 @@ class Cia402(Driver[Cia402Axis]):
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
-        io: Sequence[DigitalIO] = NO_IO,
+        io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
         """`reopening` reopens a lost bus; `io`: digital outputs and inputs of each drive."""
         super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening, io=io)

@@ -10,11 +10,11 @@ import can
 from trirail_drivers.cia402 import canopen_frames, setup
 from trirail_drivers.cia402.one_drive import SetUp
 from trirail_drivers.cia402.sdo import run_setups
-from trirail_drivers.config import Drives
+from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError, DriveError
-from trirail_drivers.interface import NAMES, NO_IO, Clock, DigitalIO
+from trirail_drivers.interface import NAMES, Clock
 
 
 def inspect(
@@ -25,7 +25,7 @@ def inspect(
     fastest: float | None = None,
     *,
     apply: bool,
-    io: Sequence[DigitalIO] = NO_IO,
+    io: Sequence[DigitalIo] = NO_IO,
 ) -> list[dict[str, Any]]:
     """Return a description of each drive, with the differences between its values and those that the cycle needs.
 

@@ -24,11 +24,11 @@ from trirail_drivers.cia402.settings import (
     heartbeat_period_ms,
 )
 from trirail_drivers.cia402.units import Units
-from trirail_drivers.config import Drive, Drives
+from trirail_drivers.config import NO_IO, DigitalIo, Drive, Drives
 from trirail_drivers.driver.conversations import LOG
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
-from trirail_drivers.interface import NO_IO, DigitalIO, PowerState
+from trirail_drivers.interface import PowerState
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 """States in which a drive may have current in its motor."""
@@ -93,7 +93,7 @@ class SetupTask(NamedTuple):
     scale: Scale
     period: float
     """Cycle period [s]."""
-    io: DigitalIO = NO_IO[0]
+    io: DigitalIo = NO_IO[0]
 
 
 async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
@@ -212,7 +212,7 @@ async def _switch_off(remote: Remote, seconds: float) -> None:
         )
 
 
-async def read_start(remote: Remote, io: DigitalIO) -> Start:
+async def read_start(remote: Remote, io: DigitalIo) -> Start:
     """Read the present state of a drive."""
     statusword = await remote.read(0x6041)
     in_fault = canopen_frames.power_state(statusword) in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)

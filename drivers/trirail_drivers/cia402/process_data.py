@@ -10,7 +10,7 @@ from typing import Final
 from trirail_drivers.bus.frames import Frame, frame_bits
 from trirail_drivers.bus.load import Traffic
 from trirail_drivers.cia402 import canopen_frames
-from trirail_drivers.interface import NO_IO, DigitalIO
+from trirail_drivers.config import NO_IO, DigitalIo
 
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8
@@ -175,7 +175,7 @@ class Exchange:
         return f"{mode}{offset}, statusword {status}{polled}, {'node guarding' if self.guarded else 'heartbeat'}"
 
 
-def default_exchange(node: int, io: DigitalIO = NO_IO[0]) -> Exchange:
+def default_exchange(node: int, io: DigitalIo = NO_IO[0]) -> Exchange:
     """Return the exchange of a drive that has every optional object of CiA 301 and CiA 402-2."""
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,

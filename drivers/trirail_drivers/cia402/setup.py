@@ -13,11 +13,11 @@ from trirail_drivers.cia402.one_drive import SetUp, SetupTask, Start, configure_
 from trirail_drivers.cia402.sdo import Remote, run_setups
 from trirail_drivers.cia402.sdo_client import Client
 from trirail_drivers.cia402.settings import check_nodes, heartbeat_period_ms, interpolation_periods
-from trirail_drivers.config import Drives
+from trirail_drivers.config import NO_IO, DigitalIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError
-from trirail_drivers.interface import NAMES, NO_IO, Clock, DigitalIO
+from trirail_drivers.interface import NAMES, Clock
 
 
 def configure(
@@ -76,7 +76,7 @@ def survey(
     period: float,
     clock: Clock,
     fastest: float | None = None,
-    io: Sequence[DigitalIO] = NO_IO,
+    io: Sequence[DigitalIo] = NO_IO,
 ) -> list[SetUp | DriveError]:
     """Read the drives' identities and the changes of their set-up; nothing is written, and no state changes."""
     each = _drives(bus, drives, scales, period, clock, io)
@@ -91,7 +91,7 @@ def setup_tasks(
     scales: tuple[Scale, ...],
     period: float,
     clock: Clock,
-    io: Sequence[DigitalIO] = NO_IO,
+    io: Sequence[DigitalIo] = NO_IO,
 ) -> list[SetupTask]:
     """Return the set-up tasks of the three drives, for a cycle of `period` seconds and their digital `io`.
 
@@ -109,7 +109,7 @@ def _drives(
     scales: tuple[Scale, ...],
     period: float,
     clock: Clock,
-    io: Sequence[DigitalIO],
+    io: Sequence[DigitalIo],
 ) -> list[SetupTask]:
     asked = remotes(bus, drives, clock)
     each = zip(asked, drives.each, scales, io, strict=True)

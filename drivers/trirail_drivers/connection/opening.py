@@ -16,8 +16,9 @@ from trirail_drivers.bus import adapters, canerrors
 from trirail_drivers.bus.capture import Capture, CapturedBus
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.unixbus import UnixBus
+from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.errors import BusAbsentError, BusError, DriveError
-from trirail_drivers.interface import NO_IO, Clock, DigitalIO, DriveGroup
+from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.carriages import Mounted
@@ -77,7 +78,7 @@ def connect(
     capture: Capture | None = None,
     *,
     awaits: bool = False,
-    io: Sequence[DigitalIO] = NO_IO,
+    io: Sequence[DigitalIo] = NO_IO,
 ) -> DriveGroup:
     """Return the three drives on their bus, not set up yet, with their digital `io`; `capture` captures every frame.
 

@@ -9,11 +9,11 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from trirail_drivers.config import Drives
+from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis_row import AXIS, NOTHING_SENT, AxisRow
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
-from trirail_drivers.interface import Counts, DigitalIO, DriveFault
+from trirail_drivers.interface import Counts, DriveFault
 
 
 class Answers(AxisRow):
@@ -98,10 +98,10 @@ class Axis(Answers):
         self.status_within = self.follows_within = math.inf
         self.counts_per_metre, self.zero = scale.counts_per_metre, scale.offset
         self._missed_positions = drives.missed_positions
-        self.io = DigitalIO()
+        self.io = DigitalIo()
         """Digital outputs and inputs that the robot uses."""
 
-    def assign_io(self, io: DigitalIO) -> None:
+    def assign_io(self, io: DigitalIo) -> None:
         """Set the digital outputs and inputs that the robot uses; the outputs have their safe values."""
         self.io = io
         self.has_outputs, self.outputs, self.outputs_sent = bool(io.outputs), io.safe, NOTHING_SENT

@@ -14,22 +14,14 @@ from trirail_drivers import config
 from trirail_drivers.bus import load
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.wire import Wire
+from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.driver.axis import Axis
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.recovery import AnyAxis, Recovery
 from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
 from trirail_drivers.driver.scaling import scale_of
 from trirail_drivers.errors import BusError
-from trirail_drivers.interface import (
-    NAMES,
-    NO_IO,
-    Clock,
-    DigitalIO,
-    DriveFault,
-    MissingProtection,
-    Unready,
-    UnreadyDrives,
-)
+from trirail_drivers.interface import NAMES, Clock, DriveFault, MissingProtection, Unready, UnreadyDrives
 
 Result = TypeVar("Result")
 
@@ -50,7 +42,7 @@ class Driver(ABC, Generic[AnyAxis]):
         axis: type[AnyAxis],
         history: int = 0,
         reopening: Reopening | None = None,
-        io: Sequence[DigitalIO] = NO_IO,
+        io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
         """`history`: number of sent setpoints to keep. `reopening` reopens a lost bus. `io`: that of each drive."""
         self.bus_load = 0.0

@@ -20,11 +20,12 @@ import can
 
 from trirail_drivers import config
 from trirail_drivers.bus.reopening import Reopening
+from trirail_drivers.config import NO_IO, DigitalIo
 from trirail_drivers.driver.axis_row import NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
-from trirail_drivers.interface import NO_IO, Clock, DigitalIO, DriveFault, Feedback, Triple
+from trirail_drivers.interface import Clock, DriveFault, Feedback, Triple
 from trirail_drivers.odrive import cansimple, setup
 from trirail_drivers.odrive.axis import OdriveAxis
 from trirail_drivers.odrive.cansimple import AxisState
@@ -52,7 +53,7 @@ class Odrive(Driver[OdriveAxis]):
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
-        io: Sequence[DigitalIO] = NO_IO,
+        io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
         setup.check_nodes(drives)
         super().__init__(bus, bitrate, drives, clock, OdriveAxis, drives.missed_positions, reopening, io)

@@ -23,7 +23,7 @@ HELP: Final = """\
 faults of frames, to and from a drive (FRAMES: all where none are named):
   drop · duplicate · corrupt (one bit) · delay SECONDS · dlc LENGTH
   FRAMES  to the drive: to, nmt sync rpdo1 rpdo2 rpdo3 sdo-request; from it: from, heartbeat, emcy tpdo1 tpdo2 tpdo3
-          sdo-answer; to an ODrive: set_axis_state set_controller_mode set_input_pos clear_errors position-request rxsdo;
+          sdo-answer; an ODrive: set_axis_state set_controller_mode set_input_pos clear_errors position-request rxsdo;
           from it: get_version get_error get_encoder_estimates txsdo; or an identifier: 0x181
 faults of a drive:
   silent            nothing is heard or sent      emcy CODE     an emergency, without more (hexadecimal)

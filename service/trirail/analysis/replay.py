@@ -337,6 +337,6 @@ def _simulated_drives(records: NDArray[np.void], config: Config, clock: _Simulat
     start: Any = tuple(records["position"][0].tolist())
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
-    drives = connect(can, config.drives, clock, io=config.digital_io)
+    drives = connect(can, config.drives, clock, io=config.drive_io)
     drives.configure(config.period, config.limits.slider.fastest)
     return drives

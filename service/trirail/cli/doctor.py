@@ -246,7 +246,7 @@ def _link(config: Config, machine: Machine) -> list[Check]:
     if info.get("info_kind") == "vcan":
         return [Check(name, "ok", "up; virtual, without bitrate and error states")]
     data = info.get("info_data", {})
-    outputs = sum(bool(each.outputs) for each in config.digital_io)
+    outputs = sum(bool(each.outputs) for each in config.drive_io)
     traffic = PROTOCOLS[config.drives.protocol].traffic.with_outputs(outputs)
     queue = _queue(name, link.get("txqlen"), traffic.most_sent)
     return [_bitrate(name, bitrate, data, up), _state(name, data, up), queue, *_coalescing(name, machine.gathered, up)]

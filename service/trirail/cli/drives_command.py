@@ -56,7 +56,7 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
     with open_bus(settings.can, settings.drives) as bus:
         fastest = settings.limits.slider.fastest
         timing = settings.period, time.monotonic, fastest
-        found = inspect(bus, settings.drives, *timing, apply=apply, io=settings.digital_io)
+        found = inspect(bus, settings.drives, *timing, apply=apply, io=settings.drive_io)
     fit = not any(each["refused"] for each in found)
     if json:
         terminal.json({"ok": fit, "applied": apply, "drives": found})

@@ -68,7 +68,7 @@ class Session:
             return Judgement("ok", words), {}
         fastest = self._config.limits.slider.fastest
         timing = self._config.period, time.monotonic, fastest
-        self._inspected = inspect(self.environment.bus, drives, *timing, apply=False, io=self._config.digital_io)
+        self._inspected = inspect(self.environment.bus, drives, *timing, apply=False, io=self._config.drive_io)
         lines = tuple(
             line
             for each in self._inspected

@@ -8,8 +8,9 @@ from functools import partial
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
+from trirail_drivers.config import DigitalIo, DriveIo
 from trirail_drivers.driver.requirements import Rule
-from trirail_drivers.interface import NAMES, DigitalIO
+from trirail_drivers.interface import NAMES
 
 from trirail.errors import ConfigError
 from trirail.wire.marks import OutputName
@@ -100,10 +101,10 @@ def _check_name(name: str, outputs: Mapping[str, Output]) -> None:
         raise ConfigError(f"inputs.{name}: an output is called {name} already; use another name")
 
 
-def digital_io(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) -> tuple[DigitalIO, DigitalIO, DigitalIO]:
+def digital_io(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) -> DriveIo:
     """Return the digital outputs and inputs of the drives A, B, C."""
     a, b, c = (
-        DigitalIO(
+        DigitalIo(
             _bits(output.bit for output in outputs.values() if output.drive == name),
             _bits(output.bit for output in outputs.values() if output.drive == name and output.safe),
             _bits(each.bit for each in inputs.values() if each.drive == name),

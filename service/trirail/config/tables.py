@@ -10,8 +10,8 @@ from typing import Annotated, Literal, cast
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct, structs
-from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
-from trirail_drivers.interface import NAMES, DigitalIO, Triple
+from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, DriveIo, Drives, Name, Timeout, Velocity
+from trirail_drivers.interface import NAMES, Triple
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
@@ -351,7 +351,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     """Digital inputs by name, each other than an output's."""
 
     @property
-    def digital_io(self) -> tuple[DigitalIO, DigitalIO, DigitalIO]:
+    def drive_io(self) -> DriveIo:
         """Digital outputs and inputs of the drives A, B, C."""
         return digital_io(self.outputs, self.inputs)
 

@@ -93,7 +93,7 @@ def windows(config: Config) -> Iterator[Check]:
 def load(config: Config) -> Iterator[Check]:
     """Check the worst-case share of the bus that the cycle takes."""
     rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
-    outputs = sum(bool(each.outputs) for each in config.digital_io)
+    outputs = sum(bool(each.outputs) for each in config.drive_io)
     traffic = PROTOCOLS[drives.protocol].traffic.with_outputs(outputs)
     share = traffic.bus_load(rate, bitrate, drives.heartbeat)
     finding = f"{share:.0%} of {bitrate} bit/s at {rate} Hz"

@@ -80,7 +80,7 @@ class _Rehearsal:
         self._clock = _RehearsedTime()
         self._bus = simulated_bus(config.can, config.drives, self._clock)
         driver = PROTOCOLS[config.drives.protocol].driver
-        self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock, None, config.digital_io)
+        self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock, None, config.drive_io)
         listening = [links.listen(folder / name) for name in Ports._fields]
         gateway, recorder, planner = listening
         self._ports = Ports(Port(gateway), Port(recorder), Port(planner))
@@ -216,7 +216,7 @@ def main(
         capture = Capture() if config.telemetry.capture_can else None
         # Simulated drives that have died come back with the service's next start only: there is nothing to wait for.
         awaits = config.can.interface != "simulated"
-        drives = connect(bus(), config.drives, capture=capture, awaits=awaits, io=config.digital_io)
+        drives = connect(bus(), config.drives, capture=capture, awaits=awaits, io=config.drive_io)
         drives.configure(config.period, config.limits.slider.fastest, awaits=True)
         lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)
