@@ -27,7 +27,7 @@ from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire.goal_kind import GoalKind, field_description
-from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, VelocityGoal
+from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.messages import GoalReply
 from trirail.wire.state import NamedPose
 
@@ -64,7 +64,14 @@ def test_every_argument_is_described(name: str, page: App, run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "kind"), [("goto", PoseGoal), ("move", MoveGoal), ("sliders", SlidersGoal), ("jog", VelocityGoal)]
+    ("command", "kind"),
+    [
+        ("goto", PoseGoal),
+        ("move", MoveGoal),
+        ("sliders", SlidersGoal),
+        ("jog", VelocityGoal),
+        ("follow", TrajectoryGoal),
+    ],
 )
 def test_an_option_of_a_goal_is_described_as_its_field_is(command: str, kind: type[GoalKind]) -> None:
     page = dict(pages())[command]
@@ -72,7 +79,7 @@ def test_an_option_of_a_goal_is_described_as_its_field_is(command: str, kind: ty
         argument.name.removeprefix("--"): argument.parameter.help
         for argument in page.assemble_argument_collection(parse_docstring=True)
     }
-    for field in {"speed", "blend", "tool", "frame"} & set(told):
+    for field in {"speed", "blend", "tool", "frame", "stretch"} & set(told):
         assert str(told[field]).lower().startswith(field_description(kind, field).lower())
 
 

@@ -30,7 +30,7 @@ from trirail.cli.options import (
 from trirail.cli.options import poses as poses_of_robot
 from trirail.naming import Labels
 from trirail.wire import boundary
-from trirail.wire.goals import Goal, MoveGoal, PoseGoal
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrajectoryGoal
 from trirail.wire.messages import CommandReply
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.units import LENGTH, quantity
@@ -224,7 +224,7 @@ def follow(
     file: Path,
     /,
     *,
-    stretch: Annotated[bool, Flag] = False,
+    stretch: Annotated[bool, Flag, described(TrajectoryGoal, "stretch")] = False,
     go_there: Annotated[bool, Flag] = False,
     wait: Wait = False,
     service: Service = HERE,
@@ -235,8 +235,6 @@ def follow(
     ----------
     file
         CSV with columns t, x, y, phi (and vx, vy, w, and ax, ay, e), or JSON with a list of points.
-    stretch
-        Slow down what is too fast, instead of refusing it.
     go_there
         Go to its first point before, by an ordinary goal, if the robot is not there.
     """

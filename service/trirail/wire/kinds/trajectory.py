@@ -28,6 +28,10 @@ LONGEST = 86_400.0
 Time = Annotated[float, Meta(ge=-1e10, le=1e10)]
 """By any clock [s]."""
 
+Stretch = Annotated[
+    bool, Meta(description="slow a trajectory that is too fast for a slider or the platform, instead of refusing it")
+]
+
 
 class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     """Where the platform is at a time [s]: x, y [m], phi [rad]; how fast and how accelerated, where given."""
@@ -68,8 +72,7 @@ class TrajectoryGoal(GoalKind, frozen=True, tag="trajectory"):
     points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=MAX_PART)]
     """By rising time; the first is where the robot stands, the last at rest."""
     id: OwnId = None
-    stretch: bool = False
-    """Slow a trajectory that is too fast for a slider or the platform, instead of refusing it."""
+    stretch: Stretch = False
     settle: bool = True
     """Whether it is done only when the robot is measured to be in position, as any other goal; else when its path has
     ended."""
