@@ -97,7 +97,7 @@ def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(
     program: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if program.startswith("sleep"):
-        monkeypatch.setattr(mark_source, "NEWER_WITHIN", 0.05)
+        monkeypatch.setattr(mark_source, "PICTURE_TIMEOUT_S", 0.05)
 
     def look() -> None:
         with mark_source.program(program) as (ask, _):
@@ -143,8 +143,8 @@ def test_pictures_that_are_not_taken_anew_or_are_none_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cv2 = pytest.importorskip("cv2")
-    monkeypatch.setattr(mark_source, "NEWER_WITHIN", 0.1)
-    monkeypatch.setattr(mark_source, "WRITTEN_WITHIN", 0.1)
+    monkeypatch.setattr(mark_source, "PICTURE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(mark_source, "WRITE_TIMEOUT_S", 0.1)
     cv2.imwrite(str(tmp_path / "left.png"), np.full((240, 320), 90, np.uint8))
     with mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _):
         assert look() == {}

@@ -295,7 +295,7 @@ def test_what_is_no_number_is_refused_by_every_method_and_not_sent(
                 for value in NONE:
                     with pytest.raises((RefusedError, ValueError)) as found:
                         await done(robot, call, value)
-                    of_record = "must be a finite number" in str(found.value)  # before the client gets it
+                    of_record = "is not a finite number" in str(found.value)  # before the client gets it
                     assert of_record or getattr(found.value, "code", None) is RefusalCode.MALFORMED, (name, value)
                     assert SERVICE[0].taken() == [], (name, value)
 

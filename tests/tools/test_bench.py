@@ -21,7 +21,7 @@ import pytest
 from bench_latency import Setpoint
 from bench_rig import QUANTILES, Rig
 from trirail.diagnosis.bare_loop import Cycles
-from trirail.wire.records import PARTS
+from trirail.wire.records import PART_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_what_one_users_flood_costs_another_is_measured(rig: Rig) -> None:
 def test_the_loop_is_measured_beside_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
     told = bench_loop.measure(0.6, (1000,), 1)
     (found,) = told["rates"]
-    assert set(found["parts"]) == set(PARTS)
+    assert set(found["parts"]) == set(PART_NAMES)
     bare = found["bare"]
     assert 0 < bare["answers"] <= 3 * bare["cycles"]
     assert all(is_spread(found[what]) for what in ("to_setpoints", "to_record"))

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 ARCSECONDS = 3600.0 * 180.0 / math.pi
-ENDED_WELL = ("reached", "calibrated", "checked")
+SUCCESSFUL_ENDS = ("reached", "calibrated", "checked")
 
 
 def show_recorded(alignments: list[AlignmentSummary]) -> None:
     """Print each with what its marks had to go, look by look."""
     terminal.out.print("\nalignments")
     for each in alignments:
-        colour = "green" if each.end in ENDED_WELL else "yellow"
+        colour = "green" if each.end in SUCCESSFUL_ENDS else "yellow"
         made = f", {terminal.counted(each.corrections, 'correction')}" if each.purpose == "alignment" else ""
         looks = f"{terminal.counted(each.looks, 'look')}{made} in {each.seconds:.2f} s"
         who = terminal.plain(f"{each.id}  {each.purpose} of {each.user}")
@@ -40,11 +40,11 @@ def show_calibration(found: CameraCalibration, file: Path) -> None:
     """Print what a calibration has found, and where it is kept."""
     for name, view in found.views.items():
         mirrored = ", mirrored" if view.mirrored else ""
-        terminal.say(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
+        terminal.print_line(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
     for name, mark in found.marks.items():
         (x, y), (dx, dy) = mark.place, mark.deviation
-        terminal.say(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
-    terminal.say(f"residual {found.noise:.3f} pixel; kept in {file}")
+        terminal.print_line(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
+    terminal.print_line(f"residual {found.noise:.3f} pixel; kept in {file}")
 
 
 def show_changes(changes: Iterable[ViewChange]) -> None:
@@ -60,32 +60,32 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
         )
 
 
-def printed(
-    wishes: Generator[AlignmentRequest, Observation, T], looks: int | None
+def print_looks(
+    requests: Generator[AlignmentRequest, Observation, T], looks: int | None
 ) -> Generator[AlignmentRequest, Observation, T]:
     """Wish for the same, and print each look as it comes; `looks` is how many there will be, where that is known."""
     from trirail.alignment.alignment_request import LookReport
 
     number = 0
     try:
-        wish = next(wishes)
+        request = next(requests)
         while True:
-            if isinstance(wish, LookReport) and wish.observation is not None:
+            if isinstance(request, LookReport) and request.observation is not None:
                 number += 1
                 of = "" if looks is None else f" of {looks}"
-                terminal.say(f"look {number}{of}: {_what(wish, wish.observation)}")
-            wish = wishes.send((yield wish))
+                terminal.print_line(f"look {number}{of}: {_describe_look(request, request.observation)}")
+            request = requests.send((yield request))
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
 
 
-def _what(report: LookReport, seen: Observation) -> str:
+def _describe_look(report: LookReport, seen: Observation) -> str:
     if report.measurement is None:
         return ", ".join(f"{name} ({u:.2f}, {v:.2f})" for name, (u, v) in seen.marks.items()) or "no marks"
-    return measured(report.measurement) + ("; corrects it" if report.correction is not None else "")
+    return format_measurement(report.measurement) + ("; corrects it" if report.correction is not None else "")
 
 
-def measured(found: Measurement) -> str:
+def format_measurement(found: Measurement) -> str:
     """Return how a part lies, in a line."""
     x, y = found.shift
     return (
@@ -104,4 +104,4 @@ def show_alignment(found: Alignment) -> None:
         "farther apart",
     }
     made = terminal.counted(len(found.corrections), "correction")
-    terminal.say(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")
+    terminal.print_line(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")

@@ -30,12 +30,12 @@ Look = Callable[[], "Marks"]
 LINE = dict[str, tuple[float, float]]
 prepare(LINE)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
-NEWER_WITHIN, WRITTEN_WITHIN, POLL = 30.0, 1.0, 0.02
+PICTURE_TIMEOUT_S, WRITE_TIMEOUT_S, POLL_S = 30.0, 1.0, 0.02
 """How long a line or newer pictures are waited for, how long one may take to be written, how often it is looked [s]."""
-ENDS_WITHIN = 5.0
+EXIT_TIMEOUT_S = 5.0
 """How long a program may take to end when it is told to [s]."""
 INSTALL = "pip install 'trirail[vision]'"
-AT_ONCE, MOST_KEPT = 0.002, 16
+BUFFERED_S, MAX_BUFFERED = 0.002, 16
 """A picture that comes sooner was waiting [s]; so many may wait."""
 
 
@@ -75,15 +75,17 @@ def program(command: str) -> Iterator[Source]:
     except (OSError, ValueError) as error:
         raise TrirailError(f"cannot run {command!r}: {error}; it is to print one line of JSON for each look") from error
 
-    def look() -> Marks:
+    def find_marks() -> Marks:
         with contextlib.suppress(BrokenPipeError):  # it has ended, and may have said something before
             stdin.write("look\n")
             stdin.flush()
-        if not select.select([stdout], [], [], NEWER_WITHIN)[0]:
-            raise TrirailError(f"{command!r} has printed no line in {NEWER_WITHIN:g} s: does it flush what it prints?")
+        if not select.select([stdout], [], [], PICTURE_TIMEOUT_S)[0]:
+            raise TrirailError(
+                f"{command!r} has printed no line in {PICTURE_TIMEOUT_S:g} s: does it flush what it prints?"
+            )
         line = stdout.readline()
         if not line:
-            code = process.wait(ENDS_WITHIN)
+            code = process.wait(EXIT_TIMEOUT_S)
             raise TrirailError(f"{command!r} has ended with exit code {code}: it is to print a line for each it reads")
         try:
             marks: Marks = decoded(line, LINE)
@@ -93,11 +95,11 @@ def program(command: str) -> Iterator[Source]:
         return marks
 
     try:
-        yield Source(look)
+        yield Source(find_marks)
     finally:
         process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(ENDS_WITHIN)
+            process.wait(EXIT_TIMEOUT_S)
         process.kill()
         process.wait()
         for pipe in (stdin, stdout):
@@ -121,13 +123,15 @@ def folder(
 
     used: set[Path] = set()
 
-    def look() -> Marks:
-        deadline = time.monotonic() + NEWER_WITHIN
+    def find_marks() -> Marks:
+        deadline = time.monotonic() + PICTURE_TIMEOUT_S
         asked = {each: _written(each) for each in used}
         while any(_written(each) <= at for each, at in asked.items()):
             if time.monotonic() > deadline:
-                raise TrirailError(f"{path}: no newer pictures within {NEWER_WITHIN:g} s: does what takes them run?")
-            time.sleep(POLL)
+                raise TrirailError(
+                    f"{path}: no newer pictures within {PICTURE_TIMEOUT_S:g} s: does what takes them run?"
+                )
+            time.sleep(POLL_S)
         pictures = {each.stem: each for each in sorted(path.glob("[!.]*")) if each.suffix.lower() in PICTURES}
         if not pictures:
             raise TrirailError(f"{path}: no picture in it; wanted is one for each mark, as left.png")
@@ -138,16 +142,16 @@ def folder(
                 raise TrirailError(
                     f"{path}: no picture {window.picture} for mark {name}; there are {', '.join(pictures)}"
                 )
-            whole_by = time.monotonic() + WRITTEN_WITHIN
+            whole_by = time.monotonic() + WRITE_TIMEOUT_S
             while (grey := cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) is None:
                 if time.monotonic() > whole_by:
                     raise TrirailError(f"{file}: no picture that OpenCV reads; write it as .{file.name} and rename it")
-                time.sleep(POLL)
+                time.sleep(POLL_S)
             used.add(file)
             marks.update(_marks(name, grey, window, shape, turn))
         return marks
 
-    yield Source(look, {name: window.picture for name, window in windows.items()} or None)
+    yield Source(find_marks, {name: window.picture for name, window in windows.items()} or None)
 
 
 @contextlib.contextmanager
@@ -175,7 +179,7 @@ def cameras(
                 raise TrirailError(f"cannot open camera {device} of {names}: is it plugged in, and may you read it?")
             captures[device] = capture
 
-        def look() -> Marks:
+        def find_marks() -> Marks:
             marks: dict[str, tuple[float, float]] = {}
             for device, capture in captures.items():
                 frame = newest(capture, cv2.CAP_PROP_FRAME_COUNT)
@@ -187,7 +191,7 @@ def cameras(
                         marks.update(_marks(name, grey, windows.get(name, MarkWindow(name)), shape, turn))
             return marks
 
-        yield Source(look, {name: f"camera {device}" for name, device in devices.items()} if windows else None)
+        yield Source(find_marks, {name: f"camera {device}" for name, device in devices.items()} if windows else None)
 
 
 def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.monotonic) -> Any:
@@ -197,9 +201,9 @@ def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.mon
     comes. The first new one may have been begun before.
     """
     film = capture.get(frame_count) > 0
-    for _ in range(0 if film else MOST_KEPT):
+    for _ in range(0 if film else MAX_BUFFERED):
         asked = clock()
-        if not capture.grab() or clock() - asked > AT_ONCE:
+        if not capture.grab() or clock() - asked > BUFFERED_S:
             break
     if film:
         capture.grab()
@@ -222,8 +226,8 @@ def _marks(name: str, grey: Any, window: MarkWindow, shape: MarkShape, turn: flo
     if window.width and (window.u + window.width > columns or window.v + window.height > rows):
         raise TrirailError(f"the window of {name} is beyond its picture of {columns} × {rows} pixels")
     bottom, right = (window.v + window.height, window.u + window.width) if window.width else (rows, columns)
-    found = find(grey[window.v : bottom, window.u : right], shape, turn)
-    return {} if found is None else {name: (found.u + window.u, found.v + window.v)}
+    mark = find(grey[window.v : bottom, window.u : right], shape, turn)
+    return {} if mark is None else {name: (mark.u + window.u, mark.v + window.v)}
 
 
 def _opencv() -> Any:
@@ -265,8 +269,8 @@ class MarkSource:
         """Open it. Raises TrirailError."""
         from trirail.alignment.shapes import MarkShape
 
-        given = [self.program is not None, self.pictures is not None, bool(self.camera)]
-        if sum(given) != 1:
+        selected = [self.program is not None, self.pictures is not None, bool(self.camera)]
+        if sum(selected) != 1:
             raise TrirailError("marks are from one of --program, --pictures and --camera; give one of them")
         shape, turn = MarkShape(self.shape, self.size), math.radians(self.turn)
         if self.window and self.program is not None:

@@ -18,7 +18,7 @@ from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import Event
 from trirail.wire.packets import Status, Welcome
 from trirail.wire.state import (
-    Commanded,
+    CommandedMotion,
     FrameCounts,
     GoalState,
     Info,
@@ -153,7 +153,7 @@ class StateMaker:
             pose=Pose(*row["pose"].tolist()),
             velocity=_triple(self._velocity),
             acceleration=_triple(self._acceleration),
-            commanded=Commanded(
+            commanded=CommandedMotion(
                 pose=Pose(*row["commanded_pose"].tolist()),
                 pose_velocity=_triple(row["commanded_pose_velocity"]),
                 pose_acceleration=_triple(row["commanded_pose_acceleration"]),
