@@ -128,8 +128,8 @@ def test_nothing_else_is_read_otherwise_for_its_commas(line: str) -> None:
         ("status --connect nowhere", "a locator is protocol/address, such as tcp/192.168.1.7:7447"),
         ("status --connect tcp/127.0.0.1:x", "no service at tcp/127.0.0.1:x"),
         (f"watch --connect {NOBODY}", f"no service at {NOBODY}"),
-        ("status --robot a/b", "robot 'a/b' is no name"),
-        ("status --robot *", "robot '*' is no name"),
+        ("status --robot a/b", "robot 'a/b' is not a valid name"),
+        ("status --robot *", "robot '*' is not a valid name"),
         ("view no.rrd", "no.rrd is no file"),
         ("report no.rrd", "no.rrd: No such file or directory"),
         ("replay no.rrd", "no.rrd: No such file or directory"),
@@ -158,7 +158,7 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
-        ("goto ../../etc", 1, "pose '../../etc' is no name: letters, digits, - and _, at most 64 are taken"),
+        ("goto ../../etc", 1, "pose '../../etc' is not a valid name; use letters, digits, - and _, at most 64"),
         ("goto a/b", 1, "letters, digits, - and _"),
         ("goto 5mm", 2, "goto takes X, Y and PHI, or the NAME of a pose"),
         ("goto 5mm 0", 2, "goto takes X, Y and PHI: here are X = 5mm and Y = 0.000 mm, and PHI is missing, the angle"),

@@ -182,7 +182,7 @@ def test_the_end_is_told_thirty_days_before(here: Path) -> None:
     assert said.endswith("users/ann: expires in 29 days; renew it with: trirail keys renew")
     with pytest.raises(ServiceError, match="expired on"):
         Credentials.read(here / "keys/users/ann", credentials.expires + timedelta(seconds=1))
-    with pytest.raises(ServiceError, match="check this machine.s clock"):
+    with pytest.raises(ServiceError, match=r"check this machine.s clock"):
         Credentials.read(here / "keys/users/ann", datetime.now(UTC) - timedelta(days=1))
 
 

@@ -136,5 +136,5 @@ def test_a_part_without_an_id_is_none() -> None:
     points = trajectory(random.Random(0), 2).points
     with pytest.raises(ValueError, match="all parts of a trajectory need the same id"):
         TrajectoryGoal(points, part=TrajectoryPart(1, 2))
-    with pytest.raises(ValueError, match="number is 3 of 2"):
+    with pytest.raises(ValueError, match="number 3 exceeds the number of parts, 2"):
         TrajectoryPart(3, 2)
