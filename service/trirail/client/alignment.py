@@ -126,7 +126,8 @@ async def drive_async(
                     marks = sight.marks
                 else:
                     marks = await _done(look())
-                sight = Observation(marks, (await _done(robot.state())).pose, time.monotonic())
+                state = await _done(robot.state())
+                sight = Observation(marks, state.pose, time.monotonic(), state.sliders.position)
             wish = wishes.send(sight)
     except StopIteration as end:
         return cast(T, end.value)
