@@ -44,13 +44,13 @@ def find_candidates(
     state = model.state(unknowns)
     shown = {name: _projected(model, state, name, poses) for name in state.places}
     sizes = {name: np.array(fields[model.view_of[name]]) for name in shown}
-    inside: dict[str, list[bool]] = {
-        name: ((at > FIELD_MARGIN * sizes[name]) & (at < (1.0 - FIELD_MARGIN) * sizes[name])).all(axis=1).tolist()
+    inside = {
+        name: np.all((at > FIELD_MARGIN * sizes[name]) & (at < (1.0 - FIELD_MARGIN) * sizes[name]), axis=1)
         for name, at in shown.items()
     }
     looks = []
     for number, (pose, reading) in enumerate(zip(poses.tolist(), sliders.tolist(), strict=True)):
-        marks = {name: _pair(at[number]) for name, at in shown.items() if inside[name][number]}
+        marks = {name: _pair(at[number]) for name, at in shown.items() if bool(np.take(inside[name], number))}
         if marks:
             looks.append(StageLook(tuple(reading), tuple(pose), marks))
     if not looks:

@@ -292,6 +292,7 @@ def poses(*, service: Service = HERE) -> int:
     width = max(map(len, found), default=0)
     for name, pose in found.items():
         whose = "taught" if pose.taught else "of [poses]"
+        whose += ", with another geometry: look at it, and teach it again" if pose.other_geometry else ""
         terminal.say(f"{name:<{width}}   {notation.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
     if not found:
         terminal.say("there is none: trirail teach NAME makes one of where the robot stands")

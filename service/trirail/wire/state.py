@@ -269,6 +269,8 @@ class NamedPose(Struct, frozen=True):
     """Counterclockwise [rad]."""
     taught: bool
     """Whether it was taught, and can be taught anew or removed; else it is one of [poses] of the configuration."""
+    other_geometry: bool = False
+    """True if it was taught with another [geometry] than the service has: look at it, and teach it again."""
 
 
 class NamedPoses(Struct, frozen=True):
