@@ -96,6 +96,11 @@ class GeometryCalibration(NamedTuple):
     map: ResidualMap | None
     """Map of what remains after the fit; None where the looks are not systematically off, or too few for a map."""
 
+    @property
+    def is_systematic(self) -> bool:
+        """True if the marks are off by more than their noise: by errors that no geometry explains."""
+        return self.noise > SYSTEMATIC * self.picture_noise
+
 
 class GeometryTask(NamedTuple):
     """Arguments of a calibration of the geometry."""

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from trirail.alignment.alignment_request import LookReport
     from trirail.alignment.calibration_diff import ViewChange
     from trirail.alignment.camera_calibration import CameraCalibration
+    from trirail.alignment.geometry_calibration import GeometryCalibration
     from trirail.alignment.procedure import Alignment, AlignmentRequest, Measurement, Observation
     from trirail.analysis.summary import AlignmentSummary
 
@@ -45,6 +46,47 @@ def show_calibration(found: CameraCalibration, file: Path) -> None:
         (x, y), (dx, dy) = mark.place, mark.deviation
         terminal.say(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
     terminal.say(f"residual {found.noise:.3f} pixel; kept in {file}")
+
+
+def show_geometry(found: GeometryCalibration, labels: Iterable[str]) -> None:
+    """Print the corrections to a geometry, what the looks do not tell, and how well it predicts."""
+    shown = dict(zip("ABC", labels, strict=True))
+    for name, value in found.parameters.items():
+        leg, parameter = name.split(" ", 1)
+        unit, factor = _unit(parameter)
+        deviation = found.deviations[name]
+        if name in found.undetermined:
+            known = "not told by these looks"
+        elif deviation == 0.0:
+            known = "by the choice of the frame"
+        else:
+            known = f"± {deviation * factor:.1f}"
+        terminal.say(f"{f'{shown[leg]} {parameter}':<32}{value * factor:>+10.1f} {unit:<5} {known}")
+    if found.undetermined:
+        terminal.say(
+            "Not told, at least not each for itself, and left as configured where nothing tells them: "
+            f"{', '.join(found.undetermined)}. More marks, a second camera or a larger field would tell more."
+        )
+    terminal.say("The frame is the configuration's, moved as little as the legs allow; lengths are those of the three")
+    terminal.say("encoders' mean: pixels tell no absolute length.")
+    for each in found.outliers:
+        swapped = f", where {each.swapped_with} belongs" if each.swapped_with else ""
+        terminal.say(f"look {each.look}: {each.mark} is {each.distance:.1f} pixels away{swapped}; not used")
+    held = found.residual
+    if held.looks:
+        terminal.say(
+            f"{held.looks} looks that were held out: marks are off by {held.before_m * 1e6:.2f} µm ({held.before:.2f} "
+            f"pixels) with the configured geometry, {held.after_m * 1e6:.2f} µm ({held.after:.2f} pixels) with this one"
+        )
+    noise = f"residual {found.noise:.3f} pixel, pictures at rest {found.picture_noise:.3f}"
+    systematic = "; the looks are off by more than noise" if found.is_systematic else ""
+    terminal.say(noise + systematic)
+
+
+def _unit(parameter: str) -> tuple[str, float]:
+    if parameter == "encoder scale":
+        return "ppm", 1e6
+    return ("µrad", 1e6) if parameter.endswith("angle") else ("µm", 1e6)
 
 
 def show_changes(changes: Iterable[ViewChange]) -> None:

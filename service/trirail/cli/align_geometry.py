@@ -1,0 +1,218 @@
+"""`trirail align geometry`: the stage's own geometry by its cameras, as a new configuration that a person asks for."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+from cyclopts import Parameter
+
+from trirail.cli import alignment_lines, notation, terminal
+from trirail.cli.mark_source import MarkSource
+from trirail.cli.options import HERE, Flag, Service
+from trirail.errors import ConfigError
+
+if TYPE_CHECKING:
+    from trirail.alignment.camera_calibration import Marks
+    from trirail.alignment.geometry_calibration import GeometryCalibration
+    from trirail.alignment.residual_map import ResidualMap
+    from trirail.client.client import Robot
+    from trirail.config import Config
+
+PROGRAM = MarkSource()
+
+
+class _Written(NamedTuple):
+    """Files that were written; None for those that nobody wanted."""
+
+    config: Path | None = None
+    cameras: Path | None = None
+    old_cameras: Path | None = None
+    map: Path | None = None
+
+
+def geometry(
+    config: Path,
+    /,
+    *,
+    field: Annotated[tuple[int, int], Parameter(negative="")],
+    out: Path | None = None,
+    calibration: Path = Path("camera.json"),
+    poses: int = 30,
+    one_camera: Annotated[bool, Flag] = False,
+    lens: Literal["affine", "perspective", "radial"] = "radial",
+    approach: notation.PoseWay = notation.AT_REST,
+    yes: Annotated[bool, Flag] = False,
+    source: MarkSource = PROGRAM,
+    service: Service = HERE,
+) -> int:
+    """Find the stage's own rails, pivots, scales and cameras by moves over its whole travel, and propose them.
+
+    The robot is enabled, and the marks of a part in the pictures. Nothing is written without a yes; CONFIG is never
+    changed. The new configuration takes effect when the service is started with it.
+
+    Parameters
+    ----------
+    config
+        Configuration with which the service runs.
+    field
+        Size of the pictures: COLUMNS ROWS in pixels. Poses are planned so that marks stay in them.
+    out
+        Configuration to write; one with a free name beside CONFIG if absent.
+    calibration
+        Calibration of the cameras to write, for `trirail align run`; what is there is kept as FILE.old.
+    poses
+        How many looks to take, 12 or more.
+    one_camera
+        The program's marks are all seen by one camera; else each has a camera of its own.
+    lens
+        What the pictures are like.
+    approach
+        How far beyond each pose to go first, X Y PHI [m, rad], so that backlash is always on the same side.
+    yes
+        Write without a question.
+    """
+    from trirail.alignment.procedure import observe_mean
+    from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_task
+    from trirail.config import load
+
+    settings = load(config)
+    if out is not None and out.exists():
+        raise ConfigError(f"{out} exists already; name another file with --out")
+    way = approach[0], approach[1], notation.radians(approach[2], False)
+    with source.open_source() as (look, known), service.open() as robot:
+        _check_same(settings, config, robot)
+        views = dict.fromkeys(look(), "camera") if one_camera else known
+        task = geometry_task(robot.info(), field, views, lens, poses, source.looks, way if any(way) else None)
+        from trirail.alignment.geometry_calibration import calibrate_geometry
+
+        wishes = calibrate_geometry(task)
+        shown = wishes if service.json else alignment_lines.printed(wishes, poses)
+        found = drive(robot, look, shown, source.speed, source.wait)
+        targets = drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks
+        taught = sorted(name for name, pose in robot.poses().items() if pose.taught)
+    if not service.json:
+        alignment_lines.show_geometry(found, settings.geometry.labels)
+    with_map = found.map is not None and found.map.helps and _wants_map(found.map, service, yes=yes)
+    written = _Written()
+    if yes or (not service.json and _answers_yes("Write a new configuration with these values?")):
+        written = _write(found, config, settings, out, calibration, targets, service.robot, with_map=with_map)
+    remarks = _remarks(settings, taught)
+    if service.json:
+        files = {name: None if path is None else str(path) for name, path in written._asdict().items()}
+        terminal.json(_content(found) | {"made_before": remarks, "written": files})
+    elif written.config is None:
+        terminal.say("nothing is written")
+    else:
+        _tell(written, config, remarks)
+    return 0
+
+
+def _check_same(settings: Config, path: Path, robot: Robot) -> None:
+    """Refuse a file that is not the service's. Raises ConfigError."""
+    from trirail import config
+    from trirail.client.stage_geometry import geometry_id
+    from trirail.config.as_built import geometry_of
+
+    if settings.robot.name != robot.name:
+        raise ConfigError(f"{path} is of robot {settings.robot.name}, not of {robot.name}: name it with --robot")
+    if geometry_of(config.geometry(settings.geometry)) != geometry_id(robot.info()):
+        raise ConfigError(f"{path}: its [geometry] is not that with which the service runs; name the service's file")
+
+
+def _wants_map(offered: ResidualMap, service: Service, *, yes: bool) -> bool:
+    before, after = offered.before, offered.after
+    if not service.json:
+        terminal.say(
+            "A map of what is left would lower the errors at looks that it does not know: from "
+            f"{before[0] * 1e6:.2f} to {after[0] * 1e6:.2f} µm, and {before[1] * 1e6:.2f} to {after[1] * 1e6:.2f} µrad."
+        )
+    return yes or (not service.json and _answers_yes("Write it too, as [correction] map?"))
+
+
+def _answers_yes(question: str) -> bool:
+    """Ask at the terminal, or the lines of a script; the end of the input is a no."""
+    terminal.out.print(f"{terminal.plain(question)} \\[y/N] ", end="")
+    try:
+        return input().strip().lower() in ("y", "yes")
+    except EOFError:
+        terminal.say("")
+        return False
+
+
+def _write(
+    found: GeometryCalibration,
+    path: Path,
+    settings: Config,
+    out: Path | None,
+    cameras: Path,
+    targets: Marks,
+    robot: str,
+    *,
+    with_map: bool,
+) -> _Written:
+    """Write the configuration, the cameras' calibration, and the map. Raises ConfigError, FileError."""
+    from trirail import config
+    from trirail.client import calibration_file
+    from trirail.commissioning import config_edit
+    from trirail.config import as_built
+
+    written = out or config_edit.find_free_path(path, "calibrated")
+    map_path = written.with_name(f"{written.stem}-map.toml") if with_map and found.map is not None else None
+    text = path.read_text(encoding="utf-8")
+    text = config_edit.edit_geometry(text, found.geometry, found.scales, map_path.name if map_path else None)
+    if settings.can.interface == "simulated" and settings.can.simulated.built is None:
+        text = config_edit.add_simulated_build(text, settings.drives)
+    if written.parent.resolve() != path.parent.resolve():
+        text = config_edit.resolve_eds_paths(text, path.parent)
+    if map_path is not None and found.map is not None:
+        errors = as_built.measured_today(found.map.correction, found.geometry)
+        config.check_as_built(errors, found.geometry, settings.limits)
+        config_edit.write_new_file(map_path, as_built.format_map(errors))
+    config_edit.write_new_file(written, text)
+    old = calibration_file.keep_old(cameras)
+    calibration_file.write(cameras, robot, found.cameras, targets, geometry=as_built.geometry_of(found.geometry))
+    return _Written(written, cameras, old, map_path)
+
+
+def _remarks(settings: Config, taught: list[str]) -> list[str]:
+    """Return what was made with the old geometry."""
+    remarks = []
+    if taught:
+        remarks.append(f"taught poses {', '.join(taught)}: flagged until each is taught again")
+    if settings.correction.map is not None:
+        remarks.append(f"correction.map {settings.correction.map}: left out; make it again")
+    remarks.append("other camera calibrations: flagged until an alignment confirms them, or they are made again")
+    return remarks
+
+
+def _tell(written: _Written, path: Path, remarks: list[str]) -> None:
+    terminal.say(f"written to {written.config}; {path} is unchanged. Cameras and targets: {written.cameras}")
+    if written.old_cameras is not None:
+        terminal.say(f"what was there is in {written.old_cameras}")
+    if written.map is not None:
+        terminal.say(f"map: {written.map}")
+    terminal.say(f"It takes effect when the service is started again: trirail run {written.config}")
+    terminal.say("Made with the geometry before:")
+    for remark in remarks:
+        terminal.say(f"  {remark}")
+
+
+def _content(found: GeometryCalibration) -> dict[str, object]:
+    """Return a calibration for programs; a deviation that the looks do not tell is null."""
+    residual_map = None
+    if found.map is not None:
+        residual_map = {"before": found.map.before, "after": found.map.after, "helps": found.map.helps}
+    return {
+        "parameters": found.parameters,
+        "deviations": {name: value if math.isfinite(value) else None for name, value in found.deviations.items()},
+        "undetermined": found.undetermined,
+        "residual": found.residual._asdict(),
+        "noise": found.noise,
+        "picture_noise": found.picture_noise,
+        "outliers": [each._asdict() for each in found.outliers],
+        "looks": len(found.looks),
+        "map": residual_map,
+    }
