@@ -81,15 +81,16 @@ def _kind(file: str, stages: int) -> dict[str, Any]:
         )
         ways = [_way(rng, robot, limits, stage) for _ in range(PLACES_OF_STAGE)]
         cases = {
-            "calibrated geometry": (calibrated, found.cameras),
-            "configured, cameras over the travel": (configured, wide),
-            "configured, cameras by 1 mm and 1°": (configured, small),
+            "calibrated geometry": (calibrated, found.cameras, LOOKS),
+            "calibrated geometry, one picture of a part": (calibrated, found.cameras, 1),
+            "configured, cameras over the travel": (configured, wide, LOOKS),
+            "configured, cameras by 1 mm and 1°": (configured, small, LOOKS),
         }
-        for name, (moved_by, cameras) in cases.items():
+        for name, (moved_by, cameras, pictures) in cases.items():
             stage.model = moved_by
             for begin, end in ways:
                 try:
-                    results.setdefault(name, []).append(_correct(stage, cameras, begin, end))
+                    results.setdefault(name, []).append(_correct(stage, cameras, begin, end, pictures))
                 except TrirailError:
                     failures[name] += 1
     summary: dict[str, Any] = {name: _summary(each, failures[name]) for name, each in results.items()}
@@ -112,7 +113,9 @@ def _way(rng: np.random.Generator, robot: Geometry, limits: Room, stage: Compute
     return poses[0], poses[1]
 
 
-def _correct(stage: ComputedStage, cameras: CameraCalibration, begin: Floats, end: Floats) -> tuple[float, float, int]:
+def _correct(
+    stage: ComputedStage, cameras: CameraCalibration, begin: Floats, end: Floats, pictures: int
+) -> tuple[float, float, int]:
     """Return distance [m] and angle [rad] after the first correction from a pose to another, and their number."""
     stage.pose = (float(end[0]), float(end[1]), float(end[2]))
     views = [stage.seen(NOISE) for _ in range(LOOKS)]
@@ -121,7 +124,7 @@ def _correct(stage: ComputedStage, cameras: CameraCalibration, begin: Floats, en
     stage.pose = (float(begin[0]), float(begin[1]), float(begin[2]))
     after: list[tuple[float, float]] = []
     # As after the first part: an unconfirmed calibration would divide a long first correction.
-    task = AlignmentTask(structs.replace(cameras, confirmed=True), targets, looks=LOOKS)
+    task = AlignmentTask(structs.replace(cameras, confirmed=True), targets, looks=pictures)
     result = stage.drive(align(task), lambda: after.append(distance_left(stage, aim)))
     return *after[0], len(result.corrections) if result.reached else 0
 

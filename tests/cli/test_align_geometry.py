@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import signal
@@ -13,13 +14,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warm
+from trirail.alignment.camera_calibration import to_base_frame
+from trirail.alignment.geometry_calibration import GeometryCalibration
+from trirail.alignment.images import CameraView, project_points
 from trirail.client import calibration_file, own_service
+from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.client.stage_as_built import built_otherwise
 from trirail.commissioning import config_edit
 from trirail.config import SIM, as_built, geometry, load, parse
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import LEGS
+from trirail.kinematics.robot import forward
+from trirail.wire.state import State
 
 MARKS = """
 import json, sys
@@ -136,6 +143,38 @@ def test_ctrl_c_stops_the_stage_and_writes_nothing(stage: tuple[Path, str], tmp_
         assert started.wait(30.0) != 0
         assert robot.state().mode == "holding"
     assert not out.exists()
+
+
+@pytest.mark.slow
+def test_python_programs_find_the_geometry_too_with_and_without_an_event_loop(stage: tuple[Path, str]) -> None:
+    view = CameraView((-0.06, 0.0), (4672.0, 3500.0), ((0.0, 2.6e5), (2.6e5, 0.0)))
+    scales = 1.0 + np.array([1e-4, -2e-4, 1e-4])
+    model = geometry(load(stage[0]).geometry)
+
+    def seen(state: State) -> dict[str, tuple[float, float]]:
+        pose = forward(model, scales * state.sliders.position)
+        at = {name: to_base_frame((-0.06, y), pose.tolist()) for name, y in (("a", -1e-3), ("b", 1e-3))}
+        pixels = {name: project_points(view, place[None])[0].tolist() for name, place in at.items()}
+        return {name: (u, v) for name, (u, v) in pixels.items()}
+
+    def check(found: GeometryCalibration) -> None:
+        assert found.residual.after < 0.02
+        assert set(found.deviations) == set(found.parameters)
+        assert set(found.undetermined) < set(found.parameters)
+
+    views = {"a": "camera", "b": "camera"}
+    with Robot("uvw", stage[1]) as robot:
+        check(robot.calibrate_geometry(lambda: seen(robot.state()), (9344, 7000), views=views, poses=16, looks=1))
+
+    async def work() -> None:
+        async with AsyncRobot("uvw", stage[1]) as robot:
+
+            async def look() -> dict[str, tuple[float, float]]:
+                return seen(await robot.state())
+
+            check(await robot.calibrate_geometry(look, (9344, 7000), views=views, poses=16, looks=1))
+
+    asyncio.run(work())
 
 
 @pytest.mark.parametrize("name", ["uvw.toml", "uvw-ppr.toml", "xxy.toml", "sim.toml"])

@@ -46,7 +46,8 @@ def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMa
     """Return the codes of a family in a grey picture, (rows, columns), each number once.
 
     A code that is there twice is ambiguous, and left out. The picture may be a mirror image of the table: it is read
-    both ways, and the way that shows more codes counts, since some codes are their own mirror images. Raises ImportError without OpenCV.
+    both ways, and the way that shows more codes counts, since some codes are their own mirror images. Raises
+    ImportError without OpenCV.
     """
     grey = np.ascontiguousarray(picture, np.uint8)
     found, reflected = _detect(grey, family), _detect(grey[:, ::-1], family)

@@ -87,7 +87,7 @@ def _result(
     jacobian = model.jacobian(unknowns, looks)[used].reshape(-1, model.size) @ basis
     freedom = max(2 * int(used.sum()) - basis.shape[1], 1)
     noise = float(np.sqrt((residuals[used] ** 2).sum() / freedom))
-    scales = np.linalg.norm(jacobian, axis=0)
+    scales = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     inverse = np.linalg.pinv(jacobian / scales)
     covariance = basis @ ((inverse @ inverse.T) / np.outer(scales, scales)) @ basis.T * noise**2
     legs = model.legs
