@@ -99,8 +99,8 @@ def align(*, parts: int = 200, goals: int = 20, stages: int = 20, json: bool = F
     import bench_align
     import bench_geometry
 
-    found = bench_align.measure(parts, goals) if parts else {}
-    report(found | {"geometry by cameras": bench_geometry.measure(stages)}, json)
+    results = bench_align.measure(parts, goals) if parts else {}
+    report(results | {"geometry by cameras": bench_geometry.measure(stages)}, json)
 
 
 @app.command

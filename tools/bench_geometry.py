@@ -2,7 +2,7 @@
 
 A stage differs from its configuration in every leg and in the scale of each encoder; lenses distort. The pictures are
 as large as the travel wants: 9344 × 7000 pixels of 3.75 µm, a sensor of 65 megapixels at 1:1. A correction takes the
-part from a pose of the stage to another, both anywhere in its travel. What is left is that of the real stage.
+part from a pose of the stage to another, both anywhere in its travel. The remaining error is that of the real stage.
 """
 
 from __future__ import annotations
@@ -70,19 +70,19 @@ def _kind(file: str, stages: int) -> dict[str, Any]:
         stage.scales = rng.uniform(-SCALES, SCALES, 3)
         small = stage.drive(calibrate_by_moves(looks=LOOKS))
         task = GeometryTask(robot, limits, FIELD, looks=LOOKS)
-        found = stage.drive(calibrate_geometry(task))
-        looks.append(len(found.looks))
-        noise.append(found.noise)
-        held_out.append((found.residual.before_m, found.residual.after_m))
-        model, *_ = start_model(task, found.looks[:7])
-        wide = calibrated_cameras(model, fit_stage(model, found.looks, fixed_legs=True), found.looks, LOOKS)
-        calibrated: Model = lambda pose, found=found: (  # type: ignore[misc]  # noqa: E731
-            inverse(found.geometry, pose).position / (1.0 + np.array(found.scales))
+        calibration = stage.drive(calibrate_geometry(task))
+        looks.append(len(calibration.looks))
+        noise.append(calibration.noise)
+        held_out.append((calibration.residual.before_m, calibration.residual.after_m))
+        model, *_ = start_model(task, calibration.looks[:7])
+        wide = calibrated_cameras(model, fit_stage(model, calibration.looks, fixed_legs=True), calibration.looks, LOOKS)
+        calibrated: Model = lambda pose, calibration=calibration: (  # type: ignore[misc]  # noqa: E731
+            inverse(calibration.geometry, pose).position / (1.0 + np.array(calibration.scales))
         )
         ways = [_way(rng, robot, limits, stage) for _ in range(PLACES_OF_STAGE)]
         cases = {
-            "calibrated geometry": (calibrated, found.cameras, LOOKS),
-            "calibrated geometry, one picture of a part": (calibrated, found.cameras, 1),
+            "calibrated geometry": (calibrated, calibration.cameras, LOOKS),
+            "calibrated geometry, one picture of a part": (calibrated, calibration.cameras, 1),
             "configured, cameras over the travel": (configured, wide, LOOKS),
             "configured, cameras by 1 mm and 1°": (configured, small, LOOKS),
         }

@@ -50,13 +50,13 @@ def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMa
     ImportError without OpenCV.
     """
     grey = np.ascontiguousarray(picture, np.uint8)
-    found, reflected = _detect(grey, family), _detect(grey[:, ::-1], family)
-    is_mirrored = len(reflected) > len(found)
+    detections, reflected = _detect(grey, family), _detect(grey[:, ::-1], family)
+    is_mirrored = len(reflected) > len(detections)
     if is_mirrored:
-        found = [(number, _mirrored(corners, grey.shape[1])) for number, corners in reflected]
-    numbers = [number for number, _ in found]
+        detections = [(number, _mirrored(corners, grey.shape[1])) for number, corners in reflected]
+    numbers = [number for number, _ in detections]
     marks = []
-    for number, corners in found:
+    for number, corners in detections:
         sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
         if numbers.count(number) > 1 or np.ptp(sides) > MAX_SKEW * sides.mean():
             continue

@@ -1,4 +1,4 @@
-"""Calibration of a stage by its own cameras: procedure, result, and what the looks cannot tell.
+"""Calibration of a stage by its own cameras: procedure, result, and the parameters that remain undetermined.
 
 A procedure as those of trirail.alignment.procedure: it looks at a few poses near the present one, estimates cameras and
 marks, plans the other poses over the whole travel, looks there, and fits everything together.
@@ -25,7 +25,7 @@ from trirail.alignment.pose_plan import choose_poses, find_candidates
 from trirail.alignment.residual_map import ResidualMap, fit_residual_map
 from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.stage_fit import StageFit, fit_stage
-from trirail.alignment.stage_model import StageLook, StageModel, seen_marks
+from trirail.alignment.stage_model import StageLook, StageModel, list_marks
 from trirail.errors import AlignmentError, AlignmentFault, RefusalCode, RefusedError
 from trirail.kinematics.geometry import Geometry, Room, travels
 from trirail.kinematics.robot import inverse
@@ -36,7 +36,7 @@ GRID = 7
 TRAVEL_SHARE = 0.97
 """Share of the travel that is used: the configured geometry may be wrong by a little."""
 HELD_OUT = 5
-"""Every so many of the planned looks is held out of a fit, to tell how well it predicts."""
+"""One of this many planned looks is held out of a fit, as a check of its predictions."""
 MAX_LEFT_OUT = 2
 """Looks of the first moves that may be wrong."""
 MAX_START_RESIDUAL_PX, MAX_START_SHARE = 1.0, 0.01
@@ -52,9 +52,9 @@ class HeldOutResidual(NamedTuple):
 
     looks: int
     before: float
-    """By the configured geometry, with cameras and marks fitted to it [pixel]."""
+    """With the configured geometry, and cameras and marks fitted to it [pixel]."""
     after: float
-    """By the calibrated one [pixel]."""
+    """With the calibrated geometry [pixel]."""
     before_m: float
     """The same on the table [m]."""
     after_m: float
@@ -73,7 +73,7 @@ class Outlier(NamedTuple):
 
 
 class GeometryCalibration(NamedTuple):
-    """The stage as its looks tell it, beside its configuration."""
+    """Differences of a stage from its configuration, and its cameras."""
 
     geometry: Geometry
     scales: Triple
@@ -81,9 +81,10 @@ class GeometryCalibration(NamedTuple):
     parameters: dict[str, float]
     """Corrections to the configured values by their names, as "A rail_angle" [m, rad, share]."""
     deviations: dict[str, float]
-    """Standard deviations of the same; infinite for those that the looks do not tell."""
+    """Standard deviations of the same; infinite for undetermined parameters."""
     undetermined: tuple[str, ...]
-    """Names of the parameters that the looks do not tell, at least not each for itself; they stay as configured."""
+    """Names of the parameters that the looks do not determine, or only in combination with others; each undetermined
+    combination stays as configured."""
     residual: HeldOutResidual
     noise: float
     """Standard deviation of a mark's u or v, from the residuals [pixel]."""
@@ -106,7 +107,7 @@ class GeometryTask(NamedTuple):
     """Arguments of a calibration of the geometry."""
 
     start: Geometry
-    """As configured, without a correction map."""
+    """Geometry of the configuration, without a correction map."""
     room: Room
     """Limits of platform and sliders."""
     field: Pair
@@ -133,36 +134,36 @@ class GeometryTask(NamedTuple):
 
 
 def calibrate_geometry(task: GeometryTask) -> Generator[AlignmentRequest, Observation, GeometryCalibration]:
-    """Look at planned poses, return to the first one, and return the stage as the looks tell it.
+    """Look at planned poses, return to the first one, and return the calibration.
 
     Raises
     ------
     RefusedError
         An argument is invalid.
     AlignmentError
-        The looks do not tell cameras and marks, or do not belong to any such stage.
+        The looks do not determine cameras and marks, or no such stage explains them.
     """
     task.check()
     if task.approach is not None:
         yield StageMotion(ZERO_OFFSET, PLATFORM_CENTRE, task.approach)
     try:
         scatter = _Scatter()
-        first = yield from _look(task, scatter)
+        first = yield from _observe(task, scatter)
         looks = [_stage_look(task.start, first)]
         for x, y, phi in DEFAULT_MOVES:
             yield StageMotion((first.pose[0] + x, first.pose[1] + y, first.pose[2] + phi), approach=task.approach)
-            looks.append(_stage_look(task.start, (yield from _look(task, scatter))))
+            looks.append(_stage_look(task.start, (yield from _observe(task, scatter))))
         model, unknowns, noise = start_model(task, looks)
         for planned in plan(task, model, unknowns, looks, noise):
             yield StageMotion(planned.pose, approach=task.approach)
-            looks.append(_stage_look(task.start, (yield from _look(task, scatter))))
+            looks.append(_stage_look(task.start, (yield from _observe(task, scatter))))
         yield StageMotion(first.pose, approach=task.approach)
-        found = solve(task, model, looks, scatter.noise or noise)
+        calibration = solve(task, model, looks, scatter.noise or noise)
     except AlignmentError as error:
         yield LookReport("calibration", end=error.fault, words=str(error))
         raise
-    yield LookReport("calibration", end="calibrated", noise=found.noise)
-    return found
+    yield LookReport("calibration", end="calibrated", noise=calibration.noise)
+    return calibration
 
 
 class _Scatter:
@@ -186,7 +187,7 @@ class _Scatter:
         return math.sqrt(float(np.median(self._squares)) / self._pictures) if self._squares else 0.0
 
 
-def _look(task: GeometryTask, scatter: _Scatter) -> Generator[AlignmentRequest, Observation, Observation]:
+def _observe(task: GeometryTask, scatter: _Scatter) -> Generator[AlignmentRequest, Observation, Observation]:
     pictures = yield from capture(task.looks)
     scatter.add(pictures)
     look = average(pictures)
@@ -275,7 +276,6 @@ def plan(
     poses = _travel(task)
     fields = dict.fromkeys(model.views, task.field)
     candidates = find_candidates(model, unknowns, poses, inverse(task.start, poses).position, fields)
-    # A look at which only some marks are in their pictures says less, but it may be all that there is.
     if not candidates:
         raise AlignmentError(
             AlignmentFault.MOVES,
@@ -288,7 +288,7 @@ def plan(
 def solve(
     task: GeometryTask, model: StageModel, looks: Sequence[StageLook], picture_noise: float
 ) -> GeometryCalibration:
-    """Return the stage as looks tell it; `picture_noise` is that of a mark at rest [pixel]. Raises AlignmentError."""
+    """Return the calibration by looks; `picture_noise` is that of a mark at rest [pixel]. Raises AlignmentError."""
     known = tuple(look._replace(marks={n: u for n, u in look.marks.items() if n in model.places}) for look in looks)
     fit = fit_stage(model, known)
     state, geometry = model.state(fit.unknowns), model.geometry(fit.unknowns)
@@ -319,7 +319,7 @@ def solve(
 
 
 def _undetermined(model: StageModel, fit: StageFit) -> tuple[str, ...]:
-    """Return the names of parameters of combinations that the looks do not tell, or that nothing can."""
+    """Return the names of parameters in combinations that these looks do not determine, or no looks can."""
     rest = np.eye(model.legs) - fit.determined @ fit.determined.T
     combinations = model.basis @ rest @ model.basis.T + model.held.T @ model.held
     shares = np.sqrt(np.maximum(np.diag(combinations), 0.0))
@@ -329,7 +329,7 @@ def _undetermined(model: StageModel, fit: StageFit) -> tuple[str, ...]:
 
 def _used(looks: Sequence[StageLook], fit: StageFit) -> list[StageLook]:
     """Return the looks without outliers."""
-    used = {each for each, is_used in zip(seen_marks(looks), fit.used.tolist(), strict=True) if is_used}
+    used = {each for each, is_used in zip(list_marks(looks), fit.used.tolist(), strict=True) if is_used}
     return [
         look._replace(marks={name: pixel for name, pixel in look.marks.items() if (number, name) in used})
         for number, look in enumerate(looks)
@@ -346,22 +346,22 @@ def _held_out(model: StageModel, looks: Sequence[StageLook], fit: StageFit) -> H
     if not out:
         return HeldOutResidual(0, math.nan, math.nan, math.nan, math.nan)
     views = {name: model.views[model.view_of[name]].scale for name in model.places}
-    scales = np.array([views[name] for _, name in seen_marks(out)])
-    found = []
+    scales = np.array([views[name] for _, name in list_marks(out)])
+    errors = []
     for fixed in (True, False):
         trial = fit_stage(model, rest, fit.unknowns if not fixed else None, fixed_legs=fixed)
         distance = np.linalg.norm(model.residuals(trial.unknowns, out), axis=1)
-        found += [math.sqrt(np.mean(distance**2)), math.sqrt(np.mean((distance / scales) ** 2))]
-    return HeldOutResidual(len(out), found[0], found[2], found[1], found[3])
+        errors += [math.sqrt(np.mean(distance**2)), math.sqrt(np.mean((distance / scales) ** 2))]
+    return HeldOutResidual(len(out), errors[0], errors[2], errors[1], errors[3])
 
 
 def _outliers(fit: StageFit, looks: Sequence[StageLook]) -> tuple[Outlier, ...]:
-    marks = seen_marks(looks)
+    marks = list_marks(looks)
     computed = {
         each: np.array(looks[each[0]].marks[each[1]]) - residual
         for each, residual in zip(marks, fit.residuals, strict=True)
     }
-    found = []
+    outliers = []
     for (number, name), residual, used in zip(marks, fit.residuals, fit.used.tolist(), strict=True):
         if used:
             continue
@@ -371,8 +371,8 @@ def _outliers(fit: StageFit, looks: Sequence[StageLook]) -> tuple[Outlier, ...]:
             for look, other in marks
             if look == number and other != name and np.linalg.norm(seen - computed[look, other]) < 0.01 * distance
         ]
-        found.append(Outlier(number + 1, name, distance, others[0] if others else None))
-    return tuple(found)
+        outliers.append(Outlier(number + 1, name, distance, others[0] if others else None))
+    return tuple(outliers)
 
 
 def calibrated_cameras(
@@ -391,7 +391,7 @@ def calibrated_cameras(
             marks[name] = MarkFit(view, state.places[name], (x, y))
     residuals: list[dict[str, Pair]] = [{} for _ in looks]
     for (number, name), residual, used in zip(
-        seen_marks(looks), fit.residuals.tolist(), fit.used.tolist(), strict=True
+        list_marks(looks), fit.residuals.tolist(), fit.used.tolist(), strict=True
     ):
         if used:
             residuals[number][name] = (residual[0], residual[1])

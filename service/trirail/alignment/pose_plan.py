@@ -1,4 +1,4 @@
-"""Plan of poses whose looks tell most about a stage: optimal by the information matrix, one pose after the other.
+"""Plan of poses whose looks determine a stage best: optimal by the information matrix, one pose after the other.
 
 The information of looks is A = sum J' J, with J the derivatives of the pixels by the unknowns in standard deviations.
 The mean variance of a mark's computed pixel over the travel is trace(Q A^-1), Q the mean of J' J over all candidates:
@@ -72,7 +72,7 @@ def _pair(values: Floats) -> Pair:
 def choose_poses(
     model: StageModel,
     unknowns: Floats,
-    taken: Sequence[StageLook],
+    earlier: Sequence[StageLook],
     candidates: Sequence[Candidate],
     count: int,
     noise: float,
@@ -84,8 +84,8 @@ def choose_poses(
     Q = sum(J.T @ J for J in jacobians) / len(jacobians)
     A = WEAK_PRIOR * len(candidates) / noise**2 * np.eye(model.size)
     A[: model.legs, : model.legs] += np.diag(1.0 / scales[: model.legs] ** 2)
-    if taken:
-        J = model.jacobian(unknowns, taken).reshape(-1, model.size) / scales / noise
+    if earlier:
+        J = model.jacobian(unknowns, earlier).reshape(-1, model.size) / scales / noise
         A += J.T @ J
     covariance = np.linalg.inv(A)
     chosen = []

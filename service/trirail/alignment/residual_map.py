@@ -1,4 +1,4 @@
-"""Map of what a calibrated stage still does beside its geometry, from the same looks as the calibration.
+"""Map of the errors that remain after a calibration of the geometry, from the same looks.
 
 A look shows the platform's pose by its marks, without any leg: the rigid motion from their places on the platform to
 where the cameras see them. trirail.kinematics.correction_fit makes the map of these poses.
@@ -22,7 +22,7 @@ from trirail.kinematics.geometry import Geometry, Room
 
 MIN_MARKS = 2
 CELLS = (2, 2, 2)
-"""Cells of the map: 30 looks tell no more."""
+"""Cells of the map: 30 to 60 looks determine no more."""
 MAX_LEFT_SHARE = 0.8
 """Share of the errors at held-out looks that a map may leave to be offered."""
 

@@ -1,4 +1,4 @@
-"""Robust fit of a stage model to looks: outliers are found and named, what the looks cannot tell stays as configured.
+"""Robust fit of a stage model to looks: outliers are left out, undetermined combinations stay as configured.
 
 The residuals are weighed by their own noise, estimated from their median. A first fit with a soft loss (soft l1,
 Triggs et al. 2000, Bundle Adjustment, 4.3) finds the outliers; the last one is plain least squares without them.
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trirail.alignment.rigid_motion import Floats
-from trirail.alignment.stage_model import StageLook, StageModel, seen_marks
+from trirail.alignment.stage_model import StageLook, StageModel, list_marks
 from trirail.errors import AlignmentError, AlignmentFault, KinematicsError
 
 OUTLIER_DEVIATIONS = 6.0
@@ -32,15 +32,15 @@ class StageFit(NamedTuple):
 
     unknowns: Floats
     covariance: Floats
-    """Covariance of the unknowns, (size, size); zero for what stays as configured."""
+    """Covariance of the unknowns, (size, size); zero for combinations that stay as configured."""
     determined: Floats
     """Orthonormal basis of the leg unknowns that the looks determine, (legs, K)."""
     noise: float
     """Standard deviation of a mark's u or v, from the residuals [pixel]."""
     residuals: Floats
-    """Seen less computed pixels, (n, 2), in the order of seen_marks."""
+    """Seen less computed pixels, (n, 2), in the order of list_marks."""
     used: NDArray[np.bool]
-    """Which of them are no outliers, (n,)."""
+    """True for those that are no outliers, (n,)."""
 
 
 def fit_stage(
@@ -50,7 +50,7 @@ def fit_stage(
 
     Raises AlignmentError if the looks are too few, or do not belong to the moves.
     """
-    marks = seen_marks(looks)
+    marks = list_marks(looks)
     unknowns = model.initial() if start is None else start
     used = np.ones(len(marks), bool)
     if 2 * len(marks) <= model.size - model.legs:
@@ -95,7 +95,7 @@ def _result(
 
 
 def leg_information(model: StageModel, jacobian: Floats) -> Floats:
-    """Return what the looks tell of the legs, with cameras and marks unknown: rows (., legs).
+    """Return the information of looks about the legs, with cameras and marks unknown: rows (., legs).
 
     `jacobian` is that of the pixels in standard deviations, (n, 2, size).
     """
@@ -128,8 +128,8 @@ def _minimise(
 ) -> Floats:
     from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
-    # Drawings count as one more observation of each correction: they keep the first steps small, and what the looks
-    # cannot tell where it is. The last fit has only directions which the looks tell better.
+    # Drawings count as one more observation of each correction: they keep the first steps small, and undetermined
+    # combinations near zero. The last fit has only directions that the looks determine better.
     prior = np.eye(model.legs, model.size) @ basis if robust else np.zeros((0, basis.shape[1]))
 
     def residuals(step: Floats) -> Floats:

@@ -3,7 +3,7 @@
 The sliders read m; leg i stands at (1 + k_i) m_i. Forward kinematics give the platform's pose (t, phi), a mark at q on
 the platform is at w = t + R(phi) q, and its camera shows it at the pixel u(w) (trirail.alignment.images).
 
-Pixels alone cannot tell everything apart, wherever the stage looks. Three kinds of change are invisible:
+Pixels alone do not determine everything, wherever the stage looks. Three kinds of change are invisible:
 
 - the base frame moves with the rails and the cameras, or the platform's frame with its edges or pivots and the marks;
 - all lengths grow by one factor, since a pixel has no size of its own;
@@ -31,7 +31,7 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import forward, inverse, jacobians
 
 LENGTH_DOUBT_M, ANGLE_DOUBT_RAD, SCALE_DOUBT = 2e-4, 5e-4, 5e-4
-"""Standard deviations beyond which drawings and data sheets tell as much as the looks."""
+"""Standard deviations beyond which drawings and data sheets are as good as the looks."""
 INVISIBLE = 1e-9
 """Singular value, as a share of the greatest, below which a change shows in no look."""
 LENS_NUMBERS = {"affine": 0, "perspective": 2, "radial": 3}
@@ -68,7 +68,7 @@ class StageModel:
     start
         Geometry as configured, without a correction map.
     samples
-        Poses in the stage's travel, (N, 3) [m, rad], by which invisible changes are told.
+        Poses in the stage's travel, (N, 3) [m, rad], which show the invisible changes.
     views, places
         First estimates of the cameras and of the marks' places on the platform.
     view_of
@@ -124,7 +124,7 @@ class StageModel:
         return unknowns
 
     def state(self, unknowns: Floats) -> StageState:
-        """Return the values that the unknowns stand for."""
+        """Return the unknowns as values of legs, views and marks."""
         legs = (self.doubts * (self.basis @ unknowns[: self.legs])).reshape(3, 6)
         views = {name: self._view(name, unknowns) for name in self.views}
         places = {name: _pair(unknowns[self.mark_unknowns(name)]) for name in self.places}
@@ -139,7 +139,7 @@ class StageModel:
         return _poses(self.geometry(unknowns), self.state(unknowns), looks)
 
     def residuals(self, unknowns: Floats, looks: Sequence[StageLook]) -> Floats:
-        """Return seen less computed pixels, (n, 2), in the order of `seen_marks`. Raises KinematicsError."""
+        """Return seen less computed pixels, (n, 2), in the order of `list_marks`. Raises KinematicsError."""
         poses, state = self.poses(unknowns, looks), self.state(unknowns)
         result = np.empty((sum(len(look.marks) for look in looks), 2))
         for rows, at, name, seen in _groups(looks):
@@ -176,19 +176,19 @@ class StageModel:
         return structs.replace(view, pixel=pixel, matrix=matrix)
 
 
-def seen_marks(looks: Sequence[StageLook]) -> list[tuple[int, str]]:
+def list_marks(looks: Sequence[StageLook]) -> list[tuple[int, str]]:
     """Return look and name of each seen mark, the order of residuals."""
     return [(number, name) for number, look in enumerate(looks) for name in look.marks]
 
 
 def _groups(looks: Sequence[StageLook]) -> list[tuple[NDArray[np.int64], NDArray[np.int64], str, Floats]]:
     """Return rows, looks and pixels of each mark."""
-    found: dict[str, list[tuple[int, int, Pair]]] = {}
-    for row, (look, name) in enumerate(seen_marks(looks)):
-        found.setdefault(name, []).append((row, look, looks[look].marks[name]))
+    rows_of: dict[str, list[tuple[int, int, Pair]]] = {}
+    for row, (look, name) in enumerate(list_marks(looks)):
+        rows_of.setdefault(name, []).append((row, look, looks[look].marks[name]))
     return [
         (np.array([r for r, _, _ in each]), np.array([k for _, k, _ in each]), name, np.array([p for *_, p in each]))
-        for name, each in found.items()
+        for name, each in rows_of.items()
     ]
 
 
@@ -212,7 +212,7 @@ def _pose_changes(geometry: Geometry, start: Geometry, poses: Floats, sliders: F
 
 
 def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Floats]:
-    """Return orthonormal bases of the corrections that looks can tell, and of those that change no pose at all.
+    """Return orthonormal bases of the corrections that looks can determine, and of those that change no pose at all.
 
     `rows` are pose changes by corrections in units of `doubts`, (N, 3, 18).
     """

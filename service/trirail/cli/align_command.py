@@ -134,7 +134,7 @@ def run(
 
     kept = _kept(file, service)
     with source.open_source() as (look, _), service.open() as robot:
-        known = _of_geometry(kept, file, now := geometry_id(robot.info()))
+        known = _checked_calibration(kept, file, now := geometry_id(robot.info()))
         task = AlignmentTask(
             known,
             kept.targets,
@@ -187,7 +187,7 @@ def check(
     kept = _kept(file, service)
     task = AlignmentTask(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
     with source.open_source() as (look, _), service.open() as robot:
-        _of_geometry(kept, file, geometry_id(robot.info()))
+        _checked_calibration(kept, file, geometry_id(robot.info()))
         if moves:
             again = repeat_calibration(kept.calibration, source.looks)
             now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), source.speed, source.wait)
@@ -221,7 +221,7 @@ def _kept(file: Path, service: Service) -> CalibrationFile:
     return kept
 
 
-def _of_geometry(kept: CalibrationFile, file: Path, geometry: str) -> CameraCalibration:
+def _checked_calibration(kept: CalibrationFile, file: Path, geometry: str) -> CameraCalibration:
     """Return the calibration; one that was made with another geometry is unconfirmed again, and said to be so."""
     if kept.is_of_geometry(geometry):
         return kept.calibration

@@ -61,7 +61,7 @@ def geometry(
     out
         Configuration to write; one with a free name beside CONFIG if absent.
     calibration
-        Calibration of the cameras to write, for `trirail align run`; what is there is kept as FILE.old.
+        Calibration of the cameras to write, for `trirail align run`; an existing file is kept as FILE.old.
     poses
         How many looks to take, 12 or more.
     one_camera
@@ -90,23 +90,23 @@ def geometry(
 
         wishes = calibrate_geometry(task)
         shown = wishes if service.json else alignment_lines.printed(wishes, poses)
-        found = drive(robot, look, shown, source.speed, source.wait)
+        result = drive(robot, look, shown, source.speed, source.wait)
         targets = drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks
         taught = sorted(name for name, pose in robot.poses().items() if pose.taught)
     if not service.json:
-        alignment_lines.show_geometry(found, settings.geometry.labels)
-    with_map = found.map is not None and found.map.helps and _wants_map(found.map, service, yes=yes)
+        alignment_lines.show_geometry(result, settings.geometry.labels)
+    with_map = result.map is not None and result.map.helps and _wants_map(result.map, service, yes=yes)
     written = _Written()
     if yes or (not service.json and _answers_yes("Write a new configuration with these values?")):
-        written = _write(found, config, settings, out, calibration, targets, service.robot, with_map=with_map)
+        written = _write(result, config, settings, out, calibration, targets, service.robot, with_map=with_map)
     remarks = _remarks(settings, taught)
     if service.json:
         files = {name: None if path is None else str(path) for name, path in written._asdict().items()}
-        terminal.json(_content(found) | {"made_before": remarks, "written": files})
+        terminal.json(_content(result) | {"made_before": remarks, "written": files})
     elif written.config is None:
         terminal.say("nothing is written")
     else:
-        _tell(written, config, remarks)
+        _report(written, config, remarks)
     return 0
 
 
@@ -126,7 +126,7 @@ def _wants_map(offered: ResidualMap, service: Service, *, yes: bool) -> bool:
     before, after = offered.before, offered.after
     if not service.json:
         terminal.say(
-            "A map of what is left would lower the errors at looks that it does not know: from "
+            "A map of the remaining errors would lower them at looks that it does not know: from "
             f"{before[0] * 1e6:.2f} to {after[0] * 1e6:.2f} µm, and {before[1] * 1e6:.2f} to {after[1] * 1e6:.2f} µrad."
         )
     return yes or (not service.json and _answers_yes("Write it too, as [correction] map?"))
@@ -143,7 +143,7 @@ def _answers_yes(question: str) -> bool:
 
 
 def _write(
-    found: GeometryCalibration,
+    result: GeometryCalibration,
     path: Path,
     settings: Config,
     out: Path | None,
@@ -160,25 +160,25 @@ def _write(
     from trirail.config import as_built
 
     written = out or config_edit.find_free_path(path, "calibrated")
-    map_path = written.with_name(f"{written.stem}-map.toml") if with_map and found.map is not None else None
+    map_path = written.with_name(f"{written.stem}-map.toml") if with_map and result.map is not None else None
     text = path.read_text(encoding="utf-8")
-    text = config_edit.edit_geometry(text, found.geometry, found.scales, map_path.name if map_path else None)
+    text = config_edit.edit_geometry(text, result.geometry, result.scales, map_path.name if map_path else None)
     if settings.can.interface == "simulated" and settings.can.simulated.built is None:
         text = config_edit.add_simulated_build(text, settings.drives)
     if written.parent.resolve() != path.parent.resolve():
         text = config_edit.resolve_eds_paths(text, path.parent)
-    if map_path is not None and found.map is not None:
-        errors = as_built.measured_today(found.map.correction, found.geometry)
-        config.check_as_built(errors, found.geometry, settings.limits)
+    if map_path is not None and result.map is not None:
+        errors = as_built.measured_today(result.map.correction, result.geometry)
+        config.check_as_built(errors, result.geometry, settings.limits)
         config_edit.write_new_file(map_path, as_built.format_map(errors))
     config_edit.write_new_file(written, text)
     old = calibration_file.keep_old(cameras)
-    calibration_file.write(cameras, robot, found.cameras, targets, geometry=as_built.geometry_of(found.geometry))
+    calibration_file.write(cameras, robot, result.cameras, targets, geometry=as_built.geometry_of(result.geometry))
     return _Written(written, cameras, old, map_path)
 
 
 def _remarks(settings: Config, taught: list[str]) -> list[str]:
-    """Return what was made with the old geometry."""
+    """Return the list of data that was made with the old geometry."""
     remarks = []
     if taught:
         remarks.append(f"taught poses {', '.join(taught)}: flagged until each is taught again")
@@ -188,10 +188,10 @@ def _remarks(settings: Config, taught: list[str]) -> list[str]:
     return remarks
 
 
-def _tell(written: _Written, path: Path, remarks: list[str]) -> None:
+def _report(written: _Written, path: Path, remarks: list[str]) -> None:
     terminal.say(f"written to {written.config}; {path} is unchanged. Cameras and targets: {written.cameras}")
     if written.old_cameras is not None:
-        terminal.say(f"what was there is in {written.old_cameras}")
+        terminal.say(f"previous file saved as {written.old_cameras}")
     if written.map is not None:
         terminal.say(f"map: {written.map}")
     terminal.say(f"It takes effect when the service is started again: trirail run {written.config}")
@@ -200,19 +200,19 @@ def _tell(written: _Written, path: Path, remarks: list[str]) -> None:
         terminal.say(f"  {remark}")
 
 
-def _content(found: GeometryCalibration) -> dict[str, object]:
-    """Return a calibration for programs; a deviation that the looks do not tell is null."""
+def _content(result: GeometryCalibration) -> dict[str, object]:
+    """Return a calibration for programs; an infinite deviation is null."""
     residual_map = None
-    if found.map is not None:
-        residual_map = {"before": found.map.before, "after": found.map.after, "helps": found.map.helps}
+    if result.map is not None:
+        residual_map = {"before": result.map.before, "after": result.map.after, "helps": result.map.helps}
     return {
-        "parameters": found.parameters,
-        "deviations": {name: value if math.isfinite(value) else None for name, value in found.deviations.items()},
-        "undetermined": found.undetermined,
-        "residual": found.residual._asdict(),
-        "noise": found.noise,
-        "picture_noise": found.picture_noise,
-        "outliers": [each._asdict() for each in found.outliers],
-        "looks": len(found.looks),
+        "parameters": result.parameters,
+        "deviations": {name: value if math.isfinite(value) else None for name, value in result.deviations.items()},
+        "undetermined": result.undetermined,
+        "residual": result.residual._asdict(),
+        "noise": result.noise,
+        "picture_noise": result.picture_noise,
+        "outliers": [each._asdict() for each in result.outliers],
+        "looks": len(result.looks),
         "map": residual_map,
     }

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
+
+from trirail_drivers.interface import NAMES
 
 from trirail.cli import terminal
 
@@ -48,45 +50,46 @@ def show_calibration(found: CameraCalibration, file: Path) -> None:
     terminal.say(f"residual {found.noise:.3f} pixel; kept in {file}")
 
 
-def show_geometry(found: GeometryCalibration, labels: Iterable[str]) -> None:
-    """Print the corrections to a geometry, what the looks do not tell, and how well it predicts."""
-    shown = dict(zip("ABC", labels, strict=True))
-    for name, value in found.parameters.items():
-        leg, parameter = name.split(" ", 1)
-        unit, factor = _unit(parameter)
-        deviation = found.deviations[name]
-        if name in found.undetermined:
-            known = "not told by these looks"
+def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
+    """Print the corrections to a geometry, the undetermined ones, the outliers, and the residuals."""
+    shown = {name: _labelled(name, labels) for name in result.parameters}
+    for name, value in result.parameters.items():
+        unit = "ppm" if name.endswith("scale") else "µrad" if name.endswith("angle") else "µm"
+        deviation = result.deviations[name]
+        if name in result.undetermined:
+            known = "undetermined"
         elif deviation == 0.0:
             known = "by the choice of the frame"
         else:
-            known = f"± {deviation * factor:.1f}"
-        terminal.say(f"{f'{shown[leg]} {parameter}':<32}{value * factor:>+10.1f} {unit:<5} {known}")
-    if found.undetermined:
+            known = f"± {deviation * 1e6:.1f}"
+        terminal.say(f"{shown[name]:<32}{value * 1e6:>+10.1f} {unit:<5} {known}")
+    if result.undetermined:
+        names = ", ".join(shown[name] for name in result.undetermined)
         terminal.say(
-            "Not told, at least not each for itself, and left as configured where nothing tells them: "
-            f"{', '.join(found.undetermined)}. More marks, a second camera or a larger field would tell more."
+            f"Undetermined, alone or in combination: {names}. The combinations stay as configured. More marks, "
+            "a second camera or a larger field would determine more, unless two parameters have the same effect."
         )
-    terminal.say("The frame is the configuration's, moved as little as the legs allow; lengths are those of the three")
-    terminal.say("encoders' mean: pixels tell no absolute length.")
-    for each in found.outliers:
-        swapped = f", where {each.swapped_with} belongs" if each.swapped_with else ""
-        terminal.say(f"look {each.look}: {each.mark} is {each.distance:.1f} pixels away{swapped}; not used")
-    held = found.residual
+    terminal.say(
+        "The frame is that of the configuration, with the least corrections of the legs. Lengths are those of the mean "
+        "of the three encoders, since pixels have no length of their own."
+    )
+    for each in result.outliers:
+        swapped = f", at the place of {each.swapped_with}" if each.swapped_with else ""
+        terminal.say(f"look {each.look}: {each.mark} is {each.distance:.1f} pixels off{swapped}; not used")
+    held = result.residual
     if held.looks:
         terminal.say(
-            f"{held.looks} looks that were held out: marks are off by {held.before_m * 1e6:.2f} µm ({held.before:.2f} "
+            f"{held.looks} looks held out of the fit: marks are off by {held.before_m * 1e6:.2f} µm ({held.before:.2f} "
             f"pixels) with the configured geometry, {held.after_m * 1e6:.2f} µm ({held.after:.2f} pixels) with this one"
         )
-    noise = f"residual {found.noise:.3f} pixel, pictures at rest {found.picture_noise:.3f}"
-    systematic = "; the looks are off by more than noise" if found.is_systematic else ""
-    terminal.say(noise + systematic)
+    systematic = "; larger than the noise: no geometry explains the rest" if result.is_systematic else ""
+    terminal.say(f"residual {result.noise:.3f} pixel, pictures at rest {result.picture_noise:.3f}{systematic}")
 
 
-def _unit(parameter: str) -> tuple[str, float]:
-    if parameter == "encoder scale":
-        return "ppm", 1e6
-    return ("µrad", 1e6) if parameter.endswith("angle") else ("µm", 1e6)
+def _labelled(name: str, labels: Sequence[str]) -> str:
+    """Return a parameter's name with the label of its slider."""
+    leg, _, parameter = name.partition(" ")
+    return f"{labels[NAMES.index(leg)]} {parameter}"
 
 
 def show_changes(changes: Iterable[ViewChange]) -> None:

@@ -295,9 +295,9 @@ class MarkSource:
     """MARK=U,V,WIDTH,HEIGHT, the part of its picture in which a mark is, in pixels, where one picture shows several;
     with --pictures as MARK=PICTURE:U,V,WIDTH,HEIGHT."""
     shape: Literal["cross", "disc", "corner", "code"] = "cross"
-    "What is looked for in pictures; codes are named by their numbers, wherever they are."
+    "Shape of the marks in pictures; codes are named by their numbers, wherever they are."
     family: CodeFamily = "4x4_50"
-    "Which codes, of ArUco or AprilTag."
+    "Family of the codes, ArUco or AprilTag."
     size: float = 100.0
     "Its size in pixels: a disc's diameter, a cross's bars, a corner's sides."
     turn: float = 0.0

@@ -138,9 +138,9 @@ class Poses:
 
     def table(self) -> NamedPoses:
         """Return all poses."""
-        found = {name: self._named(name, pose) for name, pose in self._taught.items()}
-        found |= {name: NamedPose(name, *pose, taught=False) for name, pose in self._configured.items()}
-        return NamedPoses(tuple(found[name] for name in sorted(found)))
+        named = {name: self._named(name, pose) for name, pose in self._taught.items()}
+        named |= {name: NamedPose(name, *pose, taught=False) for name, pose in self._configured.items()}
+        return NamedPoses(tuple(named[name] for name in sorted(named)))
 
     def _named(self, name: str, pose: TaughtPose) -> NamedPose:
         return NamedPose(name, *pose.pose, taught=True, other_geometry=self._is_foreign(pose))
