@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -37,6 +38,8 @@ TRAVEL_SHARE = 0.97
 """Share of the travel that is used: the configured geometry may be wrong by a little."""
 HELD_OUT = 5
 """One of this many planned looks is held out of a fit, as a check of its predictions."""
+MIN_FIRST_LOOKS = 5
+"""First looks, of seven, that must show a mark for it to count."""
 MAX_LEFT_OUT = 2
 """Looks of the first moves that may be wrong."""
 MAX_START_RESIDUAL_PX, MAX_START_SHARE = 1.0, 0.01
@@ -204,7 +207,14 @@ def _stage_look(start: Geometry, seen: Observation) -> StageLook:
 
 def start_model(task: GeometryTask, looks: Sequence[StageLook]) -> tuple[StageModel, Floats, float]:
     """Return the model, its unknowns and the noise [pixel] by the looks at the first moves. Raises AlignmentError."""
-    names = sorted({name for look in looks for name in look.marks})
+    counts = Counter(name for look in looks for name in look.marks)
+    names = sorted(name for name, count in counts.items() if count >= min(MIN_FIRST_LOOKS, len(looks)))
+    if not names:
+        raise AlignmentError(
+            AlignmentFault.MISSING,
+            f"no mark was found in {MIN_FIRST_LOOKS} of the first {len(looks)} looks; check light, focus and threshold",
+        )
+    looks = [look._replace(marks={name: look.marks[name] for name in names if name in look.marks}) for look in looks]
     views = {name: name for name in names} if task.views is None else dict(task.views)
     if unknown := [name for name in names if name not in views]:
         raise AlignmentError(AlignmentFault.MISSING, f"marks without a view: {', '.join(unknown)}; name one for each")
@@ -258,11 +268,13 @@ def _travel(task: GeometryTask) -> Floats:
         middle, half = (low + high) / 2.0, TRAVEL_SHARE * (high - low) / 2.0
         axes.append(np.linspace(middle - half, middle + half, GRID))
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    within = room.holds(travels(task.start, poses))
+    # A slider may go a little beyond both ends on the way between two poses: by 0.2 mm for 5° at 60 mm.
+    margin = -(1.0 - TRAVEL_SHARE) / 2.0 * float(np.ptp(np.atleast_2d(room.position), axis=1).min())
+    within = room.holds(travels(task.start, poses), margin)
     if task.approach is not None:
         beyond = poses + task.approach
         inside = (beyond >= room.low).all(axis=1) & (beyond <= room.high).all(axis=1)
-        within &= inside & room.holds(travels(task.start, beyond))
+        within &= inside & room.holds(travels(task.start, beyond), margin)
     reached: Floats = poses[within]
     if not len(reached):
         raise AlignmentError(AlignmentFault.MOVES, "the limits and the approach leave the stage no pose to look at")
