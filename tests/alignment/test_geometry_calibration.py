@@ -167,6 +167,14 @@ def test_one_camera_tells_less_than_two_and_says_so() -> None:
     assert len(one) > len(two)
 
 
+def test_the_fewest_looks_of_one_mark_still_end_with_what_they_determine() -> None:
+    made, task = stage("uvw", 4, noise=0.05, part={"left": PART["left"]})
+    found = made.drive(calibrate_geometry(task._replace(poses=12)))
+    assert len(found.looks) == 12
+    assert len(found.undetermined) > 6
+    assert all(math.isfinite(found.deviations[name]) for name in found.deviations.keys() - set(found.undetermined))
+
+
 def test_the_frame_and_the_length_are_those_of_the_configuration() -> None:
     """A stage that stands elsewhere, or all of whose encoders count too little, shows the same pictures."""
     made, task = stage("uvw", 5)

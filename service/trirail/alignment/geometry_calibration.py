@@ -361,7 +361,10 @@ def _held_out(model: StageModel, looks: Sequence[StageLook], fit: StageFit) -> H
     scales = np.array([views[name] for _, name in list_marks(out)])
     errors = []
     for fixed in (True, False):
-        trial = fit_stage(model, rest, fit.unknowns if not fixed else None, fixed_legs=fixed)
+        try:
+            trial = fit_stage(model, rest, fit.unknowns if not fixed else None, fixed_legs=fixed)
+        except AlignmentError:  # too few looks remain
+            return HeldOutResidual(0, math.nan, math.nan, math.nan, math.nan)
         distance = np.linalg.norm(model.residuals(trial.unknowns, out), axis=1)
         errors += [math.sqrt(np.mean(distance**2)), math.sqrt(np.mean((distance / scales) ** 2))]
     return HeldOutResidual(len(out), errors[0], errors[2], errors[1], errors[3])

@@ -14,10 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trirail.alignment.camera_calibration import to_base_frame
 from trirail.alignment.images import Pair, project_points
 from trirail.alignment.rigid_motion import Floats
-from trirail.alignment.stage_model import StageLook, StageModel, StageState
+from trirail.alignment.stage_model import StageLook, StageModel, StageState, carry
 
 FIELD_MARGIN = 0.03
 """Share of a picture at each border that no planned mark enters: the first estimate does not know the lens yet."""
@@ -61,7 +60,7 @@ def find_candidates(
 
 def _projected(model: StageModel, state: StageState, name: str, poses: Floats) -> Floats:
     """Return the pixels of a mark at poses, (N, 2)."""
-    at = np.array([to_base_frame(state.places[name], pose) for pose in poses])
+    at, _ = carry(poses, np.array(state.places[name]))
     return np.asarray(project_points(state.views[model.view_of[name]], at))
 
 

@@ -143,7 +143,7 @@ class StageModel:
         poses, state = self.poses(unknowns, looks), self.state(unknowns)
         result = np.empty((sum(len(look.marks) for look in looks), 2))
         for rows, at, name, seen in _groups(looks):
-            w, _ = _carry(poses[at], np.array(state.places[name]))
+            w, _ = carry(poses[at], np.array(state.places[name]))
             result[rows] = seen - project_points(state.views[self.view_of[name]], w)
         return result
 
@@ -156,7 +156,7 @@ class StageModel:
         result = np.zeros((sum(len(look.marks) for look in looks), 2, self.size))
         for rows, at, name, _ in _groups(looks):
             view = self.view_of[name]
-            w, by_phi = _carry(poses[at], np.array(state.places[name]))
+            w, by_phi = carry(poses[at], np.array(state.places[name]))
             by_view, by_w = _projection_derivatives(state.views[view], w)
             by_pose = np.concatenate([by_w, by_w @ by_phi[:, :, None]], axis=2)
             result[rows, :, : self.legs] = by_pose @ changes[at]
@@ -231,13 +231,8 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
     )
     moved, frames = rows.reshape(-1, rows.shape[2]), frames.reshape(-1, 6)
     unit = np.abs(moved).max()
-    both = np.concatenate([moved / unit, frames], axis=1)
-    _, values, directions = np.linalg.svd(both, full_matrices=True)
-    values = np.append(values, np.zeros(len(directions) - len(values)))
-    null = directions[values <= INVISIBLE * values[0]][:, : rows.shape[2]]
-    _, values, directions = np.linalg.svd(moved / unit, full_matrices=True)
-    values = np.append(values, np.zeros(len(directions) - len(values)))
-    held = directions[values <= INVISIBLE * values[0]]
+    null = _null_space(np.concatenate([moved / unit, frames], axis=1))[:, : rows.shape[2]]
+    held = _null_space(moved / unit)
     # The common scale: that of the three encoders' mean, exactly.
     common = np.zeros(rows.shape[2])
     common[5::6] = 1.0 / doubts[5::6]
@@ -247,7 +242,14 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
     return directions[rank:].T, held
 
 
-def _carry(poses: Floats, place: Floats) -> tuple[Floats, Floats]:
+def _null_space(matrix: Floats) -> Floats:
+    """Return an orthonormal basis of the vectors that a matrix takes to zero, in rows."""
+    _, values, directions = np.linalg.svd(np.linalg.qr(matrix, mode="r"))
+    values = np.append(values, np.zeros(len(directions) - len(values)))
+    return np.asarray(directions[values <= INVISIBLE * values[0]])
+
+
+def carry(poses: Floats, place: Floats) -> tuple[Floats, Floats]:
     """Return a mark's positions in the base frame, (n, 2) [m], and their derivatives by phi."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     arm = np.stack([c * place[0] - s * place[1], s * place[0] + c * place[1]], axis=1)
