@@ -16,9 +16,9 @@ from trirail.errors import ConfigError
 if TYPE_CHECKING:
     from trirail.alignment.camera_calibration import Marks
     from trirail.alignment.geometry_calibration import GeometryCalibration
-    from trirail.alignment.residual_map import ResidualMap
     from trirail.client.client import Robot
     from trirail.config import Config
+    from trirail.config.as_built import AsBuilt
 
 PROGRAM = MarkSource()
 
@@ -95,10 +95,12 @@ def geometry(
         taught = sorted(name for name, pose in robot.poses().items() if pose.taught)
     if not service.json:
         alignment_lines.show_geometry(result, settings.geometry.labels)
-    with_map = result.map is not None and result.map.helps and _wants_map(result.map, service, yes=yes)
-    written = _Written()
-    if yes or (not service.json and _answers_yes("Write a new configuration with these values?")):
-        written = _write(result, config, settings, out, calibration, targets, service.robot, with_map=with_map)
+    asks = not yes and not service.json
+    usable, written = _usable_map(result, settings, quiet=service.json), _Written()
+    if yes or (asks and _answers_yes("Write a new configuration with these values?")):
+        if asks and usable is not None and not _answers_yes("Write the map too, as [correction] map?"):
+            usable = None
+        written = _write(result, config, settings, out, calibration, targets, usable)
     remarks = _remarks(settings, taught)
     if service.json:
         files = {name: None if path is None else str(path) for name, path in written._asdict().items()}
@@ -122,14 +124,27 @@ def _check_same(settings: Config, path: Path, robot: Robot) -> None:
         raise ConfigError(f"{path}: its [geometry] is not that with which the service runs; name the service's file")
 
 
-def _wants_map(offered: ResidualMap, service: Service, *, yes: bool) -> bool:
-    before, after = offered.before, offered.after
-    if not service.json:
-        terminal.say(
-            "A map of the remaining errors would lower them at looks that it does not know: from "
-            f"{before[0] * 1e6:.2f} to {after[0] * 1e6:.2f} µm, and {before[1] * 1e6:.2f} to {after[1] * 1e6:.2f} µrad."
-        )
-    return yes or (not service.json and _answers_yes("Write it too, as [correction] map?"))
+def _usable_map(result: GeometryCalibration, settings: Config, *, quiet: bool) -> AsBuilt | None:
+    """Return the map of the remaining errors if it helps and the limits allow it; say its effect unless `quiet`."""
+    from trirail import config
+    from trirail.config import as_built
+
+    if result.map is None or not result.map.helps:
+        return None
+    before, after = result.map.before, result.map.after
+    made = as_built.measured_today(result.map.correction, result.geometry)
+    words = (
+        f"A map of the remaining errors lowers them at held-out looks from {before[0] * 1e6:.2f} to "
+        f"{after[0] * 1e6:.2f} µm, and from {before[1] * 1e6:.2f} to {after[1] * 1e6:.2f} µrad"
+    )
+    try:
+        config.check_as_built(made, result.geometry, settings.limits)
+        usable = True
+    except ConfigError as error:
+        usable, words = False, f"{words}, but it is refused: {error}"
+    if not quiet:
+        terminal.say(words)
+    return made if usable else None
 
 
 def _answers_yes(question: str) -> bool:
@@ -149,31 +164,27 @@ def _write(
     out: Path | None,
     cameras: Path,
     targets: Marks,
-    robot: str,
-    *,
-    with_map: bool,
+    errors: AsBuilt | None,
 ) -> _Written:
     """Write the configuration, the cameras' calibration, and the map. Raises ConfigError, FileError."""
-    from trirail import config
     from trirail.client import calibration_file
     from trirail.commissioning import config_edit
     from trirail.config import as_built
 
     written = out or config_edit.find_free_path(path, "calibrated")
-    map_path = written.with_name(f"{written.stem}-map.toml") if with_map and result.map is not None else None
+    map_path = written.with_name(f"{written.stem}-map.toml") if errors is not None else None
     text = path.read_text(encoding="utf-8")
     text = config_edit.edit_geometry(text, result.geometry, result.scales, map_path.name if map_path else None)
     if settings.can.interface == "simulated" and settings.can.simulated.built is None:
         text = config_edit.add_simulated_build(text, settings.drives)
     if written.parent.resolve() != path.parent.resolve():
         text = config_edit.resolve_eds_paths(text, path.parent)
-    if map_path is not None and result.map is not None:
-        errors = as_built.measured_today(result.map.correction, result.geometry)
-        config.check_as_built(errors, result.geometry, settings.limits)
+    if map_path is not None and errors is not None:
         config_edit.write_new_file(map_path, as_built.format_map(errors))
     config_edit.write_new_file(written, text)
     old = calibration_file.keep_old(cameras)
-    calibration_file.write(cameras, robot, result.cameras, targets, geometry=as_built.geometry_of(result.geometry))
+    geometry_id = as_built.geometry_of(result.geometry)
+    calibration_file.write(cameras, settings.robot.name, result.cameras, targets, geometry=geometry_id)
     return _Written(written, cameras, old, map_path)
 
 
