@@ -85,12 +85,13 @@ def _result(
 ) -> StageFit:
     residuals = model.residuals(unknowns, looks)
     jacobian = model.jacobian(unknowns, looks)[used].reshape(-1, model.size) @ basis
+    legs = model.legs
     freedom = max(2 * int(used.sum()) - basis.shape[1], 1)
     noise = float(np.sqrt((residuals[used] ** 2).sum() / freedom))
-    scales = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    inverse = np.linalg.pinv(jacobian / scales)
+    information = np.concatenate([jacobian, noise * np.eye(legs, model.size) @ basis])  # with the drawings
+    scales = np.maximum(np.linalg.norm(information, axis=0), 1e-300)
+    inverse = np.linalg.pinv(information / scales)
     covariance = basis @ ((inverse @ inverse.T) / np.outer(scales, scales)) @ basis.T * noise**2
-    legs = model.legs
     return StageFit(unknowns, covariance, basis[:legs, : basis.shape[1] - (model.size - legs)], noise, residuals, used)
 
 
@@ -128,16 +129,15 @@ def _minimise(
 ) -> Floats:
     from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
-    # Drawings count as one more observation of each correction: they keep the first steps small, and undetermined
-    # combinations near zero. The last fit has only directions that the looks determine better.
-    prior = np.eye(model.legs, model.size) @ basis if robust else np.zeros((0, basis.shape[1]))
+    # Drawings count as one more observation of each correction: otherwise few looks would explain their noise by legs.
+    prior = np.eye(model.legs, model.size) @ basis
 
     def residuals(step: Floats) -> Floats:
         try:
             seen = model.residuals(unknowns + basis @ step, looks)[used].ravel() / noise
         except KinematicsError:
             return np.full(2 * int(used.sum()) + len(prior), np.inf)  # too far: the solver takes a part of the step
-        return np.concatenate([seen, prior @ step])
+        return np.concatenate([seen, unknowns[: model.legs] + prior @ step])
 
     def jacobian(step: Floats) -> Floats:
         rows = model.jacobian(unknowns + basis @ step, looks)[used].reshape(-1, model.size) @ basis / noise
