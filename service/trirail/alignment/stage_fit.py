@@ -1,7 +1,8 @@
 """Robust fit of a stage model to looks: outliers are left out, undetermined combinations stay as configured.
 
 The residuals are weighed by their own noise, estimated from their median. A first fit with a soft loss (soft l1,
-Triggs et al. 2000, Bundle Adjustment, 4.3) finds the outliers; the last one is plain least squares without them.
+Triggs et al. 2000, Bundle Adjustment, 4.3) finds the outliers; the last one is least squares without them. In both the
+drawings count as one more observation of each correction, with the doubts of trirail.alignment.stage_model.
 """
 
 from __future__ import annotations

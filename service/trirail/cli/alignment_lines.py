@@ -82,6 +82,10 @@ def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
             f"{held.looks} looks held out of the fit: marks are off by {held.before_m * 1e6:.2f} µm ({held.before:.2f} "
             f"pixels) with the configured geometry, {held.after_m * 1e6:.2f} µm ({held.after:.2f} pixels) with this one"
         )
+        if held.after >= held.before:
+            terminal.say(
+                "This geometry predicts them no better than the configured one: take more looks, or more marks."
+            )
     systematic = "; larger than the noise: no geometry explains the rest" if result.is_systematic else ""
     terminal.say(f"residual {result.noise:.3f} pixel, pictures at rest {result.picture_noise:.3f}{systematic}")
 
