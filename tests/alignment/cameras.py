@@ -59,6 +59,10 @@ class Stage:
         """The longest of the motions that were made about a point [m]."""
         self.motions = 0
 
+    def reseed(self, seed: int) -> None:
+        """Give the looks from now on other noise."""
+        self._rng = np.random.default_rng(seed)
+
     @property
     def true_pose(self) -> Triple:
         """Where the table is."""

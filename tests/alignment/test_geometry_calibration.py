@@ -175,6 +175,20 @@ def test_the_fewest_looks_of_one_mark_still_end_with_what_they_determine() -> No
     assert all(math.isfinite(found.deviations[name]) for name in found.deviations.keys() - set(found.undetermined))
 
 
+def test_standard_deviations_are_the_scatter_of_repeated_calibrations() -> None:
+    corrections, deviations = [], []
+    for repeat in range(12):
+        made, task = stage("uvw", 3, noise=0.05)
+        made.reseed(repeat)
+        found = made.drive(calibrate_geometry(task))
+        corrections.append(list(found.parameters.values()))
+        deviations.append(list(found.deviations.values()))
+    expected = np.median(deviations, axis=0)
+    told = np.isfinite(expected) & (expected > 1e-12)
+    ratios = np.std(corrections, axis=0, ddof=1)[told] / expected[told]
+    assert 0.7 < math.sqrt(float(np.mean(ratios**2))) < 1.2
+
+
 def test_the_frame_and_the_length_are_those_of_the_configuration() -> None:
     """A stage that stands elsewhere, or all of whose encoders count too little, shows the same pictures."""
     made, task = stage("uvw", 5)

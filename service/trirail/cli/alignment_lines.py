@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 ARCSECONDS = 3600.0 * 180.0 / math.pi
+FRAME_DEVIATION = 1e-12
+"""Standard deviation below which a parameter is fixed by the choice of the frame [m, rad]; rounding leaves no zero."""
 ENDED_WELL = ("reached", "calibrated", "checked")
 
 
@@ -58,7 +60,7 @@ def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
         deviation = result.deviations[name]
         if name in result.undetermined:
             known = "undetermined"
-        elif deviation == 0.0:
+        elif deviation < FRAME_DEVIATION:
             known = "by the choice of the frame"
         else:
             known = f"± {deviation * 1e6:.1f}"
