@@ -78,6 +78,13 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     told = json.loads(trirail("align", "check", kept, *marks, "--moves", "--json").stdout)
     assert [(view["view"], view["changed"]) for view in told["views"]] == [("left", False), ("right", False)]
     assert "the part lies right" in trirail("align", "run", kept, *marks, *loose).stdout
+    # As if it had been made with another geometry: said, and unconfirmed until a correction confirms it.
+    made = json.loads(kept.read_text(encoding="utf-8"))
+    kept.write_text(json.dumps(made | {"geometry": "01234567"}), encoding="utf-8")
+    part.write_text(json.dumps({"left": [-0.0598, 0.0104], "right": [0.0602, 0.0107]}), encoding="utf-8")
+    assert "another geometry" in " ".join(trirail("align", "run", kept, *marks, *loose).stderr.split())
+    again = json.loads(kept.read_text(encoding="utf-8"))
+    assert (again["geometry"], again["calibration"]["confirmed"]) == (made["geometry"], True)
     part.write_text(json.dumps({"left": [-0.06, 0.01], "right": [0.061, 0.01]}), encoding="utf-8")
     refused = trirail("align", "run", kept, *marks, *loose, code=1).stderr
     assert "distance between marks" in " ".join(refused.split())
