@@ -100,6 +100,7 @@ def align(*, parts: int = 200, goals: int = 20, stages: int = 20, json: bool = F
     import bench_geometry
 
     results = bench_align.measure(parts, goals) if parts else {}
+    results |= {"pixels, rms of a mark's error": bench_geometry.marks(20)}
     report(results | {"geometry by cameras": bench_geometry.measure(stages)}, json)
 
 
