@@ -10,11 +10,13 @@ import msgspec
 from cyclopts import App
 
 from trirail.cli import alignment_lines, notation, terminal
+from trirail.cli.align_geometry import geometry
 from trirail.cli.mark_source import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 
 if TYPE_CHECKING:
+    from trirail.alignment.camera_calibration import CameraCalibration
     from trirail.alignment.procedure import AlignmentRequest, Observation
     from trirail.client.calibration_file import CalibrationFile
 
@@ -22,6 +24,7 @@ app = App(name="align", help="Lay a part right by marks in cameras, calibrated o
 FILE = Path("camera.json")
 T = TypeVar("T")
 PROGRAM = MarkSource()
+app.command(geometry)
 
 
 @app.command
@@ -63,6 +66,7 @@ def calibrate(
     from trirail.alignment.procedure import calibrate_by_moves, calibration_moves, observe_mean
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_id
 
     if lens == "radial" and centre is None:
         raise TrirailError(
@@ -74,8 +78,9 @@ def calibrate(
         requests = calibrate_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
         calibration = drive(robot, look, _with_progress(requests, service, len(moves) + 1), source.speed, source.wait)
         targets = dict(drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks)
+        made_with = geometry_id(robot.info())
     old = calibration_file.keep_old(file)
-    calibration_file.write(file, service.robot, calibration, targets)
+    calibration_file.write(file, service.robot, calibration, targets, geometry=made_with)
     if service.json:
         terminal.json(
             {
@@ -125,23 +130,25 @@ def run(
     from trirail.alignment.procedure import AlignmentTask, align
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_id
 
     kept = _load_calibration(file, service)
-    task = AlignmentTask(
-        kept.calibration,
-        kept.targets,
-        tolerance,
-        notation.radians(angle, False),
-        corrections,
-        distance_ppm * 1e-6,
-        source.looks,
-        _approach(approach),
-    )
     with source.open_source() as (look, _), service.open() as robot:
+        known = _checked_calibration(kept, file, now := geometry_id(robot.info()))
+        task = AlignmentTask(
+            known,
+            kept.targets,
+            tolerance,
+            notation.radians(angle, False),
+            corrections,
+            distance_ppm * 1e-6,
+            source.looks,
+            _approach(approach),
+        )
         result = drive(robot, look, _with_progress(align(task), service), source.speed, source.wait)
-    if result.confirmed != kept.calibration.confirmed:
-        known = msgspec.structs.replace(kept.calibration, confirmed=result.confirmed)
-        calibration_file.write(file, kept.robot, known, kept.targets, kept.made)
+    if result.confirmed != known.confirmed:
+        known = msgspec.structs.replace(known, confirmed=result.confirmed)
+        calibration_file.write(file, kept.robot, known, kept.targets, kept.made, now)
     if service.json:
         terminal.json({"reached": result.reached} | msgspec.to_builtins(result))
     else:
@@ -175,10 +182,12 @@ def check(
     from trirail.alignment.calibration_diff import compare_views
     from trirail.alignment.procedure import AlignmentTask, measure_part, repeat_calibration
     from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_id
 
     kept = _load_calibration(file, service)
     task = AlignmentTask(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
     with source.open_source() as (look, _), service.open() as robot:
+        _checked_calibration(kept, file, geometry_id(robot.info()))
         if moves:
             again = repeat_calibration(kept.calibration, source.looks)
             progress = _with_progress(again, service, len(kept.calibration.poses))
@@ -211,6 +220,17 @@ def _load_calibration(file: Path, service: Service) -> CalibrationFile:
     if kept.robot != service.robot:
         raise TrirailError(f"{file} is of robot {kept.robot}, not of {service.robot}: calibrate this one")
     return kept
+
+
+def _checked_calibration(kept: CalibrationFile, file: Path, geometry: str) -> CameraCalibration:
+    """Return the calibration; one that was made with another geometry is unconfirmed again, and said to be so."""
+    if kept.is_of_geometry(geometry):
+        return kept.calibration
+    terminal.print_error(
+        f"{file} was made with another geometry of the stage: calibrate again, or let an alignment confirm it; "
+        "its first correction is short until then"
+    )
+    return msgspec.structs.replace(kept.calibration, confirmed=False)
 
 
 def _with_progress(

@@ -68,6 +68,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail align calibrate camera.json --program ./marks",
             "trirail align run camera.json --camera left=0 --camera right=1 --shape disc --size 80",
             "trirail align check camera.json --pictures shots --json",
+            "trirail align geometry robot.toml --field 4096 3000 --program ./marks --looks 4",
         ),
         "pause": ("trirail pause",),
         "resume": ("trirail resume",),

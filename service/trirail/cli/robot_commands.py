@@ -290,6 +290,7 @@ def poses(*, service: Service = HERE) -> int:
     width = max(map(len, named_poses), default=0)
     for name, pose in named_poses.items():
         whose = "taught" if pose.taught else "of [poses]"
+        whose += ", with another geometry: look at it, and teach it again" if pose.other_geometry else ""
         terminal.print_line(f"{name:<{width}}   {notation.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
     if not named_poses:
         terminal.print_line("there is none: trirail teach NAME makes one of where the robot stands")

@@ -210,6 +210,7 @@ class Robot:
     track = _context(AsyncRobot.track, Track)
     calibrate_camera = _conversation(AsyncRobot.calibrate_camera)
     align = _conversation(AsyncRobot.align)
+    calibrate_geometry = _conversation(AsyncRobot.calibrate_geometry)
 
     enable = _call(AsyncRobot.enable)
     disable = _stop(AsyncRobot.disable)

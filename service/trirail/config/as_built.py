@@ -7,6 +7,7 @@ trirail.kinematics.correction.
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import tomllib
 import zlib
 from collections.abc import Sequence
@@ -81,6 +82,12 @@ def correction(as_built: AsBuilt) -> Correction:
         return Correction(as_built.low, as_built.high, np.array(as_built.nodes))
     except ValueError as error:  # rows of different length; KinematicsError
         raise ConfigError(f"correction.as_built.nodes: {error}") from error
+
+
+def measured_today(errors: Correction, robot: Geometry) -> AsBuilt:
+    """Return the map of a correction that was measured today on a robot with this [geometry]."""
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    return AsBuilt(today, geometry_of(robot), errors.low, errors.high, errors.nodes.tolist())
 
 
 def read(path: Path) -> AsBuilt:

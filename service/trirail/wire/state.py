@@ -267,6 +267,8 @@ class NamedPose(Struct, frozen=True):
     """Counterclockwise [rad]."""
     taught: bool
     """Whether the pose was taught, and can be replaced or removed; others are from [poses] of the configuration."""
+    other_geometry: bool = False
+    """Whether it was taught with another [geometry] than that of the service; check it, and teach it again."""
 
 
 class NamedPoses(Struct, frozen=True):
