@@ -422,6 +422,7 @@ CLOSED: dict[str, Call] = {
     "state": lambda robot, _: robot.state(),
     "records": lambda robot, _: robot.records(print),
     "calibrate_camera": lambda robot, _: robot.calibrate_camera(dict),
+    "calibrate_geometry": lambda robot, _: robot.calibrate_geometry(dict, (1.0, 1.0)),
     "align": lambda robot, _: robot.align(dict, {"a": (0.0, 0.0)}, CALIBRATION),
 }
 
