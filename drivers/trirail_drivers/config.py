@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta, Struct
 
@@ -162,6 +162,21 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     refused until the service is restarted."""
     write: tuple[ObjectWrite, ...] = ()
     """Objects of the maker's to write at set-up."""
+
+
+class DigitalIo(NamedTuple):
+    """Digital outputs and inputs of one drive, as bits of 60FEh and 60FDh."""
+
+    outputs: int = 0
+    """Bits that the service switches."""
+    safe: int = 0
+    """Values of those bits without power, in a fault and at the end."""
+    inputs: int = 0
+    """Bits that the service reads."""
+
+
+DriveIo = tuple[DigitalIo, DigitalIo, DigitalIo]
+NO_IO: DriveIo = (DigitalIo(), DigitalIo(), DigitalIo())
 
 
 class Drives(Struct, frozen=True, forbid_unknown_fields=True):

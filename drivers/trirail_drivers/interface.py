@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
@@ -115,6 +115,7 @@ class Feedback(NamedTuple):
     """Reason for which each drive cannot be reset yet; None if it is configured. A drive without a position since the
     start is reported at its zero, and as not homed."""
     inputs: tuple[int, int, int] = (0, 0, 0)
+    """Newest digital inputs of each drive: bits of object 60FDh, those of the configuration alone."""
 
 
 class DriveGroup(Protocol):
@@ -162,6 +163,16 @@ class DriveGroup(Protocol):
 
     def write(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC."""
+
+    @property
+    def path_outputs(self) -> tuple[bool, bool, bool]:
+        """Whether each drive takes its digital outputs at the same SYNC as a setpoint, known after `configure`."""
+
+    def set_outputs(self, words: Sequence[int]) -> None:
+        """Set the wanted digital outputs of each drive, bits of object 60FEh; the next `write` sends what has changed.
+
+        Also in a cycle in which the drives were stopped.
+        """
 
     def enable(self, alone: str | None = None) -> None:
         """Begin to power up all drives, or only the drive `alone`, the others staying without power.

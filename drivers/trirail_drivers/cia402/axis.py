@@ -190,6 +190,9 @@ class Cia402Axis(Axis):
         rows = [expected_row(identifier, number, bytes(data), bytes(mask), position_at=position, status_at=offset)]
         if exchange.status is not None:
             rows.append(expected_row(exchange.status, number, word, decides, status_at=0))
+        if exchange.inputs is not None:
+            held, read = canopen_frames.DIGITAL.pack(self.inputs), canopen_frames.DIGITAL.pack(self.io.inputs)
+            rows.append(expected_row(exchange.inputs, number, held, read))
         alive = canopen_frames.NMT_STATE.pack(canopen_frames.OPERATIONAL)
         bits = bytes([canopen_frames.NMT_STATE_BITS if exchange.guarded else 0xFF])
         rows.append(expected_row(canopen_frames.HEARTBEAT + self.node, number, alive, bits, lives=exchange.heard))
@@ -245,6 +248,11 @@ class Cia402Axis(Axis):
         (statusword,) = canopen_frames.STATUSWORD.unpack(data)
         self.status_heard = now
         self.update_status(statusword)
+
+    def on_inputs(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
+        """Handle TPDO3: the digital inputs, on change and every STATUS_PERIOD."""
+        (word,) = canopen_frames.DIGITAL.unpack(data)
+        self.inputs = word & self.io.inputs
 
     def update_status(self, statusword: int) -> None:
         """Update the power state from a statusword."""

@@ -17,6 +17,8 @@ TPDO1: Final = 0x180
 RPDO1: Final = 0x200
 TPDO2: Final = 0x280
 RPDO2: Final = 0x300
+TPDO3: Final = 0x380
+RPDO3: Final = 0x400
 SDO_ANSWER: Final = 0x580
 SDO_REQUEST: Final = 0x600
 HEARTBEAT: Final = 0x700
@@ -29,6 +31,10 @@ POSITION: Final = Struct("<i")
 """TPDO2: actual position 6064h [counts]."""
 CONTROLWORD: Final = Struct("<H")
 """RPDO1: controlword 6040h."""
+DIGITAL: Final = Struct("<I")
+"""RPDO3 and TPDO3: digital outputs 60FEh:01, digital inputs 60FDh."""
+OUTPUTS_DOWNLOAD: Final = b"\x23\xfe\x60\x01"
+"""Beginning of the SDO that writes the digital outputs 60FEh:01; its four bytes follow."""
 STATUSWORD: Final = Struct("<H")
 """TPDO1: statusword 6041h."""
 EMERGENCY: Final = Struct("<HB5s")

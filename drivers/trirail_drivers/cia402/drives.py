@@ -44,8 +44,10 @@ class Cia402(Driver[Cia402Axis]):
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
+        io: config.DriveIo = config.NO_IO,
     ) -> None:
-        super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening)
+        super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening, io=io)
+        self._io = io
         self._other_masters = OtherMasters(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
             self._listen(axis)
@@ -60,8 +62,8 @@ class Cia402(Driver[Cia402Axis]):
         self._heartbeat_due: float | None = None
         self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
-        self._lent_state: list[tuple[int, int]] = []
-        """Controlwords and statuswords for which the tables are filled."""
+        self._lent_state: list[tuple[int, int, int]] = []
+        """Controlwords, statuswords and digital inputs for which the tables are filled."""
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
@@ -75,7 +77,7 @@ class Cia402(Driver[Cia402Axis]):
         """
         self._set_period(period, canopen_frames.TRAFFIC)
         scales = tuple(axis.scale for axis in self._axes)
-        ones = setup.setup_tasks(self._wire.bus, self._drives, scales, period, self._clock)
+        ones = setup.setup_tasks(self._wire.bus, self._drives, scales, period, self._clock, self._io)
         configure = partial(setup.configure, self._wire.bus, self._drives, ones, fastest, awaits=awaits)
         done, lost = self._set_up(configure, awaits=awaits)
         each = [
@@ -116,6 +118,7 @@ class Cia402(Driver[Cia402Axis]):
         """Let a drive take part in the cycle again after its set-up in the background."""
         axis, drive = self._axes[number], self._drives.each[number]
         axis.rejoin(made.exchange, made.units, self._clock(), homed=drive.homing is None)
+        axis.outputs_sent = NOWHERE if axis.io.outputs else axis.outputs
         self._apply_start(axis, start)
         self._prepare_frames()
 
@@ -124,6 +127,8 @@ class Cia402(Driver[Cia402Axis]):
         listen(exchange.feedback.identifier, axis, axis.on_position)
         if exchange.status is not None:
             listen(exchange.status, axis, axis.on_status)
+        if exchange.inputs is not None:
+            listen(exchange.inputs, axis, axis.on_inputs)
         listen(exchange.emergency, axis, axis.on_emergency)
         listen(canopen_frames.HEARTBEAT + axis.node, axis, axis.on_heartbeat)
         listen(canopen_frames.SDO_ANSWER + axis.node, axis, axis.on_sdo)
@@ -196,9 +201,34 @@ class Cia402(Driver[Cia402Axis]):
             (a.follows, b.follows, c.follows),
             (a.homed, b.homed, c.homed),
             self._unready,
+            (a.inputs, b.inputs, c.inputs),
         )
 
+    @property
+    def path_outputs(self) -> tuple[bool, bool, bool]:
+        """Whether each drive takes its outputs with a setpoint: those that map 60FEh into a PDO."""
+        a, b, c = (axis.exchange.outputs is not None for axis in self._axes)
+        return a, b, c
+
+    def _send_outputs(self) -> None:
+        """Send the digital outputs that have changed, to be taken up at the next SYNC; by SDO, one at a time."""
+        for axis in self._axes:
+            if axis.outputs == axis.outputs_sent or not axis.configured or self._is_being_configured(axis):
+                continue
+            data = canopen_frames.DIGITAL.pack(axis.outputs)
+            if axis.exchange.outputs is not None:
+                if self._wire.send(Frame(axis.exchange.outputs, data)):
+                    axis.outputs_sent = axis.outputs
+            elif not axis.unanswered:
+                self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + data)
+                axis.outputs_sent = axis.outputs
+
     def write(self, position: Triple, velocity: Triple) -> None:
+        """Send setpoints [m] and velocity feed-forward [m/s], and the digital outputs that have changed."""
+        self._write_setpoints(position, velocity)
+        self._send_outputs()
+
+    def _write_setpoints(self, position: Triple, velocity: Triple) -> None:
         """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC.
 
         Setpoints that are not finite or beyond 32-bit counts latch a fault of cause "setpoint" instead. The next
@@ -238,6 +268,8 @@ class Cia402(Driver[Cia402Axis]):
         due = self._heartbeat_due
         if due is None or not (self._wire.is_healthy and self._homing.idle) or self._period == 0.0:
             return None
+        if any(axis.outputs != axis.outputs_sent and axis.exchange.outputs is None for axis in self._axes):
+            return None
         if self._stopped_in_this_cycle or not all(
             axis.is_steady(_target_of(axis, self._wanted)) for axis in self._axes
         ):
@@ -246,8 +278,11 @@ class Cia402(Driver[Cia402Axis]):
         if not len(lent.end):
             lent.begin, lent.beats, lent.setpoints = map(packed_frames, ([self._sync], self._beats, self._setpoints))
             lent.end = lent.setpoints.headers
+            identifiers = [axis.exchange.outputs for axis in self._axes]
+            if any(each is not None for each in identifiers):
+                lent.outputs = packed_frames([Frame(each or 0, bytes(4)) for each in identifiers])
         lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NOWHERE, lent.times[0]["traffic"]
-        words = [(axis.controlword, axis.statusword) for axis in self._axes]
+        words = [(axis.controlword, axis.statusword, axis.inputs) for axis in self._axes]
         if words != self._lent_state:
             self._lent_state = words
             for axis, frame in zip(self._axes, self._setpoints, strict=True):
@@ -334,6 +369,8 @@ class Cia402(Driver[Cia402Axis]):
         self._command()
 
     def _cut_power(self) -> None:
+        self.set_outputs([axis.io.safe for axis in self._axes])
+        self._send_outputs()
         # By PDO and SDO: an operational node gets both, a pre-operational one only the SDO (CiA 301).
         for axis in self._axes:
             self._send_word(axis, canopen_frames.DISABLE_VOLTAGE)

@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 from trirail_drivers.bus.frames import send_in_setup
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.differences import Difference, Differences
+from trirail_drivers.cia402.digital_io import configure_digital_io
 from trirail_drivers.cia402.drive_units import read_units
 from trirail_drivers.cia402.dry_run import DryRun
 from trirail_drivers.cia402.guarding import configure_watchdogs
@@ -23,7 +24,7 @@ from trirail_drivers.cia402.settings import (
     heartbeat_period_ms,
 )
 from trirail_drivers.cia402.units import Units
-from trirail_drivers.config import Drive, Drives
+from trirail_drivers.config import DigitalIo, Drive, Drives
 from trirail_drivers.driver.conversations import LOG
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
@@ -90,6 +91,8 @@ class SetupTask(NamedTuple):
     scale: Scale
     period: float
     """Cycle period [s]."""
+    io: DigitalIo = DigitalIo()
+    """Its digital outputs and inputs."""
 
 
 async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
@@ -121,6 +124,7 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
     pdos = Pdos(differences, drive.node)
     setpoints, controlword = await pdos.setpoints(mode)
     feedback, status, polled = await pdos.feedback()
+    outputs, inputs = await configure_digital_io(differences, pdos, one.io)
     await pdos.switch_off_others()
     for key in ((0x603F, 0), (0x1001, 0)):
         if not await remote.has(*key):
@@ -139,6 +143,8 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
         watched.emergency,
         FOLLOWING_BIT not in drive.accept_without,
         shown,
+        outputs,
+        inputs,
     )
     vendor, product, revision, serial = [await remote.peek(0x1018, subindex) for subindex in range(1, 5)]
     device_type = await remote.peek(0x1000) or 0

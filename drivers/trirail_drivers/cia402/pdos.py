@@ -12,6 +12,8 @@ from trirail_drivers.cia402.process_data import (
     ACTUAL_POSITION,
     CONTROLWORD,
     CYCLIC_SYNCHRONOUS_POSITION,
+    DIGITAL_INPUTS,
+    DIGITAL_OUTPUTS,
     POSITIONS,
     STATUSWORD,
     VELOCITY_OFFSET,
@@ -132,6 +134,20 @@ class Pdos:
         if polled:
             self._drive.add_note(f"its statusword is also requested by SDO, every {canopen_frames.POLL_PERIOD:g} s")
         return chosen, status, polled
+
+    async def outputs(self) -> int | None:
+        """Return the identifier of the digital outputs' RPDO, with SYNC; None if it cannot be mapped."""
+        return await self._map(RPDO + 2, canopen_frames.RPDO3 + self._node, EVERY_SYNC, (DIGITAL_OUTPUTS,))
+
+    async def inputs(self) -> int:
+        """Return the identifier of the digital inputs' event-driven TPDO. DriveError if it cannot be mapped."""
+        identifier = await self._map(TPDO + 2, canopen_frames.TPDO3 + self._node, ON_CHANGE, (DIGITAL_INPUTS,))
+        if identifier is None:
+            raise DriveError(
+                f"drive {self._remote.name}: object 60FD (digital inputs) cannot be mapped into PDO {TPDO + 2:04X}; "
+                "leave its [inputs] out"
+            )
+        return identifier
 
     async def switch_off_others(self) -> None:
         """Switch off unused PDOs: they add bus load that is not budgeted, or accept frames of other senders."""

@@ -20,6 +20,8 @@ ACTUAL_POSITION: Final = 0x6064_00_20
 TARGET_POSITION: Final = 0x607A_00_20
 VELOCITY_OFFSET: Final = 0x60B1_00_20
 INTERPOLATION_DATA: Final = 0x60C1_01_20
+DIGITAL_OUTPUTS: Final = 0x60FE_01_20
+DIGITAL_INPUTS: Final = 0x60FD_00_20
 """Entries of PDO mappings: index, subindex, bits (CiA 301, 1600h)."""
 
 POSITIONS: Final = {CYCLIC_SYNCHRONOUS_POSITION: TARGET_POSITION, INTERPOLATED_POSITION: INTERPOLATION_DATA}
@@ -135,6 +137,10 @@ class Exchange:
     """Whether bit 12 of its statusword must show that it follows setpoints."""
     mode_shown: bool = True
     """Whether 6061h shows the mode without power too."""
+    outputs: int | None = None
+    """Identifier of the RPDO of the digital outputs; None if there are none, or if they are written by SDO."""
+    inputs: int | None = None
+    """Identifier of the event-driven TPDO of the digital inputs; None if there are none."""
 
     @property
     def name(self) -> str:
@@ -162,13 +168,18 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
     """Return the bus traffic of the service and of drives with these exchanges."""
     exchanges = tuple(exchanges)
     cycle = frame_bits(0) + sum(
-        frame_bits(exchange.setpoints.size) + frame_bits(exchange.feedback.size) for exchange in exchanges
+        frame_bits(exchange.setpoints.size)
+        + frame_bits(exchange.feedback.size)
+        + frame_bits(4) * (exchange.outputs is not None)
+        for exchange in exchanges
     )
     status = sum(frame_bits(2) for exchange in exchanges if exchange.status) / canopen_frames.STATUS_PERIOD
+    status += sum(frame_bits(4) for exchange in exchanges if exchange.inputs) / canopen_frames.STATUS_PERIOD
     polls = sum(2 * frame_bits(8) for exchange in exchanges if exchange.polled) / canopen_frames.POLL_PERIOD
     lives = frame_bits(1) * (1 + sum(1 + exchange.guarded for exchange in exchanges))
     return Traffic(
         cycle_bits=cycle,
         background=lambda heartbeat: status + polls + lives / heartbeat,
-        most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
+        most_sent=11
+        + sum(exchange.guarded + exchange.polled + (exchange.outputs is not None) for exchange in exchanges),
     )

@@ -13,7 +13,7 @@ from trirail_drivers.cia402.one_drive import SetUp, SetupTask, Start, configure_
 from trirail_drivers.cia402.sdo import Remote, run_setups
 from trirail_drivers.cia402.sdo_client import Client
 from trirail_drivers.cia402.settings import check_nodes, heartbeat_period_ms, interpolation_periods
-from trirail_drivers.config import Drives
+from trirail_drivers.config import NO_IO, DriveIo, Drives
 from trirail_drivers.driver.refusals import raise_combined
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveAbsentError, DriveError
@@ -84,7 +84,12 @@ def survey(
 
 
 def setup_tasks(
-    bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock
+    bus: can.BusABC,
+    drives: Drives,
+    scales: tuple[Scale, ...],
+    period: float,
+    clock: Clock,
+    io: DriveIo = NO_IO,
 ) -> list[SetupTask]:
     """Return the set-up tasks of the three drives, for a cycle of `period` seconds.
 
@@ -93,13 +98,20 @@ def setup_tasks(
     check_nodes(drives)
     heartbeat_period_ms(drives)
     interpolation_periods(period)
-    return _drives(bus, drives, scales, period, clock)
+    return _drives(bus, drives, scales, period, clock, io)
 
 
-def _drives(bus: can.BusABC, drives: Drives, scales: tuple[Scale, ...], period: float, clock: Clock) -> list[SetupTask]:
+def _drives(
+    bus: can.BusABC,
+    drives: Drives,
+    scales: tuple[Scale, ...],
+    period: float,
+    clock: Clock,
+    io: DriveIo = NO_IO,
+) -> list[SetupTask]:
     asked = remotes(bus, drives, clock)
-    each = zip(asked, drives.each, scales, strict=True)
-    return [SetupTask(remote, drive, drives, scale, period) for remote, drive, scale in each]
+    each = zip(asked, drives.each, scales, io, strict=True)
+    return [SetupTask(remote, drive, drives, scale, period, digital) for remote, drive, scale, digital in each]
 
 
 def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
@@ -131,6 +143,8 @@ def check_identifiers(done: Sequence[SetUp]) -> None:
             exchange.controlword,
             exchange.feedback.identifier,
             exchange.status,
+            exchange.outputs,
+            exchange.inputs,
         ):
             if identifier is None:
                 continue

@@ -31,13 +31,15 @@ IFF_UP = 0x1
 """Flag of a network interface that is up (linux/if.h)."""
 
 
-def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> can.BusABC:
+def open_bus(
+    section: config.Can, drives: config.Drives, clock: Clock = time.monotonic, io: config.DriveIo = config.NO_IO
+) -> can.BusABC:
     """Return the bus that section [can] names; BusError with the remedy if it cannot be opened.
 
-    `drives` and `clock` are used for the simulated drives of a "simulated" bus.
+    `drives`, `clock` and `io` are used for the simulated drives of a "simulated" bus.
     """
     if section.interface == "simulated":
-        return simulated_bus(section, drives, clock)
+        return simulated_bus(section, drives, clock, io)
     if section.interface == "unix":
         return UnixBus(section.channel)
     if section.interface not in can.VALID_INTERFACES:
@@ -77,8 +79,9 @@ def connect(
     capture: Capture | None = None,
     *,
     awaits: bool = False,
+    io: config.DriveIo = config.NO_IO,
 ) -> DriveGroup:
-    """Return the three drives on their bus, not set up yet; `capture` captures every frame.
+    """Return the three drives on their bus, not set up yet; `capture` captures every frame, `io` are their digital I/O.
 
     With `awaits`, a lost bus is reopened in the background of the cycle, and a missing bus is opened when it appears.
 
@@ -87,7 +90,7 @@ def connect(
     protocol = PROTOCOLS[drives.protocol]
 
     def opened() -> can.BusABC:
-        bus = open_bus(section, drives, clock)
+        bus = open_bus(section, drives, clock, io)
         return CapturedBus(bus, capture) if capture is not None else bus
 
     reopening = Reopening(section.channel or section.interface, opened) if awaits else None
@@ -99,23 +102,27 @@ def connect(
             raise
         bus = AbsentBus(reopening.name, str(error))
     try:
-        return protocol.driver(bus, section.bitrate, drives, clock, reopening)
+        return protocol.driver(bus, section.bitrate, drives, clock, reopening, io)
     except DriveError:
         bus.shutdown()
         raise
 
 
-def simulated_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> SimulatedBus:
+def simulated_bus(
+    section: config.Can, drives: config.Drives, clock: Clock = time.monotonic, io: config.DriveIo = config.NO_IO
+) -> SimulatedBus:
     """Return the three simulated drives of a configuration on a bus of their own, at rest at `can.simulated.start`."""
-    devices, faults = simulated_drives(section, drives)
+    devices, faults = simulated_drives(section, drives, io)
     return SimulatedBus(devices, clock, faults)
 
 
-def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequence[SimulatedDevice], Faults]:
+def simulated_drives(
+    section: config.Can, drives: config.Drives, io: config.DriveIo = config.NO_IO
+) -> tuple[Sequence[SimulatedDevice], Faults]:
     """Return the three simulated drives of a configuration, without a bus, and their faults."""
     protocol = PROTOCOLS[drives.protocol]
-    starts = zip(drives.each, section.simulated.start, strict=True)
-    devices = [protocol.simulated_drive(section.simulated, drives, drive, start) for drive, start in starts]
+    each = zip(drives.each, section.simulated.start, io, strict=True)
+    devices = [protocol.simulated_drive(section.simulated, drives, *one) for one in each]
     scales = [drive.direction * drive.counts_per_metre for drive in drives.each]
     mounted = [_mounted(section.simulated.built, index, drive) for index, drive in enumerate(drives.each)]
     return devices, Faults(devices, scales, protocol.fault_frames, mounted=mounted)

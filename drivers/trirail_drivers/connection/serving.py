@@ -29,12 +29,13 @@ def serve(
     drives: config.Drives,
     ready: Callable[[], None],
     connected: Callable[[], None],
+    io: config.DriveIo = config.NO_IO,
 ) -> None:
     """Serve the drives of a configuration to the first client of the socket at `path`, until it disconnects.
 
     The path appears once it accepts connections. `ready` is called just before, `connected` after the connection.
     """
-    devices, faults = simulated_drives(section, drives)
+    devices, faults = simulated_drives(section, drives, io)
     states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listening:
         unready = path.with_name(f"{path.name}.new")

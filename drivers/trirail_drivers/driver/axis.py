@@ -9,7 +9,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from trirail_drivers.config import Drives
+from trirail_drivers.config import DigitalIo, Drives
 from trirail_drivers.driver.axis_row import AXIS, AxisRow
 from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import shortened
@@ -97,6 +97,8 @@ class Axis(Answers):
         self.heard_within = MISSED_HEARTBEATS * drives.heartbeat
         self.status_within = self.follows_within = math.inf
         self.counts_per_metre, self.zero = scale.counts_per_metre, scale.offset
+        self.io = DigitalIo()
+        """Its digital outputs and inputs."""
         self._missed_positions = drives.missed_positions
 
     @classmethod

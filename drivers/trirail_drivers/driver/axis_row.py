@@ -65,6 +65,12 @@ class AxisRow(ctypes.Structure):
     """Velocity sent by the last SYNC, if setpoints wait for one [m/s]."""
     in_force: float
     """Position that the bus took last [m]; NaN if it took none."""
+    outputs: int
+    """Wanted bits of its digital outputs."""
+    outputs_sent: int
+    """Bits of its digital outputs that the bus took last; NOWHERE for none."""
+    inputs: int
+    """Newest bits of its digital inputs."""
 
     # Constant while cycles are quiet.
     floats: bool

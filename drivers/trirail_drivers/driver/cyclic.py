@@ -75,8 +75,9 @@ class Cyclic:
         self.axes: NDArray[np.void] = np.zeros(3, AXIS)
         self.times: NDArray[np.void] = np.zeros(1, TIMES)
         self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
-        self.begin = self.beats = self.setpoints = PackedFrames(0)
-        """Frames at the beginning of a cycle; periodic frames, sent after those; setpoints, one for each drive."""
+        self.begin = self.beats = self.setpoints = self.outputs = PackedFrames(0)
+        """Frames at the beginning of a cycle; periodic frames, sent after those; setpoints, one for each drive; digital
+        outputs, one for each drive, sent where they have changed, or none."""
         self.end = self.setpoints.headers
         """Frames at the end of a cycle: the setpoints, or none if they are sent at the beginning of the next."""
         self.history = np.full((history, 3), np.nan)

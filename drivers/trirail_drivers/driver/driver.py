@@ -15,6 +15,7 @@ from trirail_drivers.bus import load
 from trirail_drivers.bus.reopening import AbsentBus, Reopening
 from trirail_drivers.bus.wire import Wire
 from trirail_drivers.driver.axis import Axis
+from trirail_drivers.driver.axis_row import NOWHERE
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.recovery import AnyAxis, Recovery
 from trirail_drivers.driver.refusals import SetUpDrive, merge_notes
@@ -41,8 +42,9 @@ class Driver(ABC, Generic[AnyAxis]):
         axis: type[AnyAxis],
         history: int = 0,
         reopening: Reopening | None = None,
+        io: config.DriveIo = config.NO_IO,
     ) -> None:
-        """`history`: number of sent setpoints to keep. `reopening` reopens a lost bus."""
+        """`history`: number of sent setpoints to keep. `reopening` reopens a lost bus. `io`: digital I/O."""
         self.bus_load = 0.0
         self._wire = Wire(bus, self._stop, reopening)
         self._bitrate = bitrate
@@ -53,6 +55,9 @@ class Driver(ABC, Generic[AnyAxis]):
             axis.in_row(self._tables.axes, number, name, drive.node, scale_of(name, drive), drives)
             for number, (name, drive) in enumerate(zip(NAMES, drives.each, strict=True))
         )
+        for one, digital in zip(self._axes, io, strict=True):
+            one.io = digital
+            one.outputs, one.outputs_sent = digital.safe, NOWHERE if digital.outputs else digital.safe
         self._recovery: Recovery[AnyAxis, Any, Any] | None = None
         self._period = 0.0
         self._synced = 0.0
@@ -121,6 +126,16 @@ class Driver(ABC, Generic[AnyAxis]):
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
         """First fault that each drive itself has reported since the last reset, or None."""
         return tuple(axis.event for axis in self._axes)
+
+    @property
+    def path_outputs(self) -> tuple[bool, bool, bool]:
+        """Whether each drive takes its outputs with a setpoint, so that they may switch on a path."""
+        return False, False, False
+
+    def set_outputs(self, words: Sequence[int]) -> None:
+        """Set the wanted digital outputs; the next `write` sends them. Bits that are not named stay as they are."""
+        for axis, word in zip(self._axes, words, strict=True):
+            axis.outputs = word & axis.io.outputs
 
     def close(self) -> None:
         """Take the drives' power off, and close the bus.

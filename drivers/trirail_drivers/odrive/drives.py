@@ -51,9 +51,10 @@ class Odrive(Driver[OdriveAxis]):
         drives: config.Drives,
         clock: Clock = time.monotonic,
         reopening: Reopening | None = None,
+        io: config.DriveIo = config.NO_IO,
     ) -> None:
         setup.check_nodes(drives)
-        super().__init__(bus, bitrate, drives, clock, OdriveAxis, drives.missed_positions, reopening)
+        super().__init__(bus, bitrate, drives, clock, OdriveAxis, drives.missed_positions, reopening, io)
         for axis in self._axes:
             for number, handler in (
                 (cansimple.GET_VERSION, axis.ignore_answer),

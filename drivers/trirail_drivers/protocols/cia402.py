@@ -13,6 +13,7 @@ from trirail_drivers.cia402.inspection import inputs, inspect
 from trirail_drivers.cia402.objects import PROTECTIONS, describe_protection
 from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import EDS, Frames, Mechanics, Servo, SimulatedDevice, SimulatedDrive
+from trirail_drivers.simulated.digital_outputs import add_digital_io
 
 
 def _simulated_drive(
@@ -20,6 +21,7 @@ def _simulated_drive(
     drives: config.Drives,  # noqa: ARG001  one signature for all
     drive: config.Drive,
     start: float,
+    io: config.DigitalIo = config.DigitalIo(),  # noqa: B008 - an immutable record
 ) -> SimulatedDevice:
     """Return a simulated drive; one with homing counts from 0 at power-on, its switch at zero counts of [drives].
 
@@ -29,7 +31,8 @@ def _simulated_drive(
     switch = None if drive.homing is None else -counts
     servo = Servo.configured(simulated, drive, counts if switch is None else 0)
     eds = Path(drive.eds) if drive.eds is not None else EDS
-    device = SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, mechanics_of(drive))
+    extend = add_digital_io if drive.eds is None and any(io) else None
+    device = SimulatedDrive(drive.node, servo, simulated.missed_syncs, switch, eds, mechanics_of(drive), extend)
     for each in drive.write if drive.eds is None else ():
         device.objects.add(each.object, each.sub, each.bits, signed=each.signed)
     return device

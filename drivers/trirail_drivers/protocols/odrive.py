@@ -19,7 +19,11 @@ _NODE: Final = cansimple.identifier(1, 0)
 
 
 def _simulated_drive(
-    simulated: config.Simulated, drives: config.Drives, drive: config.Drive, start: float
+    simulated: config.Simulated,
+    drives: config.Drives,
+    drive: config.Drive,
+    start: float,
+    io: config.DigitalIo | None = None,  # noqa: ARG001  one signature for all
 ) -> SimulatedDevice:
     turns = drive.direction * (start - drive.offset) * drive.counts_per_metre
     return SimulatedOdrive(

@@ -25,16 +25,17 @@ class Protocol:
     name: str
     """Name in `drives.protocol` of the configuration."""
     driver: Callable[..., DriveGroup]
-    """Return the driver of three drives, from the bus, its bitrate, section [drives], the clock and, if a lost bus can
-    be reopened, a Reopening."""
+    """Return the driver of three drives, from the bus, its bitrate, section [drives], the clock, a Reopening if a lost
+    bus can be reopened, and the drives' digital I/O."""
     rules: Callable[[config.Drives, Requirements], Iterator[Rule]]
     """Yield checks for settings that the drives cannot carry out."""
     files: Callable[[config.Drives], Iterator[Rule]]
     """Yield checks that read the files that the settings name."""
     traffic: Traffic
     """Bus traffic of drives and service."""
-    simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]
-    """Return one simulated drive, its slider at rest at a position [m]."""
+    simulated_drive: Callable[..., SimulatedDevice]
+    """Return one simulated drive, from [can.simulated], [drives], its own section, the position of its slider at rest
+    [m], and its digital I/O."""
     inspect: Callable[..., list[dict[str, Any]]] | None
     """Return a description of each drive and the changes of its set-up, from the bus, section [drives], the period [s],
     the clock, the sliders' velocity limit [m/s], and whether to `apply` them; None if drives cannot be inspected."""

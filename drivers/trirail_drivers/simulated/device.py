@@ -49,9 +49,12 @@ def _discard(can_id: int, data: bytes) -> None:
 class Device:
     """A node on a CAN bus. Its owner passes it frames and the time with `receive` and `poll`."""
 
-    def __init__(self, node: int, eds: Path) -> None:
+    def __init__(self, node: int, eds: Path, extend: Callable[[Dictionary, int], None] | None = None) -> None:
+        """`extend` adds objects to those of the EDS, given them and the node id."""
         self.node = node
         self.objects = Dictionary(eds, node)
+        if extend is not None:
+            extend(self.objects, node)
         self.nmt = Nmt.INITIALISING
         self.fault = 0
         """Code of the error that the device profile latches until a fault reset; 0 for none."""

@@ -201,12 +201,15 @@ class Dictionary:
             if compact.get(index):
                 self._entries[index, 0].default = self._entries[index, 0].value = compact[index]
 
-    def add(self, index: int, subindex: int, bits: int, *, signed: bool) -> None:
-        """Add an integer that the bus may write, unless the object exists already."""
+    def add(
+        self, index: int, subindex: int, bits: int, *, signed: bool = False, value: int = 0, mappable: bool = False
+    ) -> None:
+        """Add an integer that the bus may write, unless the object exists already; `value` is that at power-on."""
         variable = ODVariable(f"Object {index:04X}", index, subindex)
         sizes = _SIGNED if signed else _UNSIGNED
         variable.data_type = next(kind for kind, size in sizes.items() if size * 8 == bits and kind != _BOOLEAN)
         variable.access_type = "rw"
+        variable.default, variable.pdo_mappable = value, mappable
         self._indices.add(index)
         self._entries.setdefault((index, subindex), ObjectEntry(variable))
 

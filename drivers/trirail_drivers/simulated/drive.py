@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated.device import Device, Nmt
-from trirail_drivers.simulated.dictionary import ObjectEntry
+from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
+from trirail_drivers.simulated.digital_outputs import DigitalOutputs
 from trirail_drivers.simulated.factor_group import Mechanics
 from trirail_drivers.simulated.homing import HomingMode
 from trirail_drivers.simulated.power import FAULT_RESET, STATUS, commanded
@@ -56,14 +58,21 @@ class SimulatedDrive(Device):
         home_switch: float | None = None,
         eds: Path = EDS,
         mechanics: Mechanics = MECHANICS,
+        extend: Callable[[Dictionary, int], None] | None = None,
     ) -> None:
-        """`eds` defines the objects and their units; the drive works without those missing."""
-        super().__init__(node, eds)
+        """`eds` defines the objects and their units; the drive works without those missing.
+
+        `extend` adds objects, as add_digital_io does.
+        """
+        super().__init__(node, eds, extend)
+        self.outputs = DigitalOutputs(self.objects, lambda: (self._syncs, self._now))
         self._missed_syncs = missed_syncs
         self.servo = servo
         self.homing = HomingMode(servo, home_switch)
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self._synchronised = False
+        self._syncs = 0
+        """SYNCs received."""
         self._moved_at = 0.0
         self._heard_period = 0.0
         """Time between the last two SYNCs [s]."""
@@ -107,6 +116,7 @@ class SimulatedDrive(Device):
 
     def before_sync(self) -> None:
         """Move from one setpoint to the next, except at the first SYNC: the axis has already moved with time."""
+        self._syncs += 1
         if self._synchronised:
             self._heard_period = self._now - self._moved_at
             self._move(self._step, self._profile.feed_forward)

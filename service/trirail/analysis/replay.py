@@ -244,19 +244,26 @@ class _RecordedDrives:
     bus_load = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
     traffic = 0
+    path_outputs = (True, True, True)
 
     def __init__(self, records: NDArray[np.void]) -> None:
         positions: list[Any] = records["position"].tolist()
         flags: list[Any] = [map(tuple, records[name].astype(kind).tolist()) for name, kind in _FLAG_FIELDS]
         homing = records["homing"].astype(bool).tolist()
         states: list[Any] = [tuple(map(PowerState, state)) for state in records["drive_state"].tolist()]
+        inputs: list[Any] = list(map(tuple, records["inputs"].tolist()))
         self._feedback = [
-            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now)
-            for position, state, age, follows, homed, now in zip(positions, states, *flags, homing, strict=True)
+            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now, inputs=words)
+            for position, state, age, follows, homed, now, words in zip(
+                positions, states, *flags, homing, inputs, strict=True
+            )
         ]
         self._row = -1
         self._fault: DriveFault | None = None
         self._unready: UnreadyDrives = (None, None, None)
+
+    def set_outputs(self, words: Sequence[int]) -> None:
+        """Do nothing: outputs are no feedback."""
 
     def set_fault(self, fault: DrivesFault) -> None:
         """Report a fault, and the drives that are not ready, from now on."""
@@ -330,6 +337,6 @@ def _simulated_drives(records: NDArray[np.void], config: Config, clock: _Simulat
     start: Any = tuple(records["position"][0].tolist())
     behaviour = msgspec.structs.replace(config.can.simulated, start=start)
     can = msgspec.structs.replace(config.can, interface="simulated", simulated=behaviour)  # never real drives
-    drives = connect(can, config.drives, clock)
+    drives = connect(can, config.drives, clock, io=config.drive_io)
     drives.configure(config.period, config.limits.slider.fastest)
     return drives

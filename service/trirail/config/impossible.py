@@ -13,6 +13,7 @@ from trirail_drivers.errors import DriveError, TrirailError
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
+from trirail.config.digital import check_bit
 from trirail.config.explained import Mistake, overlap
 from trirail.config.network_checks import network_rules
 from trirail.config.tables import BASE, PLATFORM, Config, Limits, corrected_geometry, geometry, room
@@ -99,6 +100,9 @@ def rules(config: Config) -> Iterator[Rule]:
         yield Rule(f"frames.work.{name}", (), partial(_check_frame, name))
     for name in config.poses:
         yield Rule(f"poses.{name}", ("geometry", "correction", *ranges), partial(_check_pose, config, name))
+    for table, each, others in (("outputs", config.outputs, config.inputs), ("inputs", config.inputs, config.outputs)):
+        for name in each:
+            yield Rule(f"{table}.{name}", (), partial(check_bit, table, name, each, others, config.drives.protocol))
     yield Rule("loop.rate_hz", (), partial(_check_rate, config))
     yield from settings_checks.bus_rules(config.can)
     yield from settings_checks.rules(config.drives, _required(config))

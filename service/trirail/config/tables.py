@@ -10,17 +10,18 @@ from typing import Annotated, Literal, cast
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct, structs
-from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, Drives, Name, Timeout, Velocity
+from trirail_drivers.config import Acceleration, Can, Coordinate, Distance, DriveIo, Drives, Name, Timeout, Velocity
 from trirail_drivers.interface import NAMES, Triple
 
 from trirail.config import as_built
 from trirail.config.as_built import AsBuilt
-from trirail.config.digital import Input, Output
+from trirail.config.digital import Input, Output, digital_io
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import CrossLeg, Geometry, Leg, Room
 from trirail.kinematics.leg import AnyLeg
 from trirail.naming import Labels
 from trirail.wire.endpoints import endpoint_of, is_local
+from trirail.wire.marks import OutputName
 from trirail.wire.vocabulary import LeasePolicy, Role
 
 Angle = Annotated[float, Meta(ge=-2.0 * math.pi, le=2.0 * math.pi)]
@@ -345,8 +346,15 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
     """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. Taught poses are not here; the
     service stores them."""
-    outputs: dict[str, Output] = {}
-    inputs: dict[str, Input] = {}
+    outputs: dict[OutputName, Output] = {}
+    """Digital outputs of the drives, by name."""
+    inputs: dict[OutputName, Input] = {}
+    """Digital inputs of the drives, by name."""
+
+    @property
+    def drive_io(self) -> DriveIo:
+        """Digital outputs and inputs of each drive."""
+        return digital_io(self.outputs, self.inputs)
 
     @property
     def period(self) -> float:

@@ -181,7 +181,7 @@ def _serve_drives(child: Child) -> int:
         # The loop stops the robot first, on any signal to end; its end is the end of this process.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
-    serve(child.runtime / DRIVES, config.can, config.drives, begin, connected)
+    serve(child.runtime / DRIVES, config.can, config.drives, begin, connected, config.drive_io)
     return 0
 
 

@@ -274,6 +274,23 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
 
 
 @compiled()
+def send_outputs(
+    bus: NDArray[np.int64],
+    headers: NDArray[np.uint64],
+    frames: NDArray[np.uint8],
+    axes: NDArray[np.void],
+    times: NDArray[np.void],
+) -> None:
+    """Send the digital outputs that have changed; those that the bus refuses are sent in the next cycle."""
+    for i in range(len(headers)):
+        axis = axes[i]
+        if axis.outputs != axis.outputs_sent:
+            _put(frames[i], 0, axis.outputs, 4)
+            if send_frames(bus, headers[i : i + 1], frames[i : i + 1], times) == 1:
+                axis.outputs_sent = axis.outputs
+
+
+@compiled()
 def exchange_frames(
     bus: NDArray[np.int64],
     period_ns: int,

@@ -78,7 +78,7 @@ class _Rehearsal:
         self._config = config
         self._folder = folder
         self._clock = _RehearsedTime()
-        self._bus = simulated_bus(config.can, config.drives, self._clock)
+        self._bus = simulated_bus(config.can, config.drives, self._clock, config.drive_io)
         driver = PROTOCOLS[config.drives.protocol].driver
         self._drives = driver(self._bus, config.can.bitrate, config.drives, self._clock)
         listening = [links.listen(folder / name) for name in Ports._fields]
@@ -216,7 +216,7 @@ def main(
         capture = Capture() if config.telemetry.capture_can else None
         # Simulated drives that have died come back with the service's next start only: there is nothing to wait for.
         awaits = config.can.interface != "simulated"
-        drives = connect(bus(), config.drives, capture=capture, awaits=awaits)
+        drives = connect(bus(), config.drives, capture=capture, awaits=awaits, io=config.drive_io)
         drives.configure(config.period, config.limits.slider.fastest, awaits=True)
         lacking = (*realtime.acquire(config.loop), *unrehearsed)
         loop = Loop(config, drives, ports, heartbeats, capture=capture, lacking=lacking)

@@ -32,6 +32,7 @@ from trirail.processes.cycle_frames import (
     end_read,
     receive_frames,
     send_frames,
+    send_outputs,
     set_frames,
     take_frames,
 )
@@ -165,7 +166,7 @@ def _receive(
 @compiled(
     i8(
         *(_STATE, i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
+        *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND),
         *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
@@ -187,6 +188,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     beats: NDArray[np.uint64],
     setpoints: NDArray[np.uint8],
     departures: NDArray[np.uint64],
+    output_frames: NDArray[np.uint8],
+    output_headers: NDArray[np.uint64],
     expected: NDArray[np.void],
     axes: NDArray[np.void],
     times: NDArray[np.void],
@@ -222,8 +225,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
 
     `moment` (2,) is room for a struct timespec, `bus` (3,) a BusAccess, `doors` (n, 2) an array for poll, the
     gateway's first, `hearts` the counters of trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made`
-    (SIZE,) the bytes of `record`; `switches`, `planned`, `words` and `log` are as in control.outputs.switch. All else as
-    in control.cycle and cycle_frames.
+    (SIZE,) the bytes of `record`; `switches`, `planned`, `words` and `log` are as in control.outputs.switch. All else
+    as in control.cycle and cycle_frames.
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
@@ -310,6 +313,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.KINEMATICS)
 
         s.sent = send_frames(bus, departures, setpoints, times)
+        send_outputs(bus, output_headers, output_frames, axes, times)
         _mark(state, moment, Part.WRITE)
 
         s.cycle += 1

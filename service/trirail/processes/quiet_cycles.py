@@ -185,6 +185,7 @@ class QuietCycles:
             *(self._state, self._moment, lent.bus),
             *(lent.arrived.frames, lent.arrived.headers, lent.begin.frames, lent.begin.headers),
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
+            *(lent.outputs.frames, lent.outputs.headers),
             *(lent.expected, lent.axes, lent.times, lent.history),
             *(self._doors.room, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
             *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.found),
