@@ -21,7 +21,7 @@ from trirail.motion.runs import MotionState
 from trirail.wire.goals import Goal, PoseGoal
 from trirail.wire.messages import Notice
 from trirail.wire.packets import Accepted, Answer, CommandRequest, GoalRequest, Request
-from trirail.wire.vocabulary import Command, CommandContent, Mode
+from trirail.wire.vocabulary import Command, CommandContent, Mode, SetOutput
 from trirail_drivers.interface import DriveFault, DriveGroup, Feedback, MissingProtection, PowerState, Triple
 
 SHIPPED = load(SIM)
@@ -34,7 +34,8 @@ STILL = (0.0, 0.0, 0.0)
 def carried(name: str, rate: float | None = None) -> CommandContent:
     """What a command carries at least: 1 for each number that it needs, or for override a rate, 1 being full speed."""
     content = Command(name).content
-    return content(*(1.0 if rate is None else 100.0 * rate for field in fields(content) if field.required))
+    numbers = (1.0 if rate is None else 100.0 * rate for field in fields(content) if field.required)
+    return content("valve", True) if content is SetOutput else content(*numbers)
 
 
 def expected_duration(answer: Answer) -> float:

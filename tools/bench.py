@@ -91,11 +91,17 @@ def kinematics(*, json: bool = False) -> None:
 
 
 @app.command
-def align(*, parts: int = 200, goals: int = 20, json: bool = False) -> None:
-    """Align seeded parts on computed stages of both kinds, by right and wrong models, and time it on a service."""
-    import bench_align
+def align(*, parts: int = 200, goals: int = 20, stages: int = 20, json: bool = False) -> None:
+    """Align seeded parts on computed stages of both kinds, by right and wrong models, and time it on a service.
 
-    report(bench_align.measure(parts, goals), json)
+    Then calibrate the geometry of `stages` stages of each kind by their cameras, and align all over their travel.
+    """
+    import bench_align
+    import bench_geometry
+
+    results = bench_align.measure(parts, goals) if parts else {}
+    results |= {"pixels, rms of a mark's error": bench_geometry.marks(20)}
+    report(results | {"geometry by cameras": bench_geometry.measure(stages)}, json)
 
 
 @app.command

@@ -46,6 +46,8 @@ COUNT = 1e-7
 OFF, TURNED = 1e-3, math.radians(0.5)
 PLACES, ANGLES = 50e-6, 0.1e-3
 """Maximum deviations of legs as built from their configuration, in each coordinate [m] and angle [rad]."""
+DISTORTION, AXIS_OFF = 0.005, 150.0
+"""Maximum distortion at the edge of a picture, as a share, and of the lens's axis from its middle [pixel]."""
 TOLERANCE, ARC = 1e-6, math.radians(5.0 / 3600.0)
 LOOKS = 4
 """Pictures averaged at each place: for calibration, targets and parts, unless a case uses one."""
@@ -60,18 +62,24 @@ AIMS = {
 class ComputedStage:
     """A stage as built, commanded through a model of it, and two cameras above it."""
 
-    def __init__(self, built: Geometry, model: Model, rng: np.random.Generator) -> None:
-        self._built, self._model, self._rng = built, model, rng
-        self.views = {name: _view(rng, place) for name, place in PART.items()}
+    def __init__(self, built: Geometry, model: Model, rng: np.random.Generator, field: Pair | None = None) -> None:
+        self._built, self.model, self._rng, self._field = built, model, rng, field
+        self.scales = np.zeros(3)
+        """Relative errors of the encoders' scales."""
+        self.views = {name: _view(rng, place, field) for name, place in PART.items()}
         self.part: Mapping[str, Pair] = PART
         self.pose: Triple = (0.0, 0.0, 0.0)
         """Pose according to the model."""
 
     @property
+    def sliders(self) -> Floats:
+        """Slider positions by their encoders, (3,) [m]."""
+        return np.asarray(np.round(self.model(np.array(self.pose)) / COUNT) * COUNT)
+
+    @property
     def true(self) -> Triple:
         """True pose."""
-        sliders = np.round(self._model(np.array(self.pose)) / COUNT) * COUNT
-        x, y, phi = forward(self._built, sliders).tolist()
+        x, y, phi = forward(self._built, self.sliders * (1.0 + self.scales)).tolist()
         return x, y, phi
 
     def seen(self, noise: float) -> dict[str, Pair]:
@@ -81,7 +89,10 @@ class ComputedStage:
             name: project_points(self.views[name], to_base_frame(q, pose)[None])[0] for name, q in self.part.items()
         }
         noisy = {name: (at + noise * self._rng.standard_normal(2)).tolist() for name, at in exact.items()}
-        return {name: (u, v) for name, (u, v) in noisy.items()}
+        return {name: (u, v) for name, (u, v) in noisy.items() if self._is_in_picture(u, v)}
+
+    def _is_in_picture(self, u: float, v: float) -> bool:
+        return self._field is None or (0.0 <= u < self._field[0] and 0.0 <= v < self._field[1])
 
     def go(self, motion: StageMotion) -> None:
         """Move to a pose, or relative about a point, according to the model."""
@@ -103,7 +114,8 @@ class ComputedStage:
                 elif isinstance(wish, StageMotion):
                     self.go(wish)
                     after()
-                wish = wishes.send(Observation(marks, self.pose, 0.0))
+                a, b, c = self.sliders.tolist()
+                wish = wishes.send(Observation(marks, self.pose, 0.0, (a, b, c)))
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
 
@@ -150,7 +162,7 @@ def _case(
         stage.part = {name: tuple(to_base_frame(q, error).tolist()) for name, q in PART.items()}
         after: list[tuple[float, float]] = []
         task = AlignmentTask(calibration, targets, looks=looks)
-        result = stage.drive(align(task), lambda: after.append(_left(stage, aim)))  # noqa: B023
+        result = stage.drive(align(task), lambda: after.append(distance_left(stage, aim)))  # noqa: B023
         made.append(len(result.corrections))
         one.append(after[0][0])
         left.append(after[-1][0])
@@ -170,7 +182,7 @@ def _case(
     }
 
 
-def _left(stage: ComputedStage, aim: Floats) -> tuple[float, float]:
+def distance_left(stage: ComputedStage, aim: Floats) -> tuple[float, float]:
     """Return the true distance of the farthest mark from its place [m], and the angular error of the part [rad]."""
     at = np.array([to_base_frame(q, stage.true) for q in stage.part.values()])
     return float(np.linalg.norm(at - aim, axis=1).max()), abs(fit_rigid_motion(at, aim).turn)
@@ -187,16 +199,18 @@ def small_angles(robot: Geometry) -> Model:
     return lambda pose: np.asarray(middle + np.array(rows) @ pose)
 
 
-def _view(rng: np.random.Generator, place: Pair) -> CameraView:
+def _view(rng: np.random.Generator, place: Pair, field: Pair | None = None) -> CameraView:
+    """Return a camera above a place: with a `field` its long side is along y, and its lens bends the picture."""
     mirror = np.diag([1.0, rng.choice([-1.0, 1.0])])
-    matrix = (
-        SCALE
-        * rotation_matrix(rng.uniform(-math.pi, math.pi))
-        @ mirror
-        @ (np.eye(2) + rng.uniform(-0.01, 0.01, (2, 2)))
-    )
+    turn = rng.uniform(-math.pi, math.pi) if field is None else math.pi / 2.0 + rng.uniform(-0.05, 0.05)
+    matrix = SCALE * rotation_matrix(turn) @ mirror @ (np.eye(2) + rng.uniform(-0.01, 0.01, (2, 2)))
     (a, b), (c, d) = matrix.tolist()
-    return CameraView(place, (1000.0, 800.0), ((a, b), (c, d)))
+    if field is None:
+        return CameraView(place, (1000.0, 800.0), ((a, b), (c, d)))
+    middle, half = np.array(field) / 2.0, max(field) / 2.0
+    (u, v), (axis_u, axis_v) = (middle + rng.uniform(-AXIS_OFF, AXIS_OFF, (2, 2))).tolist()
+    bend = (float(rng.uniform(-DISTORTION, DISTORTION)) / half**2, 0.0)
+    return CameraView(place, (u, v), ((a, b), (c, d)), "radial", bend, (axis_u, axis_v))
 
 
 def seconds(goals: int) -> dict[str, Any]:

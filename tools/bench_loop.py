@@ -26,7 +26,7 @@ from trirail.client.client import Robot
 from trirail.config import SIM, load
 from trirail.diagnosis import bare_loop
 from trirail.errors import TrirailError
-from trirail.wire.records import PARTS, Part, unpack
+from trirail.wire.records import PART_NAMES, Part, unpack
 from trirail.wire.vocabulary import Mode
 
 MOST_FAULTS = 0.2
@@ -98,7 +98,7 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
         "missed": sum(run["missed"] for run in found),
         "lost_by_the_machine": sum(run["lost_by_the_machine"] for run in found),
         "runs": found,
-        "parts": {name: quantiles(parts[:, column]) for column, name in enumerate(PARTS)},
+        "parts": {name: quantiles(parts[:, column]) for column, name in enumerate(PART_NAMES)},
         "to_setpoints": quantiles(parts[:, : Part.WRITE + 1].sum(axis=1)),
         "to_record": quantiles(parts[:, : Part.RECORD + 1].sum(axis=1)),
         "cycle": quantiles(parts.sum(axis=1)),

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import datetime
 import io
 import math
 import sys
@@ -139,13 +138,7 @@ def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders
     limits = config.load(options.config).limits
     try:
         found = correction_fit.fit(robot, poses, sliders, config.room(limits), options.cells)
-        made = as_built.AsBuilt(
-            made=datetime.datetime.now(datetime.UTC).date().isoformat(),
-            geometry=as_built.geometry_of(robot),
-            low=found.correction.low,
-            high=found.correction.high,
-            nodes=found.correction.nodes.tolist(),
-        )
+        made = as_built.measured_today(found.correction, robot)
         text = as_built.format_map(made)
         config.check_as_built(as_built.parse(text), robot, limits)
     except (CalibrationError, ConfigError) as error:

@@ -84,11 +84,6 @@ def _stops_of_many_ids() -> Iterator[Query]:
         yield Query(_key("cmd", "eva", "stop"), b'{"goal": "g"}', f"{number:060}".encode())
 
 
-def _long_selectors() -> Iterator[Query]:
-    for number in itertools.count():
-        yield Query(f"{_key('info')}?{number}={'a' * 60_000}")
-
-
 QUERIES: Final[dict[str, tuple[str, Callable[[], Iterator[Query]]]]] = {
     "4 MiB to a role": (REVOKED, lambda: _behind(Query(_key("role", "u0")), Query(_key("role", "u0"), LARGE))),
     "4 MiB to many roles": (REVOKED, lambda: (Query(key, LARGE) for key in _named("role"))),

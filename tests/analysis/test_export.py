@@ -21,10 +21,10 @@ from trirail.telemetry.recording import Recording
 from trirail.wire.goals import MoveGoal
 from trirail.wire.messages import Event
 from trirail.wire.packets import ControlInput, GoalRequest
-from trirail.wire.records import DTYPE, PARTS
+from trirail.wire.records import DTYPE, PART_NAMES
 from trirail.wire.vocabulary import MODES
 
-ENDINGS = {"", *(f"_{end}" for end in ("x", "y", "phi", "a", "b", "c", *PARTS))}
+ENDINGS = {"", *(f"_{end}" for end in ("x", "y", "phi", "a", "b", "c", *PART_NAMES))}
 
 
 @pytest.fixture(scope="module")

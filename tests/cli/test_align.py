@@ -78,6 +78,13 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
     told = json.loads(trirail("align", "check", kept, *marks, "--moves", "--json").stdout)
     assert [(view["view"], view["changed"]) for view in told["views"]] == [("left", False), ("right", False)]
     assert "the part lies right" in trirail("align", "run", kept, *marks, *loose).stdout
+    # As if it had been made with another geometry: said, and unconfirmed until a correction confirms it.
+    made = json.loads(kept.read_text(encoding="utf-8"))
+    kept.write_text(json.dumps(made | {"geometry": "01234567"}), encoding="utf-8")
+    part.write_text(json.dumps({"left": [-0.0598, 0.0104], "right": [0.0602, 0.0107]}), encoding="utf-8")
+    assert "another geometry" in " ".join(trirail("align", "run", kept, *marks, *loose).stderr.split())
+    again = json.loads(kept.read_text(encoding="utf-8"))
+    assert (again["geometry"], again["calibration"]["confirmed"]) == (made["geometry"], True)
     part.write_text(json.dumps({"left": [-0.06, 0.01], "right": [0.061, 0.01]}), encoding="utf-8")
     refused = trirail("align", "run", kept, *marks, *loose, code=1).stderr
     assert "distance between marks" in " ".join(refused.split())
@@ -97,7 +104,7 @@ def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(
     program: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if program.startswith("sleep"):
-        monkeypatch.setattr(mark_source, "NEWER_WITHIN", 0.05)
+        monkeypatch.setattr(mark_source, "PICTURE_TIMEOUT_S", 0.05)
 
     def look() -> None:
         with mark_source.program(program) as (ask, _):
@@ -139,12 +146,38 @@ def test_marks_of_pictures_are_of_those_that_were_written_since_they_were_asked_
         camera.join()
 
 
+def test_codes_of_pictures_are_named_by_their_numbers_and_no_number_may_be_there_twice(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    from trirail.alignment.coded_marks import code_shape
+
+    view = CameraView((0.0, 0.0), (160.0, 120.0), ((2.5e5, 0.0), (0.0, -2.5e5)))
+
+    def write(picture: str, number: int) -> None:
+        marks = {"m": DrawnMark(code_shape("4x4_50", number, 300e-6), (4e-5, 0.0))}
+        camera = SimulatedCamera(view, marks, 320, 240, 180.0, -120.0)
+        drawn = camera.picture(lambda _: (0.0, 0.0, 0.0), 0.0, np.random.default_rng(0))
+        cv2.imwrite(str(tmp_path / f"{picture}.png"), drawn)
+
+    write("left", 3)
+    write("right", 7)
+    with mark_source.folder(tmp_path, MarkShape("code", 100.0), 0.0, family="4x4_50") as (look, views):
+        found = look()
+    assert found == {"3": pytest.approx((170.0, 120.0), abs=0.02), "7": pytest.approx((170.0, 120.0), abs=0.02)}
+    assert views == {"3": "left", "7": "right"}
+    write("right", 3)
+    with (
+        mark_source.folder(tmp_path, MarkShape("code", 100.0), 0.0, family="4x4_50") as (look, _),
+        pytest.raises(TrirailError, match="left and right"),
+    ):
+        look()
+
+
 def test_pictures_that_are_not_taken_anew_or_are_none_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cv2 = pytest.importorskip("cv2")
-    monkeypatch.setattr(mark_source, "NEWER_WITHIN", 0.1)
-    monkeypatch.setattr(mark_source, "WRITTEN_WITHIN", 0.1)
+    monkeypatch.setattr(mark_source, "PICTURE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(mark_source, "WRITE_TIMEOUT_S", 0.1)
     cv2.imwrite(str(tmp_path / "left.png"), np.full((240, 320), 90, np.uint8))
     with mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _):
         assert look() == {}

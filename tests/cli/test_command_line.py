@@ -27,7 +27,7 @@ from trirail.client.goal import Result
 from trirail.config import SIM, load
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.wire.goal_kind import GoalKind, field_description
-from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, VelocityGoal
+from trirail.wire.goals import MoveGoal, PoseGoal, SlidersGoal, TrajectoryGoal, VelocityGoal
 from trirail.wire.messages import GoalReply
 from trirail.wire.state import NamedPose
 
@@ -64,7 +64,14 @@ def test_every_argument_is_described(name: str, page: App, run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "kind"), [("goto", PoseGoal), ("move", MoveGoal), ("sliders", SlidersGoal), ("jog", VelocityGoal)]
+    ("command", "kind"),
+    [
+        ("goto", PoseGoal),
+        ("move", MoveGoal),
+        ("sliders", SlidersGoal),
+        ("jog", VelocityGoal),
+        ("follow", TrajectoryGoal),
+    ],
 )
 def test_an_option_of_a_goal_is_described_as_its_field_is(command: str, kind: type[GoalKind]) -> None:
     page = dict(pages())[command]
@@ -72,7 +79,7 @@ def test_an_option_of_a_goal_is_described_as_its_field_is(command: str, kind: ty
         argument.name.removeprefix("--"): argument.parameter.help
         for argument in page.assemble_argument_collection(parse_docstring=True)
     }
-    for field in {"speed", "blend", "tool", "frame"} & set(told):
+    for field in {"speed", "blend", "tool", "frame", "stretch"} & set(told):
         assert str(told[field]).lower().startswith(field_description(kind, field).lower())
 
 
@@ -86,12 +93,12 @@ def test_help_shows_groups_and_examples(run: Run) -> None:
 
 def test_what_is_seldom_needed_is_on_the_page_of_all_alone(run: Run) -> None:
     names = {name for group in help_pages.GROUPS.values() for name in group}
-    assert set(help_pages.SELDOM) < names
-    for line, shown in (("--help", names - {*help_pages.SELDOM}), ("help all", names), ("help", None)):
+    assert set(help_pages.ADVANCED_COMMANDS) < names
+    for line, shown in (("--help", names - {*help_pages.ADVANCED_COMMANDS}), ("help all", names), ("help", None)):
         code, out, _ = run(*line.split())
         found = {line.split()[1] for line in out.splitlines() if line.startswith("│ ") and line[2].isalpha()}
         assert code == 0
-        assert found & names == (shown if shown is not None else names - {*help_pages.SELDOM})
+        assert found & names == (shown if shown is not None else names - {*help_pages.ADVANCED_COMMANDS})
     lines = run("--help")[1].splitlines()
     assert not [line for line in lines if line.startswith("│   ")]  # each command takes one line
     assert run("help", "keys", "add")[1] == run("keys", "add", "--help")[1]
@@ -118,11 +125,11 @@ def test_nothing_else_is_read_otherwise_for_its_commas(line: str) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("status --connect nowhere", "a locator is protocol/address, tcp/192.168.1.7:7447 for one"),
+        ("status --connect nowhere", "a locator is protocol/address, such as tcp/192.168.1.7:7447"),
         ("status --connect tcp/127.0.0.1:x", "no service at tcp/127.0.0.1:x"),
         (f"watch --connect {NOBODY}", f"no service at {NOBODY}"),
-        ("status --robot a/b", "robot 'a/b' is no name"),
-        ("status --robot *", "robot '*' is no name"),
+        ("status --robot a/b", "robot 'a/b' is not a valid name"),
+        ("status --robot *", "robot '*' is not a valid name"),
         ("view no.rrd", "no.rrd is no file"),
         ("report no.rrd", "no.rrd: No such file or directory"),
         ("replay no.rrd", "no.rrd: No such file or directory"),
@@ -151,7 +158,7 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
-        ("goto ../../etc", 1, "pose '../../etc' is no name: letters, digits, - and _, at most 64 are taken"),
+        ("goto ../../etc", 1, "pose '../../etc' is not a valid name; use letters, digits, - and _, at most 64"),
         ("goto a/b", 1, "letters, digits, - and _"),
         ("goto 5mm", 2, "goto takes X, Y and PHI, or the NAME of a pose"),
         ("goto 5mm 0", 2, "goto takes X, Y and PHI: here are X = 5mm and Y = 0.000 mm, and PHI is missing, the angle"),
@@ -170,9 +177,9 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
             "(trirail workspace --help tells the usage)",
         ),
         ("enable my.toml", 2, "trirail: my.toml is more than it takes (trirail enable --help tells the usage)"),
-        ("goto 0,5 0 0", 2, ": write 0.5, with a point"),
-        ("goto -12,5mm 0 0", 2, ": write -12.5, with a point"),
-        ("override 12,5", 2, ": write 12.5, with a point"),
+        ("goto 0,5 0 0", 2, ": write 0.5 with a decimal point"),
+        ("goto -12,5mm 0 0", 2, ": write -12.5 with a decimal point"),
+        ("override 12,5", 2, ": write 12.5 with a decimal point"),
         ("goto 0 0 0 --blend -1mm", 2, "--blend: '-1mm' is negative: a length such as 5mm"),
         ("jog 1mm/s 0 0 --seconds -1", 2, "--seconds: '-1' is negative: a time such as 2s"),
         ("override 300", 2, "'300' is no override: 0, or 1 to 200 %"),
@@ -181,10 +188,10 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
         (
             f"stop --connect {NOBODY}",
             1,
-            f"no service at {NOBODY}: connection refused; start what is to answer there, trirail run or zenohd"
+            f"no service at {NOBODY}: connection refused; start trirail run or zenohd there"
             ", or name another address with --connect (in Python connect=)",
         ),
-        ("stop --connect tcp/no..name:1", 1, "its host name is none; start what is to answer there"),
+        ("stop --connect tcp/no..name:1", 1, "invalid host name; start trirail run or zenohd there"),
     ],
 )
 def test_what_is_typed_wrongly_is_told_with_what_would_be_right(line: str, code: int, said: str, run: Run) -> None:
@@ -251,7 +258,7 @@ def test_wrong_usage_is_one_line_and_exit_2(line: str, run: Run) -> None:
 
 
 def test_a_refusal_is_json_with_its_code_and_what_is_allowed(capsys: pytest.CaptureFixture[str]) -> None:
-    terminal.failed(RefusedError(RefusalCode.OUT_OF_WORKSPACE, "x: 0.5 m", slider="A", value=0.5, limit=0.15))
+    terminal.print_error_json(RefusedError(RefusalCode.OUT_OF_WORKSPACE, "x: 0.5 m", slider="A", value=0.5, limit=0.15))
     assert json.loads(capsys.readouterr().out) == {
         "ok": False,
         "error": "RefusedError",
@@ -261,7 +268,7 @@ def test_a_refusal_is_json_with_its_code_and_what_is_allowed(capsys: pytest.Capt
         "value": 0.5,
         "limit": 0.15,
     }
-    terminal.failed(ServiceError("no robot"))
+    terminal.print_error_json(ServiceError("no robot"))
     assert json.loads(capsys.readouterr().out) == {"ok": False, "error": "ServiceError", "message": "no robot"}
 
 
@@ -462,7 +469,7 @@ def test_watch_into_a_pipe_is_a_line_a_second(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(time, "monotonic", lambda: at[0])
     goal, position = SimpleNamespace(id="g-1", progress=0.4), (0.01, 0.0, 0.0)
     said: list[str] = []
-    monkeypatch.setattr(live, "say", said.append)
+    monkeypatch.setattr(live, "print_line", said.append)
 
     class Moving(Slow):
         def states(self, timeout: float) -> Iterator[SimpleNamespace]:

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trirail.cli import doctor, doctor_cycle, probes
-from trirail.cli.machine import Gathered, Machine, Passed
+from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import SIM, Config, Tls, everything, load
 from trirail.diagnosis import Check, bare_loop, drive_checks
 from trirail.diagnosis.bare_loop import Cycles
@@ -62,7 +62,7 @@ GOOD = Machine(
     governors=dict.fromkeys(range(4), "performance"),
     isolated=(2, 3),
     link=LINK,
-    gathered=Gathered(1, 0),
+    coalescing=ReceiveCoalescing(1, 0),
     cycles=cycles([20_000] * 2000, 50_000),
 )
 
@@ -105,8 +105,13 @@ def test_nothing_is_wrong_with_a_good_machine(config: Config) -> None:
         ({"link": link("BUS-OFF")}, "can0 state", "failure", "ip link set can0 down"),
         ({"link": link("STOPPED")}, "can0 state", "failure", ""),
         ({"link": link(txqlen=10)}, "can0 queue", "warning", "txqueuelen"),
-        ({"gathered": Gathered(8, 0)}, "can0 coalescing", "warning", "ethtool -C can0 rx-usecs-irq 0 rx-frames-irq 1"),
-        ({"gathered": Gathered(0, 50)}, "can0 coalescing", "warning", "ip link set can0 down"),
+        (
+            {"coalescing": ReceiveCoalescing(8, 0)},
+            "can0 coalescing",
+            "warning",
+            "ethtool -C can0 rx-usecs-irq 0 rx-frames-irq 1",
+        ),
+        ({"coalescing": ReceiveCoalescing(0, 50)}, "can0 coalescing", "warning", "ip link set can0 down"),
         ({"cycles": cycles([10_000] * 50, 600_000)}, "cycle", "warning", "loop.rate_hz = 500"),
         ({"cycles": cycles([10_000] * 50, 1_100_000)}, "cycle", "failure", "loop.rate_hz = 250"),
         ({"cycles": cycles([10_000] * 50, 90_000_000)}, "cycle", "failure", "no rate is held"),
@@ -158,7 +163,7 @@ def test_the_machine_is_judged_beside_mistakes_that_are_none_of_it(
         asked.append(config)
         return msgspec.structs.replace(GOOD, governors={0: "powersave"})
 
-    checks = bad(doctor.whole(tmp_path / "robot.toml", everything(tmp_path / "robot.toml"), machine))
+    checks = bad(doctor.run_checks(tmp_path / "robot.toml", everything(tmp_path / "robot.toml"), machine))
     assert {"configuration", "the rest"} <= checks.keys()
     assert ("governor" in checks, bool(asked)) == (read, read)
     assert ("the machine" in checks["the rest"].found) == (not read)
@@ -202,14 +207,14 @@ def test_what_was_not_measured_is_said() -> None:
     st.sampled_from([500, 1000, 4000]),
 )
 def test_the_numbers_are_those_of_the_samples(lateness: list[int], work: int, rate: int) -> None:
-    found = doctor_cycle.measured(cycles(lateness, work, rate))
+    found = doctor_cycle.compute_held_rate(cycles(lateness, work, rate))
     assert found.cycles == len(lateness)
     assert found.missed == sum(late * rate // 1_000_000_000 for late in lateness)
     assert found.missed_in_a_row <= found.missed
     assert found.over_us.max == pytest.approx(max(lateness) / 1e3 + work / 1e3)
     assert found.answers_missing == 1
     if found.up_to_hz is not None:
-        assert found.over_us.p999 <= doctor_cycle.SHARE * 1e6 / found.up_to_hz
+        assert found.over_us.p999 <= doctor_cycle.MAX_PERIOD_SHARE * 1e6 / found.up_to_hz
 
 
 def test_a_virtual_interface_has_no_bitrate_to_be_wrong() -> None:
@@ -228,7 +233,7 @@ def test_another_interface_is_said_to_be_unknown() -> None:
 @pytest.mark.parametrize(("frames", "verdict"), [(0, "ok"), (100, "ok"), (11_000, "ok"), (13_000, "warning")])
 def test_what_passes_on_the_bus_is_counted_whoever_sends_it(frames: int, verdict: str) -> None:
     """At 1 Mbit/s frames of eight bytes fill the bus at 7407 a second."""
-    machine = msgspec.structs.replace(GOOD, passed=Passed(2.0, frames, 8 * frames))
+    machine = msgspec.structs.replace(GOOD, traffic=BusTraffic(2.0, frames, 8 * frames))
     (check,) = [check for check in doctor.examine(REAL, machine) if check.name == "can0 traffic"]
     assert check.verdict == verdict
     assert float(check.found.partition("%")[0]) == pytest.approx(frames * frame_bits(8) / 2e4, abs=0.6)
@@ -242,20 +247,20 @@ def test_bits_are_those_of_the_frames_one_a_frame_at_most_too_many(lengths: list
 
 def test_the_kernels_counters_are_read_and_subtracted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probes, "SYSTEM", tmp_path)
-    assert probes.counted("can0") is None
-    assert probes.counted("") is None
+    assert probes.read_counters("can0") is None
+    assert probes.read_counters("") is None
     folder = tmp_path / "class/net/can0/statistics"
     folder.mkdir(parents=True)
     for name, value in {"rx_packets": 30, "tx_packets": 12, "rx_bytes": 200, "tx_bytes": 96}.items():
         (folder / name).write_text(f"{value}\n")
-    now = probes.counted("can0")
+    now = probes.read_counters("can0")
     assert now is not None
     assert (now.frames, now.data) == (42, 296)
-    difference = probes.passed(now, Passed(now.seconds + 2.0, 142, 1096))
+    difference = probes.traffic_between(now, BusTraffic(now.seconds + 2.0, 142, 1096))
     assert difference is not None
     assert difference.seconds == pytest.approx(2.0)
     assert (difference.frames, difference.data) == (100, 800)
-    assert probes.passed(None, now) is None
+    assert probes.traffic_between(None, now) is None
 
 
 def test_protections_that_drives_may_lack_are_listed_once_each_with_their_drives() -> None:
@@ -421,7 +426,7 @@ def test_the_command(json_wanted: bool) -> None:
     ("address", "tls", "verdict", "by"),
     [
         ("127.0.0.1", False, "ok", "every user of this machine"),
-        ("0.0.0.0", True, "ok", "who has a role, by his certificate,"),
+        ("0.0.0.0", True, "ok", "users with a certificate and a role"),
         ("0.0.0.0", False, "warning", "everybody in the network"),
     ],
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from trirail.cli.app import app
-from trirail.cli.drives_command import UNTRIED
+from trirail.cli.drives_command import UNTESTED_NOTE
 from trirail.config import SIM
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.simulated import SimulatedDrive
@@ -46,7 +46,7 @@ def test_of_real_drives_it_is_said_that_no_make_was_tried(
 ) -> None:
     monkeypatch.setattr("trirail.diagnosis.check.is_simulated", lambda section: simulated)
     assert run("drives", str(SIM)) == 0
-    assert (UNTRIED in capsys.readouterr().out) == (not simulated)
+    assert (UNTESTED_NOTE in capsys.readouterr().out) == (not simulated)
 
 
 def test_drives_that_tell_nothing(tmp_path: Path) -> None:

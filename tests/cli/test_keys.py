@@ -154,7 +154,7 @@ def test_a_folder_is_whole_or_not_there(here: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("key.pem", None, "key.pem: No such file or directory; trirail keys makes"),
+        ("key.pem", None, "key.pem: No such file or directory; trirail keys creates"),
         ("cert.pem", b"not PEM", "must be PEM"),
         ("key.pem", "other", "key.pem is not the key of cert.pem"),
         ("ca.pem", "other", "cert.pem is not signed by the authority of ca.pem"),
@@ -179,10 +179,10 @@ def test_the_end_is_told_thirty_days_before(here: Path) -> None:
     credentials = Credentials.read(here / "keys/users/ann")
     assert credentials.warning(credentials.expires - timedelta(days=30, minutes=1)) == ""
     said = credentials.warning(credentials.expires - timedelta(days=29, hours=23))
-    assert said.endswith("users/ann expires in 29 days; trirail keys renew makes a new one")
+    assert said.endswith("users/ann: expires in 29 days; renew it with: trirail keys renew")
     with pytest.raises(ServiceError, match="expired on"):
         Credentials.read(here / "keys/users/ann", credentials.expires + timedelta(seconds=1))
-    with pytest.raises(ServiceError, match="is this machine's clock right"):
+    with pytest.raises(ServiceError, match=r"check this machine.s clock"):
         Credentials.read(here / "keys/users/ann", datetime.now(UTC) - timedelta(days=1))
 
 

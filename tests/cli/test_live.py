@@ -15,8 +15,8 @@ from trirail.cli import live
 from trirail.config import SIM, load
 from trirail.processes.publications import info
 from trirail.wire.state import (
-    Commanded,
-    CorrectionTold,
+    CommandedMotion,
+    CorrectionInfo,
     FrameCounts,
     GoalState,
     LoopState,
@@ -42,7 +42,7 @@ def a_state(**changed: Any) -> State:
         pose=Pose(*REST),
         velocity=REST,
         acceleration=REST,
-        commanded=Commanded(Pose(*REST), REST, REST, REST, REST, REST),
+        commanded=CommandedMotion(Pose(*REST), REST, REST, REST, REST, REST),
         sliders=Sliders(REST, REST, REST, REST, ("operation enabled",) * 3, (COUNTS,) * 3),
         goal=None,
         settled=True,
@@ -76,7 +76,7 @@ def test_what_is_printed_can_be_typed(pose: tuple[float, float, float], slider: 
 
 
 def test_measured_and_commanded_stand_below_each_other() -> None:
-    commanded = Commanded(Pose(0.01, -0.02, 0.1), REST, REST, REST, REST, REST)
+    commanded = CommandedMotion(Pose(0.01, -0.02, 0.1), REST, REST, REST, REST, REST)
     lines = printed(a_state(pose=(0.011, 0.0, 0.0), commanded=commanded))
     assert lines["measured"] == "x    11.000 mm   y     0.000 mm   φ    0.0000°"
     assert lines["commanded"] == "x    10.000 mm   y   -20.000 mm   φ    5.7296°"
@@ -131,7 +131,7 @@ def test_a_correction_that_is_on_is_said(capsys: pytest.CaptureFixture[str]) -> 
     plain = info(load(SIM))
     live.show(a_state(), plain)
     assert "corrected" not in capsys.readouterr().out
-    told = CorrectionTold("map.toml", "2026-05-01", (5e-5, 4e-5, 1e-4), (5e-5, 0.0, 1e-5))
+    told = CorrectionInfo("map.toml", "2026-05-01", (5e-5, 4e-5, 1e-4), (5e-5, 0.0, 1e-5))
     live.show(a_state(), msgspec.structs.replace(plain, correction=told))
     words = " ".join(capsys.readouterr().out.split())
     assert "corrected map.toml, measured 2026-05-01: up to 50.0 µm in x, 40.0 µm in y, 0.100 mrad; " in words

@@ -202,7 +202,7 @@ def test_a_tool_is_a_point_or_a_name(line: str, tool: object) -> None:
         ("goto 0 0 0 --tool a/b", "'a/b' is neither a point, as 20mm 0, nor a name"),
         ("goto 0 0", "goto takes X, Y and PHI: here are X = 0 and Y = 0.000 mm, and PHI is missing"),
         ("goto 0.5", "goto takes X, Y and PHI, or the NAME of a pose: here is X = 0.5 alone"),
-        ("goto 10 mm 20 mm 0", "a bare number is in m: no space stands before a unit"),
+        ("goto 10 mm 20 mm 0", "write no space before"),
         (
             "goto pick --tool camera",
             "the pose of a NAME is where it was taught: it knows no --tool and no --frame",
@@ -276,7 +276,7 @@ def test_the_page_takes_the_units_of_the_command_line(name: str, dimension: Dime
 
 @given(st.integers(0, 999), st.integers(0, 999), st.sampled_from(["", "-"]), st.sampled_from(["", "mm", " m", "deg"]))
 def test_a_decimal_comma_is_told_with_a_point(whole: int, part: int, sign: str, unit: str) -> None:
-    with pytest.raises(ValueError, match=rf": write {sign}{whole}\.{part}, with a point"):
+    with pytest.raises(ValueError, match=rf": write {sign}{whole}\.{part} with a decimal point"):
         quantity(f"{sign}{whole},{part}{unit}", LENGTH)
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
-from trirail.cli.pendant import REPEAT, Pendant, keys
+from trirail.cli.pendant import KEY_TIMEOUT_S, Pendant, keys
 from trirail.client import held_jog
 from waiting import wait_until
 
@@ -85,12 +85,12 @@ def test_a_key_that_comes_again_is_one_jog_until_it_does_not(
     for number in range(1, 6):
         operator.press(key)
         sent = operator.sent(number)
-        operator.wait(0.9 * REPEAT)
+        operator.wait(0.9 * KEY_TIMEOUT_S)
     assert all(each == pytest.approx(velocity) for each in sent)
-    operator.wait(0.2 * REPEAT)
+    operator.wait(0.2 * KEY_TIMEOUT_S)
     assert operator.sent(6)[5] == (0.0, 0.0, 0.0)
     assert len({goal.id for goal in operator.robot.sent}) == 1
-    operator.wait(10.0 * REPEAT)
+    operator.wait(10.0 * KEY_TIMEOUT_S)
     assert len(operator.robot.sent) == 6
 
 

@@ -208,8 +208,8 @@ def test_a_robot_is_there_before_its_router_and_after_it_is_gone(net: Net) -> No
     ("impostor", "why"),
     [
         ("", "connection refused"),
-        ("stray", "its certificate is in the name of stray, not of hub"),  # another robot's
-        ("ann", "its certificate is not accepted: unsuitable certificate purpose"),  # a user's
+        ("stray", "the server's certificate has the name stray, expected hub"),  # another robot's
+        ("ann", "the server's certificate is not trusted: unsuitable certificate purpose"),  # a user's
     ],
 )
 def test_a_robot_says_why_it_has_no_router_and_obeys_nobody_in_its_place(net: Net, impostor: str, why: str) -> None:

@@ -23,7 +23,7 @@ def written(form: str, *events: Event, **environment: str) -> list[str]:
     log = Log(form, out, clock=lambda: 1_700_000_000.0, environment=environment)  # type: ignore[arg-type]
     for event in events:
         log.event(event)
-    log.say("the planner has died", "warning")
+    log.log("the planner has died", "warning")
     return out.getvalue().splitlines()
 
 
@@ -87,7 +87,7 @@ def test_a_full_disk_stops_no_robot() -> None:
     with open("/dev/full", "w") as full:
         log = Log("text", full)
         for _ in range(1000):
-            log.say("the planner has died", "warning")
+            log.log("the planner has died", "warning")
         log.close()
         assert os.readlink(f"/proc/self/fd/{full.fileno()}") == os.devnull
 

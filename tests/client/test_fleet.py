@@ -92,7 +92,7 @@ def test_one_look_as_json(
     publisher = threading.Thread(target=publish)
     publisher.start()
     try:
-        monkeypatch.setattr(fleet_command, "LOOK", 3.0)
+        monkeypatch.setattr(fleet_command, "SNAPSHOT_S", 3.0)
         words = ["fleet", "--connect", locator, "--json"]
         assert app(words, exit_on_error=False, result_action="return_value") == 0
     finally:
@@ -107,11 +107,11 @@ def test_into_a_pipe_each_robot_is_a_line_whenever_it_has_changed(
 ) -> None:
     locator, service = hub
     said: list[str] = []
-    monkeypatch.setattr(fleet_command, "REFRESH", 0.01)
-    monkeypatch.setattr(terminal, "say", said.append)
+    monkeypatch.setattr(fleet_command, "REFRESH_S", 0.01)
+    monkeypatch.setattr(terminal, "print_line", said.append)
     over = threading.Event()
     with Fleet(locator, "demo") as fleet:
-        printing = threading.Thread(target=fleet_command._say_changes, args=(fleet, over))
+        printing = threading.Thread(target=fleet_command._print_changes, args=(fleet, over))
         printing.start()
         try:
             for number, summary in enumerate((OK, FAULT), 1):

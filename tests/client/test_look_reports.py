@@ -34,7 +34,7 @@ class Told:
         self.trouble: ServiceError | None = None
 
     def state(self) -> Any:
-        return SimpleNamespace(pose=self.stage.pose)
+        return SimpleNamespace(pose=self.stage.pose, sliders=SimpleNamespace(position=(0.0, 0.0, 0.0)))
 
     def send(self, goal: Any) -> Any:
         motion = (goal.x, goal.y, goal.phi)

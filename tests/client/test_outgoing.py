@@ -295,7 +295,7 @@ def test_what_is_no_number_is_refused_by_every_method_and_not_sent(
                 for value in NONE:
                     with pytest.raises((RefusedError, ValueError)) as found:
                         await done(robot, call, value)
-                    of_record = "must be a finite number" in str(found.value)  # before the client gets it
+                    of_record = "is not a finite number" in str(found.value)  # before the client gets it
                     assert of_record or getattr(found.value, "code", None) is RefusalCode.MALFORMED, (name, value)
                     assert SERVICE[0].taken() == [], (name, value)
 
@@ -422,6 +422,7 @@ CLOSED: dict[str, Call] = {
     "state": lambda robot, _: robot.state(),
     "records": lambda robot, _: robot.records(print),
     "calibrate_camera": lambda robot, _: robot.calibrate_camera(dict),
+    "calibrate_geometry": lambda robot, _: robot.calibrate_geometry(dict, (1.0, 1.0)),
     "align": lambda robot, _: robot.align(dict, {"a": (0.0, 0.0)}, CALIBRATION),
 }
 

@@ -14,7 +14,7 @@ from trirail.client import picture
 from trirail.config import SIM, geometry, load
 from trirail.kinematics.robot import inverse
 from trirail.processes.publications import info
-from trirail.wire.state import Commanded, GoalState, Pose, Sliders, State
+from trirail.wire.state import CommandedMotion, GoalState, Pose, Sliders, State
 from trirail.workspace import part_positions
 
 SHIPPED = sorted(SIM.parent.glob("*.toml"))
@@ -26,7 +26,9 @@ def at(pose: tuple[float, float, float], path: Path) -> State:
     moved = inverse(geometry(load(path).geometry), np.array(pose), np.zeros(3), np.zeros(3))
     a, b, c = moved.position.tolist()
     sliders = Sliders((a, b, c), (a, b, c), REST, REST, ("operation enabled",) * 3, (COUNTS,) * 3)
-    return a_state(pose=pose, sliders=sliders, commanded=Commanded(Pose(*pose), REST, REST, (a, b, c), REST, REST))
+    return a_state(
+        pose=pose, sliders=sliders, commanded=CommandedMotion(Pose(*pose), REST, REST, (a, b, c), REST, REST)
+    )
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

@@ -54,7 +54,7 @@ def test_a_cell_that_is_no_number_is_named(rows: list[tuple[float, ...]], data: 
     )
     with pytest.raises(TrirailError) as refused:
         read_text(csv_of(cells))
-    where = f"path.csv: line {line + 2}, column {HEAD[column]}: {wrong!r} is no number"
+    where = f"path.csv: line {line + 2}, column {HEAD[column]}: {wrong!r} is not a number"
     assert f"{where}; a CSV has bare metres, radians and seconds" in str(refused.value)
 
 

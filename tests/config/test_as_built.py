@@ -180,13 +180,13 @@ def test_the_geometry_is_told_from_others_by_a_nanometre() -> None:
 
 def test_who_asks_is_told_of_the_correction(tmp_path: Path) -> None:
     assert info(CONFIG).correction is None
-    assert doctor.corrected(CONFIG) == []
+    assert doctor.correction(CONFIG) == []
     config = load(robot_file(tmp_path, format_map(a_map()).encode(), BOTH))
     told = info(config).correction
     assert told is not None
     assert (told.file, told.made, told.backlash) == (str(tmp_path / "as_built.toml"), "2026-05-01", (5e-5, 0.0, 1e-5))
     assert 0.0 < max(told.greatest) < 2e-5
-    (check,) = doctor.corrected(config)
+    (check,) = doctor.correction(config)
     assert check.verdict == "ok"
     assert "as_built.toml, measured 2026-05-01: up to" in check.found
     assert "backlash of A 50.0 µm, B 0.0 µm, C 10.0 µm" in check.found

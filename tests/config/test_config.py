@@ -80,7 +80,7 @@ def test_shipped_configurations_load(path: Path) -> None:
         (
             LISTEN,
             'listen = ["tcp/127.0.0.1:70000"]',
-            "its port must be 1 to 65535: an endpoint is protocol/address, as",
+            "the port must be 1 to 65535: an endpoint is protocol/address, such as",
         ),
         (LISTEN, f'{LISTEN}\nconnect = ["tcp/hub"]', "zenoh.connect[0] = 'tcp/hub': the port is missing"),
         (LISTEN, 'listen = ["tcp/127.0.0.1:9876"]', "telemetry.live_port: port 9876 is also that of zenoh.listen[0]"),

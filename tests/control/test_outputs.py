@@ -67,11 +67,7 @@ class Rig(ControlRig):
         """Return the cycles, from 1, whose setpoints came with another value of an output, and that value."""
         drive, bit = BITS[name]
         values = [word[drive] >> bit & 1 for word in self.words]
-        return [
-            (k + 1, bool(now))
-            for k, (before, now) in enumerate(itertools.pairwise(values), 1)
-            if before != now
-        ]
+        return [(k + 1, bool(now)) for k, (before, now) in enumerate(itertools.pairwise(values), 1) if before != now]
 
     @property
     def switches(self) -> list[Switch]:

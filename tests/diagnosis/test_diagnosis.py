@@ -280,7 +280,7 @@ def test_stops_are_those_of_the_motion_itself(v: float, a: float, j: float, q: f
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_the_rail_is_drawn(path: Path) -> None:
     found = stops(load(path))
-    lines = rail_drawing.drawn(found)
+    lines = rail_drawing.draw_lines(found)
     assert max(map(len, lines)) < 100
     rows = [line.split("  ")[0] for line in lines[:-1]]
     if load(path).geometry.l0 is None:  # measured legs do not tell where rails end

@@ -123,7 +123,7 @@ def test_what_happens_in_a_moment_lasts_only_if_told_to(line: str) -> None:
         ("A emcy 10000", "an error code"),
         ("A dlc 9", "after dlc comes a length from 0 to 8"),
         ("babble 800", "after babble comes an identifier, hexadecimal"),
-        ("A drop tpdo3", 'unknown frames "tpdo3"; did you mean tpdo'),
+        ("A drop tpdo9", 'unknown frames "tpdo9"; did you mean tpdo'),
         ("A drop 0x800", 'unknown frames "0x800"'),
         ("A silent tpdo2", '"tpdo2" after silent: only for can follow, as in: A silent for 0.5'),
         ("A silent for", "after for comes seconds"),

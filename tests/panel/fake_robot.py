@@ -27,7 +27,7 @@ from trirail.processes.publications import info
 from trirail.wire.goals import Goal, MoveGoal, NamedGoal, PoseGoal, Tool, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import CommandReply, Event
 from trirail.wire.state import (
-    Commanded,
+    CommandedMotion,
     FrameCounts,
     GoalState,
     Info,
@@ -268,7 +268,7 @@ class FakeRobot:
         counts = FrameCounts(0, 0, 0, 0)
         power = "switch on disabled" if self.mode in ("disabled", "fault") else "operation enabled"
         sliders = Sliders((a, b, c), ZERO, ZERO, ZERO, (power,) * 3, (counts,) * 3)
-        commanded = Commanded(Pose(*self.pose), self.velocity, ZERO, (a, b, c), ZERO, ZERO)
+        commanded = CommandedMotion(Pose(*self.pose), self.velocity, ZERO, (a, b, c), ZERO, ZERO)
         seq = self._seq()
         return State(
             seq=seq,

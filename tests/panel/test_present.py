@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.viewer, needs_chromium]
 
 ANSWER = "document.querySelector('#answer').textContent"
 RIGHT = "[data-axis=x][data-sign='1']"
-EVERYBODYS = {each for each in Command if each.everybodys}
+EVERYBODYS = {each for each in Command if each.ignores_lease}
 
 
 def bars(page: Page) -> dict[str, str]:

@@ -13,7 +13,7 @@ from trirail.processes.gateway import ROUTES
 from trirail.processes.incoming import Incoming
 from trirail.processes.requests import LOOKS, LOOKS_PER_SECOND, Looks
 from trirail.wire import boundary
-from trirail.wire.looks import WELL, AlignmentLook, in_words
+from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, in_words
 from trirail.wire.messages import Notice
 from trirail.wire.packets import Announcement
 from trirail.wire.text import printable
@@ -47,7 +47,7 @@ def test_a_look_is_passed_on_in_a_line_that_a_terminal_shows(look: AlignmentLook
     assert sent.user == "ann"
     assert sent.alignment == taken
     assert taken.marks == look.marks
-    assert sent.level == ("info" if look.end in WELL else "warning")
+    assert sent.level == ("info" if look.end in SUCCESSFUL_ENDS else "warning")
     assert sent.message == printable(sent.message)
     for words in (look.id, look.purpose, look.end or ""):
         assert words in sent.message

@@ -16,7 +16,7 @@ from refusals import refused_as
 from trirail.client.client import Robot
 from trirail.client.new_stop import NewStop
 from trirail.errors import RefusalCode, ServiceError
-from trirail.wire.stop_protocol import FARTHER
+from trirail.wire.stop_protocol import PORT_OFFSET
 from waiting import WITHIN
 
 pytestmark = pytest.mark.slow
@@ -59,7 +59,7 @@ def held(served: Served) -> Iterator[str]:
     """Hold both ports; the locator is the service's own."""
     with contextlib.ExitStack() as connections:
         for _ in range(HELD):
-            for number in (port(served.locator), port(served.locator) + FARTHER):
+            for number in (port(served.locator), port(served.locator) + PORT_OFFSET):
                 connections.enter_context(socket.create_connection(("127.0.0.1", number)))
         yield served.locator
 
@@ -78,7 +78,7 @@ def without_zenoh(served: Served) -> Iterator[str]:
     with (
         contextlib.ExitStack() as opened,
         socket.create_server(("127.0.0.1", number)),
-        socket.create_server(("127.0.0.1", number + FARTHER)) as door,
+        socket.create_server(("127.0.0.1", number + PORT_OFFSET)) as door,
     ):
 
         def serve() -> None:
@@ -87,7 +87,7 @@ def without_zenoh(served: Served) -> Iterator[str]:
                 for ready in select.select([door, *other], [], [], 0.02)[0]:
                     if ready is door:
                         client = opened.enter_context(door.accept()[0])
-                        service = socket.create_connection(("127.0.0.1", port(served.locator) + FARTHER))
+                        service = socket.create_connection(("127.0.0.1", port(served.locator) + PORT_OFFSET))
                         other |= {client: opened.enter_context(service), service: client}
                     elif heard := passed(ready):
                         other[ready].sendall(heard)

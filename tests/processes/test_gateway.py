@@ -21,7 +21,7 @@ from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.event_codes import EventCode
-from trirail.wire.links import Closed
+from trirail.wire.links import LinkClosed
 from trirail.wire.messages import Event, GoalReply, Notice
 from trirail.wire.packets import (
     Accepted,
@@ -345,11 +345,11 @@ class EndedLoop(FakeLink):
         self._said = list(said)
 
     def send(self, packet: bytes) -> bool:
-        raise Closed
+        raise LinkClosed
 
     def receive(self) -> bytes:
         if not self._said:
-            raise Closed
+            raise LinkClosed
         return self._said.pop(0)
 
     def fileno(self) -> int:

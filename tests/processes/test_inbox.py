@@ -182,7 +182,7 @@ def test_what_is_too_large_is_refused_when_it_comes_and_its_memory_is_not_held(t
         (stop,) = inbox.next_messages(9)
         assert stop.key == "trirail/demo/cmd/eve/stop"
         assert stop.query is None
-        with pytest.raises(RefusedError, match="at most"):  # so that it is carried out as one without content
+        with pytest.raises(RefusedError, match="exceed the maximum"):  # so: without content
             stop.content(type(None), "")
 
 

@@ -18,7 +18,7 @@ from trirail.processes.requests import AHEAD_OF_ALL, UNDER_WAY_OF_ALL
 from trirail.wire import links
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal
-from trirail.wire.links import Closed, PacketLink, Port
+from trirail.wire.links import LinkClosed, PacketLink, Port
 from trirail.wire.messages import Event, Notice
 from trirail.wire.packets import (
     Announcement,
@@ -495,7 +495,7 @@ def test_what_is_no_answer_ends_the_planner_and_not_the_robot(shell: Shell, junk
     assert refusals(shell) == [(3, "planner_lost")]
     shell.cycles(20)
     assert not shell.ports.planner.connected
-    with pytest.raises(Closed):
+    with pytest.raises(LinkClosed):
         shell.received(shell.planner)
     assert shell.mode() is Mode.MOVING
 

@@ -160,7 +160,8 @@ def test_from_the_command_line(place: Place, robot: Robot) -> None:
     assert [line.split()[0] for line in listed] == ["park", "pick"]
     assert [line.rpartition("   ")[2] for line in listed] == ["of [poses]", "taught"]
     told = json.loads(trirail("poses", "--json", locator=place.locator).stdout)
-    assert told["park"] == {"name": "park", "x": 0.0, "y": 0.05, "phi": 0.0, "taught": False}
+    park = {"name": "park", "x": 0.0, "y": 0.05, "phi": 0.0, "taught": False, "other_geometry": False}
+    assert told["park"] == park
     unknown = trirail("goto", "nowhere", locator=place.locator)
     assert (unknown.returncode, unknown.stdout) == (1, "")
     assert unknown.stderr == "trirail: no pose 'nowhere': `trirail poses` lists the saved poses\n"

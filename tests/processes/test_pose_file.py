@@ -18,9 +18,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trirail.errors import ServiceError
-from trirail.processes.pose_file import NAME, PoseFile, state_directory
+from trirail.processes.pose_file import NAME, PoseFile, TaughtPose, state_directory
 
-PICK, PLACE = (0.01, -0.02, 0.3), (-0.05, 0.0, -0.1)
+PICK, PLACE = TaughtPose(0.01, -0.02, 0.3, "0123abcd"), TaughtPose(-0.05, 0.0, -0.1)
 
 
 class PowerCut(BaseException):
@@ -123,10 +123,10 @@ def test_the_model_of_a_disk_finds_what_is_not_synced(tmp_path: Path, monkeypatc
 TEACHES = """
 import itertools, sys
 from pathlib import Path
-from trirail.processes.pose_file import PoseFile
+from trirail.processes.pose_file import PoseFile, TaughtPose
 print("begun", flush=True)
 for number in itertools.count():
-    PoseFile(Path(sys.argv[1])).change(f"p{number % 40}", (float(number), 0.0, 0.0))
+    PoseFile(Path(sys.argv[1])).change(f"p{number % 40}", TaughtPose(float(number), 0.0, 0.0))
 """
 
 
@@ -139,12 +139,15 @@ def test_a_service_that_is_killed_while_it_writes_leaves_a_whole_file(tmp_path: 
             while len(PoseFile(folder).read()) < 5 + number:
                 assert teaching.poll() is None
             teaching.send_signal(signal.SIGKILL)
-        numbers = sorted(round(x) for x, _, _ in PoseFile(folder).read().values())
+        numbers = sorted(round(x) for x, *_ in PoseFile(folder).read().values())
         assert numbers == list(range(numbers[-1] - len(numbers) + 1, numbers[-1] + 1))
 
 
 poses = st.dictionaries(
-    st.from_regex(r"\A[A-Za-z0-9_-]{1,64}\Z"), st.tuples(*[st.floats(-1e3, 1e3)] * 3), min_size=1, max_size=5
+    st.from_regex(r"\A[A-Za-z0-9_-]{1,64}\Z"),
+    st.builds(TaughtPose, *[st.floats(-1e3, 1e3)] * 3),
+    min_size=1,
+    max_size=5,
 )
 
 
@@ -179,7 +182,7 @@ def test_a_file_that_is_none_of_ours_is_refused_by_name_and_never_overwritten(
 
 def test_services_of_one_robot_that_write_at_once_keep_each_other_s(tmp_path: Path) -> None:
     with ThreadPoolExecutor(8) as several:
-        list(several.map(lambda n: PoseFile(tmp_path).change(f"p{n}", (n, 0.0, 0.0)), range(40)))
+        list(several.map(lambda n: PoseFile(tmp_path).change(f"p{n}", TaughtPose(n, 0.0, 0.0)), range(40)))
     assert set(PoseFile(tmp_path).read()) == {f"p{n}" for n in range(40)}
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
 

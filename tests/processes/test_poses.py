@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import random
 import tempfile
@@ -19,7 +20,7 @@ from control_rig import CONFIG
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refused_as, uncoded
-from trirail.config import Config, geometry, parse
+from trirail.config import Config, LegTable, geometry, parse
 from trirail.errors import ConfigError, RefusalCode, RefusedError, ServiceError
 from trirail.kinematics.geometry import travels
 from trirail.kinematics.robot import inverse
@@ -107,6 +108,22 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     yield ask
     for each in made:
         each.poses.close()
+
+
+def test_a_pose_that_was_taught_with_another_geometry_is_flagged_until_it_is_taught_again(make: Make) -> None:
+    make(CONFIG).teach("pick")
+    leg_a, *others = GEOMETRY.legs
+    turned = dataclasses.replace(leg_a, rail_angle=leg_a.rail_angle + 1e-6)
+    legs = [LegTable(**leg.keys()) for leg in (turned, *others)]
+    table = msgspec.structs.replace(CONFIG.geometry, l0=None, leg=tuple(legs))
+    calibrated = make(msgspec.structs.replace(CONFIG, geometry=table))
+    calibrated.teach("place")
+    flags = {pose.name: pose.other_geometry for pose in calibrated.poses.table().poses}
+    assert flags == {"pick": True, "place": False}
+    assert ["pick" in line and "place" not in line for line in calibrated.poses.warnings()] == [True]
+    calibrated.teach("pick")
+    assert not any(pose.other_geometry for pose in calibrated.poses.table().poses)
+    assert calibrated.poses.warnings() == ()
 
 
 def test_a_pose_is_taught_where_the_next_record_has_the_robot_and_kept(make: Make) -> None:

@@ -68,7 +68,7 @@ def test_a_link_that_is_lost_is_told_at_once_with_why() -> None:
     net.there = False
     net.wait(3)
     assert uncoded(net.told[1:]) == [Notice("service", "warning", DOWN)]
-    net.why = "its certificate is in the name of stray, not of hub"
+    net.why = "the server's certificate has the name stray, expected hub"
     net.wait(2 * ASK_EVERY)
     assert net.links.warnings() == (DOWN.replace("connection refused", net.why),)
     assert len(net.told) == 2

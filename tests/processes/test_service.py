@@ -377,7 +377,7 @@ def test_bad_commands(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     assert "no such command; there are enable" in reply.err.payload.to_string()
     (reply,) = session.get("trirail/demo/cmd/*/stop")
     assert reply.err is not None
-    assert "name one robot and one user" in reply.err.payload.to_string()
+    assert "contains a wildcard" in reply.err.payload.to_string()
     assert robot.state().mode == "holding"
 
 
@@ -935,7 +935,7 @@ def test_nobody_there(tmp_path: Path) -> None:
     failed = trirail("status", locator=f"unixsock-stream/{tmp_path}/none")
     assert failed.returncode == 1
     assert failed.stderr.startswith("trirail: no service at unixsock-stream/")
-    assert "start what is to answer there, trirail run or zenohd, or name another address" in failed.stderr
+    assert "start trirail run or zenohd there, or name another address" in failed.stderr
 
 
 @pytest.mark.alone  # the demo has a port of the machine

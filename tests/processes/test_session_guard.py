@@ -202,7 +202,7 @@ def test_a_certificate_without_a_name_asks_nothing(served: Served) -> None:
     ("name", "said"),
     [
         ("late", "expired on"),
-        ("early", "is this machine's clock right"),
+        ("early", "check this machine's clock"),
         ("foreign", "not signed by the authority of ca.pem"),
         ("none", "none/ca.pem: No such file or directory"),
     ],
@@ -255,7 +255,7 @@ def test_the_folder_of_the_user_is_found_by_default(served: Served, monkeypatch:
 
 
 def test_what_would_not_be_encrypted_takes_no_credentials(served: Served) -> None:
-    with pytest.raises(ServiceError, match="credentials are for tls/HOST:PORT"):
+    with pytest.raises(ServiceError, match="connect to tls/HOST:PORT"):
         Robot("demo", "tcp/127.0.0.1:1", tls=user(served[1], "ann"))
 
 
@@ -371,9 +371,11 @@ def test_the_doctor_tells_who_can_reach_it(served: Served, tmp_path: Path) -> No
         ("network", "warning", "tcp/0.0.0.0:1: everybody in the network can command")
     ]
     socket = "unixsock-stream//run/z"
-    assert said(Zenoh((socket,))) == [("network", "ok", f"{socket}: who may write to the socket's file can command")]
+    assert said(Zenoh((socket,))) == [
+        ("network", "ok", f"{socket}: users with write access to the socket's file can command")
+    ]
     tls = Zenoh(("tls/0.0.0.0:1",), tls=Tls())
-    open_to = ("network", "ok", "tls/0.0.0.0:1: who has a role, by his certificate, can command")
+    open_to = ("network", "ok", "tls/0.0.0.0:1: users with a certificate and a role can command")
     assert said(tls, "no certificates") == [open_to, ("certificates", "failure", "no certificates")]
     assert said(tls, Guard(served[0])) == [
         open_to,
@@ -386,4 +388,4 @@ def test_a_certificate_that_ends_soon_is_told(tmp_path: Path) -> None:
     KeyFolder(tmp_path / "keys").create("demo", ["localhost"], 10.0)
     config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(("tls/127.0.0.1:1",), tls=Tls(str(tmp_path / "keys"))))
     (said,) = Guard(config).warnings()
-    assert said.endswith("keys expires in 9 days; trirail keys renew makes a new one")
+    assert said.endswith("keys: expires in 9 days; renew it with: trirail keys renew")

@@ -134,7 +134,7 @@ def test_times_that_fall_from_one_part_to_the_next_refuse_the_whole() -> None:
 
 def test_a_part_without_an_id_is_none() -> None:
     points = trajectory(random.Random(0), 2).points
-    with pytest.raises(ValueError, match="id: the parts of a trajectory need the same one"):
+    with pytest.raises(ValueError, match="all parts of a trajectory need the same id"):
         TrajectoryGoal(points, part=TrajectoryPart(1, 2))
-    with pytest.raises(ValueError, match="number is 3 of 2"):
+    with pytest.raises(ValueError, match="number 3 exceeds the number of parts, 2"):
         TrajectoryPart(3, 2)

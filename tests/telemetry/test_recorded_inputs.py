@@ -8,7 +8,7 @@ from trirail.errors import RefusalCode
 from trirail.telemetry.recorded_inputs import decode_input, encode_input
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal
-from trirail.wire.looks import AlignmentLook, look_text
+from trirail.wire.looks import AlignmentLook, alignment_event_text
 from trirail.wire.messages import GoalReply, Notice
 from trirail.wire.packets import Announcement, CommandRequest, ControlInput, Disturbance, GivenInput, GoalRequest
 from trirail.wire.plan_packets import Extended, NotPlanned, PackedPath, PackedRun, Planned
@@ -16,7 +16,7 @@ from trirail.wire.vocabulary import Command, Override
 
 TAUGHT = coded("pose", EventCode.POSE_REMOVED, pose="x", user="ann")
 LOOK = AlignmentLook("a", "check", 1)
-LOOKED = look_text(LOOK, "a look")
+LOOKED = alignment_event_text(LOOK, "a look")
 RECORDING = coded("hello", EventCode.RECORDING, file="x")
 PATH = PackedPath(b"abc", b"defg")
 AGAIN = coded("again", EventCode.RECORDED_AGAIN)

@@ -12,6 +12,7 @@ import bench_aims
 import bench_align
 import bench_fairness
 import bench_frames
+import bench_geometry
 import bench_latency
 import bench_loop
 import bench_peers
@@ -21,7 +22,7 @@ import pytest
 from bench_latency import Setpoint
 from bench_rig import QUANTILES, Rig
 from trirail.diagnosis.bare_loop import Cycles
-from trirail.wire.records import PARTS
+from trirail.wire.records import PART_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def test_what_one_users_flood_costs_another_is_measured(rig: Rig) -> None:
 def test_the_loop_is_measured_beside_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
     told = bench_loop.measure(0.6, (1000,), 1)
     (found,) = told["rates"]
-    assert set(found["parts"]) == set(PARTS)
+    assert set(found["parts"]) == set(PART_NAMES)
     bare = found["bare"]
     assert 0 < bare["answers"] <= 3 * bare["cycles"]
     assert all(is_spread(found[what]) for what in ("to_setpoints", "to_record"))
@@ -121,6 +122,15 @@ def test_a_rate_that_is_not_kept_is_said_and_not_met() -> None:
     assert any("9 faults" in line for line in bench.lines({"rates": [found]}))
     rows = bench_aims.table({"loop": {"rates": [found]}})
     assert [(row["measured"], row["met"]) for row in rows] == [((), False)] * 2, "the ratio and the ticks missed"
+
+
+def test_a_stage_that_measured_its_geometry_needs_one_correction_where_today_it_needs_two() -> None:
+    found = bench_geometry.measure(1)
+    for kind in bench_align.FILES:
+        calibrated, configured = found[kind]["calibrated geometry"], found[kind]["configured, cameras by 1 mm and 1°"]
+        assert calibrated["reached"] == configured["reached"] == 1.0, kind
+        assert calibrated["within 1 µm, 5 arcsec after one"] > configured["within 1 µm, 5 arcsec after one"], kind
+        assert found[kind]["looks of a calibration"] <= 30, kind
 
 
 def test_alignment_needs_one_correction_by_the_right_model_and_more_by_the_others() -> None:

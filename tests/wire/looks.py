@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import get_args
 
 from hypothesis import strategies as st
-from trirail.wire.looks import MOST_MARKS, AlignmentLook, LookEnd, LookError, LookPurpose, SeenMark
+from trirail.wire.looks import MAX_MARKS, AlignmentLook, LookEnd, LookError, LookPurpose, SeenMark
 from trirail.wire.messages import Event
 from trirail.wire.text import is_id
 
@@ -34,7 +34,7 @@ LARGEST = AlignmentLook(
     1_000_000,
     tuple(
         SeenMark(f"{n:02}" + "\U0001f916" * 62, (-1.2345678901234567e8,) * 2, (-123.45678901234567,) * 2)
-        for n in range(MOST_MARKS)
+        for n in range(MAX_MARKS)
     ),
     LookError(-123.45678901234567, (-123.45678901234567,) * 2, -123.45678901234567, 0.1, 0.1),
     (-123.45678901234567,) * 3,

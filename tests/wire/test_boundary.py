@@ -56,15 +56,15 @@ POSE = b'"x":0.1,"y":0,"phi":0'
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b'{"kind":"pose","x":-0.1,%b}' % POSE, "not a goal: x stands twice: once would be right"),
-        (b'{"kind":"pose","x":-0.1,"x":0,%b}' % POSE, "not a goal: x stands 3 times: once would be right"),
-        (b'{"kind":"pose","\\u0078":-0.1,%b}' % POSE, "not a goal: x stands twice: once would be right"),
-        (b'{"kind":"pose","kind":"pose",%b}' % POSE, "not a goal: kind stands twice: once would be right"),
+        (b'{"kind":"pose","x":-0.1,%b}' % POSE, "not a goal: key x is given twice; give it once"),
+        (b'{"kind":"pose","x":-0.1,"x":0,%b}' % POSE, "not a goal: key x is given 3 times; give it once"),
+        (b'{"kind":"pose","\\u0078":-0.1,%b}' % POSE, "not a goal: key x is given twice; give it once"),
+        (b'{"kind":"pose","kind":"pose",%b}' % POSE, "not a goal: key kind is given twice; give it once"),
         (
             b'{"kind":"trajectory","points":[{"t":0,%b},{"t":1,"t":2,%b}]}' % (POSE, POSE),
-            "not a goal: t stands twice: once would be right",
+            "not a goal: key t is given twice; give it once",
         ),
-        (b'{"kind":"pose","limits":{"velocity":[1,1,1],"velocity":[2,2,2]},%b}' % POSE, "velocity stands twice"),
+        (b'{"kind":"pose","limits":{"velocity":[1,1,1],"velocity":[2,2,2]},%b}' % POSE, "key velocity is given twice"),
     ],
 )
 def test_a_key_that_stands_twice_is_refused_by_name(content: bytes, said: str) -> None:

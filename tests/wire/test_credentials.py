@@ -19,7 +19,7 @@ def test_a_key_is_its_owners_alone_and_roots_its_groups_to_read(tmp_path: Path) 
     for mode in range(0o1000):
         file.chmod(mode)
         if mode & 0o007 or mode & 0o030 or (mode & 0o040 and not of_root):
-            with pytest.raises(ServiceError, match=rf"its mode {mode:04o} lets others .* chmod 600 {file}"):
+            with pytest.raises(ServiceError, match=rf"mode {mode:04o} lets other .* chmod 600 {file}"):
                 check_private(file)
         else:
             check_private(file)
@@ -36,6 +36,6 @@ def test_everybody_who_reads_one_looks_at_that(tmp_path: Path) -> None:
     for file, read in readers.items():
         read()
         file.chmod(0o644)
-        with pytest.raises(ServiceError, match="lets others use this private key"):
+        with pytest.raises(ServiceError, match="lets other users read this private key"):
             read()
         file.chmod(0o600)

@@ -96,7 +96,7 @@ def test_what_an_endpoint_lacks_is_said(host: str, port: int, protocol: str, end
     assert fault_of(f"{protocol}/:{port}{end}").startswith("the host is missing")
     assert fault_of(f"{protocol}/{end}").startswith("the address is missing")
     for wrong in ("", "0", str(port + 65535), f"-{port}", "x", "\u0665"):
-        assert fault_of(f"{protocol}/{host}:{wrong}{end}").startswith("its port must be 1 to 65535")
+        assert fault_of(f"{protocol}/{host}:{wrong}{end}").startswith("the port must be 1 to 65535")
     assert tcp_address(f"{protocol}/{host}:{port}{end}") == (
         None if protocol in ("udp", "quic") else (host.strip("[]"), port)
     )

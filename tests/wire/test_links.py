@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from trirail.wire import links
-from trirail.wire.links import Closed, Port
+from trirail.wire.links import LinkClosed, Port
 
 
 @pytest.fixture
@@ -55,11 +55,11 @@ def test_a_peer_that_does_not_read_costs_a_counted_drop(port: Port, path: Path) 
 def test_a_lost_peer_is_told_once_and_can_come_back(port: Port, path: Path) -> None:
     link = links.connect(path)
     port.accept()
-    assert not port.take_lost()
+    assert not port.clear_lost()
     link.close()
     assert port.receive() is None
-    assert port.take_lost()
-    assert not port.take_lost()
+    assert port.clear_lost()
+    assert not port.clear_lost()
     assert not port.send(b"x")
     again = links.connect(path)
     assert port.accept()
@@ -67,7 +67,7 @@ def test_a_lost_peer_is_told_once_and_can_come_back(port: Port, path: Path) -> N
     assert again.receive() == b"welcome back"
     again.close()
     assert not port.send(b"x")  # a peer that is lost in sending is lost too
-    assert port.take_lost()
+    assert port.clear_lost()
 
 
 def test_a_peer_is_awaited_until_it_comes(port: Port, path: Path) -> None:
@@ -82,7 +82,7 @@ def test_the_peer_sees_the_end(port: Port, path: Path) -> None:
     link = links.connect(path)
     port.accept()
     port.close()
-    with pytest.raises(Closed):
+    with pytest.raises(LinkClosed):
         link.receive()
     link.close()
 

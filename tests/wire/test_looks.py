@@ -11,7 +11,7 @@ from refusals import refused_as
 from trirail.alignment.procedure import AlignmentEnd
 from trirail.errors import AlignmentFault, RefusalCode
 from trirail.wire import boundary
-from trirail.wire.looks import WELL, AlignmentLook, LookEnd, SeenMark, look_text
+from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, LookEnd, SeenMark, alignment_event_text
 from trirail.wire.messages import Notice
 from trirail.wire.packets import Announcement, Happened, decode_answer, decode_request, event_packet, message
 from trirail.wire.sizes import MAX_MESSAGE, MAX_PACKET
@@ -30,7 +30,7 @@ def test_a_look_is_read_as_it_was_said_and_goes_between_the_processes(look: Alig
 
 def test_the_largest_fits_into_a_message_and_a_packet() -> None:
     assert len(boundary.encode(LARGEST)) <= MAX_MESSAGE
-    text = look_text(LARGEST, "w" * 6000)
+    text = alignment_event_text(LARGEST, "w" * 6000)
     notice = Notice("alignment", "warning", text.text, user="u" * 64, alignment=LARGEST, **text.fields)
     assert len(message(Announcement(notice))) <= MAX_PACKET
     assert decode_answer(event_packet(event(1, LARGEST))[1:]) == Happened(event(1, LARGEST))
@@ -69,7 +69,7 @@ def test_what_is_none_is_refused(wrong: dict[str, object]) -> None:
 
 def test_every_way_in_which_an_alignment_ends_can_be_said() -> None:
     assert set(get_args(LookEnd)) == {*AlignmentEnd, *AlignmentFault, "calibrated", "checked", "failed"}
-    assert set(WELL) - {None} < set(get_args(LookEnd))
+    assert set(SUCCESSFUL_ENDS) - {None} < set(get_args(LookEnd))
 
 
 def test_a_mark_with_numbers_that_are_none_cannot_be_made() -> None:

@@ -47,14 +47,14 @@ def test_an_id_that_cannot_be_shown_is_refused(kind: type[Any]) -> None:
     assert kind(**GOOD[kind], id="g 17").id == "g 17"
     assert kind(**GOOD[kind]).id is None
     for name in ("", "\x1b[2J", "a\nb", "x" * 65):
-        with pytest.raises(ValueError, match="cannot be shown"):
+        with pytest.raises(ValueError, match="is not printable"):
             kind(**GOOD[kind], id=name)
 
 
 @pytest.mark.parametrize("number", NO_NUMBERS)
 @pytest.mark.parametrize(("kind", "name"), NUMBERS)
 def test_a_number_that_is_not_finite_is_refused(kind: type[Any], name: str, number: float) -> None:
-    with pytest.raises(ValueError, match=f"{name} is .*: it must be a finite number"):
+    with pytest.raises(ValueError, match=f"{name}: .* is not a finite number"):
         kind(**GOOD[kind] | {name: number})
 
 
@@ -64,13 +64,13 @@ def test_so_is_any_of_three(index: int, number: float) -> None:
     three: Any = [0.1, 0.1, 0.1]
     three[index] = number
     for kind, name in TRIPLES:
-        with pytest.raises(ValueError, match=f"{name} is .*: it must be a finite number"):
+        with pytest.raises(ValueError, match=f"{name}: .* is not a finite number"):
             kind(**GOOD[kind] | {name: tuple(three)})
     for name in ("velocity", "acceleration", "jerk"):
-        with pytest.raises(ValueError, match=f"{name} is .*: it must be a finite number"):
+        with pytest.raises(ValueError, match=f"{name}: .* is not a finite number"):
             OwnLimits(**{name: tuple(three)})
     for name in ("velocity", "acceleration"):
-        with pytest.raises(ValueError, match=f"{name} is .*: it must be a finite number"):
+        with pytest.raises(ValueError, match=f"{name}: .* is not a finite number"):
             TrajectoryPoint(0.0, 0.0, 0.0, 0.0, **{name: tuple(three)})
 
 
@@ -96,7 +96,7 @@ def test_an_override_is_nothing_or_a_percent_at_least(percent: float, taken: boo
     if taken:
         assert Override(percent).percent == percent
     else:
-        with pytest.raises(ValueError, match="0, or 1 to 200 are taken"):
+        with pytest.raises(ValueError, match="0, or 1 to 200"):
             Override(percent)
     with pytest.raises(ValueError, match="finite"):
         Override(math.nan)

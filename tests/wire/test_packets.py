@@ -24,7 +24,7 @@ from trirail.wire.packets import (
     Status,
     Welcome,
 )
-from trirail.wire.records import DTYPE, FIELDS, HEAD, PARTS, SIZE, last_cycle, unpack
+from trirail.wire.records import DTYPE, FIELDS, HEADER, PART_NAMES, SIZE, last_cycle, unpack
 from trirail.wire.sizes import MAX_PACKET
 from trirail.wire.vocabulary import Command
 
@@ -100,7 +100,7 @@ def test_a_record_has_one_number_for_the_robot_three_for_its_sliders_or_pose_and
     shapes = {name: DTYPE[name].shape for name, _, _ in FIELDS}
     assert DTYPE.names == tuple(shapes)
     assert {name for name, shape in shapes.items() if shape == ()} == SCALARS
-    assert shapes.pop("parts_ns") == (len(PARTS),)
+    assert shapes.pop("parts_ns") == (len(PART_NAMES),)
     assert all(shape == (3,) for name, shape in shapes.items() if name not in SCALARS)
     assert all(DTYPE.fields[name][1] % DTYPE[name].alignment == 0 for name in shapes)  # type: ignore[index]
     assert SIZE % 8 == 0
@@ -120,10 +120,10 @@ def test_a_record_begins_with_what_the_loop_writes() -> None:
     numbers = iter(range(1, 1000))
     given = {name: [next(numbers) for _ in range(n)] for name, _, n in FIELDS if name in head}
     buffer = bytearray(SIZE)
-    HEAD.pack_into(buffer, 0, *(number for values in given.values() for number in values))
+    HEADER.pack_into(buffer, 0, *(number for values in given.values() for number in values))
     (row,) = unpack(bytes(buffer))
     for name, values in given.items():
         assert row[name].ravel().tolist() == values
     offset = DTYPE.fields["drive_state"][1]  # type: ignore[index]
-    assert HEAD.size == offset
+    assert HEADER.size == offset
     assert not any(buffer[offset:])

@@ -28,6 +28,8 @@ class Observation(NamedTuple):
     marks: Marks
     pose: Triple
     time: float
+    sliders: Triple | None = None
+    """Measured positions of the sliders A, B, C [m]; None where they are those of the pose by the geometry."""
 
 
 class LookReport(NamedTuple):

@@ -66,7 +66,7 @@ def find(picture: NDArray[np.generic], shape: MarkShape, turn: float = 0.0) -> D
     if grey.ndim != 2 or min(grey.shape) < shape.size * (1.0 + 2.0 * WINDOW_MARGIN):
         return None
     start = _search(grey, shape, turn)
-    return None if start is None else _fit(grey, shape, start, turn)
+    return None if start is None else fit_at(grey, shape, start, turn)
 
 
 def _window_offset(shape: MarkShape, turn: float) -> tuple[float, float]:
@@ -120,7 +120,7 @@ def _window_sums(values: Floats, side: int) -> Floats:
     return np.asarray(total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side])
 
 
-def _fit(grey: Floats, shape: MarkShape, start: tuple[float, float], turn: float) -> DetectedMark | None:
+def fit_at(grey: Floats, shape: MarkShape, start: tuple[float, float], turn: float) -> DetectedMark | None:
     """Return the mark fitted from a start pixel u, v, None if the fit does not look like the mark."""
     half = shape.size * (0.5 + WINDOW_MARGIN)
     mu, mv = _window_offset(shape, turn)

@@ -77,7 +77,9 @@ def average(pictures: Sequence[Observation]) -> Observation:
         name: (math.fsum(u for u, _ in p) / len(p), math.fsum(v for _, v in p) / len(p)) for name, p in seen.items()
     }
     x, y, phi = np.mean([each.pose for each in pictures], axis=0).tolist()
-    return Observation(marks, (x, y, phi), pictures[-1].time)
+    readings = [each.sliders for each in pictures if each.sliders is not None]
+    a, b, c = np.mean(readings, axis=0).tolist() if readings else (0.0, 0.0, 0.0)
+    return Observation(marks, (x, y, phi), pictures[-1].time, (a, b, c) if readings else None)
 
 
 def capture_after_motion(

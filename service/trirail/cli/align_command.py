@@ -10,11 +10,13 @@ import msgspec
 from cyclopts import App
 
 from trirail.cli import alignment_lines, notation, terminal
+from trirail.cli.align_geometry import geometry
 from trirail.cli.mark_source import MarkSource
 from trirail.cli.options import HERE, Flag, Service
 from trirail.errors import TrirailError
 
 if TYPE_CHECKING:
+    from trirail.alignment.camera_calibration import CameraCalibration
     from trirail.alignment.procedure import AlignmentRequest, Observation
     from trirail.client.calibration_file import CalibrationFile
 
@@ -22,6 +24,7 @@ app = App(name="align", help="Lay a part right by marks in cameras, calibrated o
 FILE = Path("camera.json")
 T = TypeVar("T")
 PROGRAM = MarkSource()
+app.command(geometry)
 
 
 @app.command
@@ -63,6 +66,7 @@ def calibrate(
     from trirail.alignment.procedure import calibrate_by_moves, calibration_moves, observe_mean
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_id
 
     if lens == "radial" and centre is None:
         raise TrirailError(
@@ -71,24 +75,25 @@ def calibrate(
     moves = calibration_moves(lens, by, notation.radians(angle, False))
     with source.open_source() as (look, known), service.open() as robot:
         views = dict.fromkeys(look(), "camera") if one_camera else known
-        wishes = calibrate_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
-        found = drive(robot, look, _printed(wishes, service, len(moves) + 1), source.speed, source.wait)
+        requests = calibrate_by_moves(moves, views, lens, centre or (0.0, 0.0), source.looks, _approach(approach))
+        calibration = drive(robot, look, _with_progress(requests, service, len(moves) + 1), source.speed, source.wait)
         targets = dict(drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks)
+        made_with = geometry_id(robot.info())
     old = calibration_file.keep_old(file)
-    calibration_file.write(file, service.robot, found, targets)
+    calibration_file.write(file, service.robot, calibration, targets, geometry=made_with)
     if service.json:
         terminal.json(
             {
                 "file": str(file),
                 "old": str(old) if old else None,
                 "targets": targets,
-                "calibration": msgspec.to_builtins(found),
+                "calibration": msgspec.to_builtins(calibration),
             }
         )
     else:
-        alignment_lines.show_calibration(found, file)
+        alignment_lines.show_calibration(calibration, file)
         if old is not None:
-            terminal.say(f"what was there is in {old}")
+            terminal.print_line(f"what was there is in {old}")
     return 0
 
 
@@ -125,28 +130,30 @@ def run(
     from trirail.alignment.procedure import AlignmentTask, align
     from trirail.client import calibration_file
     from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_id
 
-    kept = _kept(file, service)
-    task = AlignmentTask(
-        kept.calibration,
-        kept.targets,
-        tolerance,
-        notation.radians(angle, False),
-        corrections,
-        distance_ppm * 1e-6,
-        source.looks,
-        _approach(approach),
-    )
+    kept = _load_calibration(file, service)
     with source.open_source() as (look, _), service.open() as robot:
-        found = drive(robot, look, _printed(align(task), service), source.speed, source.wait)
-    if found.confirmed != kept.calibration.confirmed:
-        known = msgspec.structs.replace(kept.calibration, confirmed=found.confirmed)
-        calibration_file.write(file, kept.robot, known, kept.targets, kept.made)
+        known = _checked_calibration(kept, file, now := geometry_id(robot.info()))
+        task = AlignmentTask(
+            known,
+            kept.targets,
+            tolerance,
+            notation.radians(angle, False),
+            corrections,
+            distance_ppm * 1e-6,
+            source.looks,
+            _approach(approach),
+        )
+        result = drive(robot, look, _with_progress(align(task), service), source.speed, source.wait)
+    if result.confirmed != known.confirmed:
+        known = msgspec.structs.replace(known, confirmed=result.confirmed)
+        calibration_file.write(file, kept.robot, known, kept.targets, kept.made, now)
     if service.json:
-        terminal.json({"reached": found.reached} | msgspec.to_builtins(found))
+        terminal.json({"reached": result.reached} | msgspec.to_builtins(result))
     else:
-        alignment_lines.show_alignment(found)
-    return 0 if found.reached else 1
+        alignment_lines.show_alignment(result)
+    return 0 if result.reached else 1
 
 
 @app.command
@@ -175,16 +182,19 @@ def check(
     from trirail.alignment.calibration_diff import compare_views
     from trirail.alignment.procedure import AlignmentTask, measure_part, repeat_calibration
     from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_id
 
-    kept = _kept(file, service)
+    kept = _load_calibration(file, service)
     task = AlignmentTask(kept.calibration, kept.targets, distance=distance_ppm * 1e-6, looks=source.looks)
     with source.open_source() as (look, _), service.open() as robot:
+        _checked_calibration(kept, file, geometry_id(robot.info()))
         if moves:
             again = repeat_calibration(kept.calibration, source.looks)
-            now = drive(robot, look, _printed(again, service, len(kept.calibration.poses)), source.speed, source.wait)
+            progress = _with_progress(again, service, len(kept.calibration.poses))
+            now = drive(robot, look, progress, source.speed, source.wait)
             changes = compare_views(kept.calibration, now)
         else:
-            found = drive(robot, look, measure_part(task), source.speed, source.wait)
+            measurement = drive(robot, look, measure_part(task), source.speed, source.wait)
     if moves:
         if service.json:
             terminal.json({"views": [msgspec.to_builtins(each) | {"changed": each.is_changed} for each in changes]})
@@ -192,9 +202,9 @@ def check(
             alignment_lines.show_changes(changes)
         return 1 if any(each.is_changed for each in changes) else 0
     if service.json:
-        terminal.json(msgspec.to_builtins(found))
+        terminal.json(msgspec.to_builtins(measurement))
     else:
-        terminal.say(alignment_lines.measured(found))
+        terminal.print_line(alignment_lines.format_measurement(measurement))
     return 0
 
 
@@ -203,7 +213,7 @@ def _approach(way: tuple[float, float, str]) -> tuple[float, float, float] | Non
     return (x, y, phi) if any((x, y, phi)) else None
 
 
-def _kept(file: Path, service: Service) -> CalibrationFile:
+def _load_calibration(file: Path, service: Service) -> CalibrationFile:
     from trirail.client import calibration_file
 
     kept = calibration_file.read(file)
@@ -212,8 +222,19 @@ def _kept(file: Path, service: Service) -> CalibrationFile:
     return kept
 
 
-def _printed(
-    wishes: Generator[AlignmentRequest, Observation, T], service: Service, looks: int | None = None
+def _checked_calibration(kept: CalibrationFile, file: Path, geometry: str) -> CameraCalibration:
+    """Return the calibration; one that was made with another geometry is unconfirmed again, and said to be so."""
+    if kept.is_of_geometry(geometry):
+        return kept.calibration
+    terminal.print_error(
+        f"{file} was made with another geometry of the stage: calibrate again, or let an alignment confirm it; "
+        "its first correction is short until then"
+    )
+    return msgspec.structs.replace(kept.calibration, confirmed=False)
+
+
+def _with_progress(
+    requests: Generator[AlignmentRequest, Observation, T], service: Service, looks: int | None = None
 ) -> Generator[AlignmentRequest, Observation, T]:
     """Return what asks for the same, and tells a person of each look, where no program reads."""
-    return wishes if service.json else alignment_lines.printed(wishes, looks)
+    return requests if service.json else alignment_lines.print_looks(requests, looks)

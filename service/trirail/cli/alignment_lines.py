@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
+
+from trirail_drivers.interface import NAMES
 
 from trirail.cli import terminal
 
@@ -13,19 +15,22 @@ if TYPE_CHECKING:
     from trirail.alignment.alignment_request import LookReport
     from trirail.alignment.calibration_diff import ViewChange
     from trirail.alignment.camera_calibration import CameraCalibration
+    from trirail.alignment.geometry_calibration import GeometryCalibration
     from trirail.alignment.procedure import Alignment, AlignmentRequest, Measurement, Observation
     from trirail.analysis.summary import AlignmentSummary
 
 T = TypeVar("T")
 ARCSECONDS = 3600.0 * 180.0 / math.pi
-ENDED_WELL = ("reached", "calibrated", "checked")
+FRAME_DEVIATION = 1e-12
+"""Standard deviation below which a parameter is fixed by the choice of the frame [m, rad]; rounding leaves no zero."""
+SUCCESSFUL_ENDS = ("reached", "calibrated", "checked")
 
 
 def show_recorded(alignments: list[AlignmentSummary]) -> None:
     """Print each with what its marks had to go, look by look."""
     terminal.out.print("\nalignments")
     for each in alignments:
-        colour = "green" if each.end in ENDED_WELL else "yellow"
+        colour = "green" if each.end in SUCCESSFUL_ENDS else "yellow"
         made = f", {terminal.counted(each.corrections, 'correction')}" if each.purpose == "alignment" else ""
         looks = f"{terminal.counted(each.looks, 'look')}{made} in {each.seconds:.2f} s"
         who = terminal.plain(f"{each.id}  {each.purpose} of {each.user}")
@@ -40,11 +45,57 @@ def show_calibration(found: CameraCalibration, file: Path) -> None:
     """Print what a calibration has found, and where it is kept."""
     for name, view in found.views.items():
         mirrored = ", mirrored" if view.mirrored else ""
-        terminal.say(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
+        terminal.print_line(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
     for name, mark in found.marks.items():
         (x, y), (dx, dy) = mark.place, mark.deviation
-        terminal.say(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
-    terminal.say(f"residual {found.noise:.3f} pixel; kept in {file}")
+        terminal.print_line(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
+    terminal.print_line(f"residual {found.noise:.3f} pixel; kept in {file}")
+
+
+def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
+    """Print the corrections to a geometry, the undetermined ones, the outliers, and the residuals."""
+    shown = {name: _labelled(name, labels) for name in result.parameters}
+    for name, value in result.parameters.items():
+        unit = "ppm" if name.endswith("scale") else "µrad" if name.endswith("angle") else "µm"
+        deviation = result.deviations[name]
+        if name in result.undetermined:
+            known = "undetermined"
+        elif deviation < FRAME_DEVIATION:
+            known = "by the choice of the frame"
+        else:
+            known = f"± {deviation * 1e6:.1f}"
+        terminal.print_line(f"{shown[name]:<32}{value * 1e6:>+10.1f} {unit:<5} {known}")
+    if result.undetermined:
+        names = ", ".join(shown[name] for name in result.undetermined)
+        terminal.print_line(
+            f"Undetermined, alone or in combination: {names}. The combinations stay as configured. More marks, "
+            "a second camera or a larger field would determine more, unless two parameters have the same effect."
+        )
+    terminal.print_line(
+        "The frame is that of the configuration, with the least corrections of the legs. Lengths are those of the mean "
+        "of the three encoders, since pixels have no length of their own."
+    )
+    for each in result.outliers:
+        swapped = f", at the place of {each.swapped_with}" if each.swapped_with else ""
+        terminal.print_line(f"look {each.look}: {each.mark} is {each.distance:.1f} pixels off{swapped}; not used")
+    held = result.residual
+    if held.looks:
+        terminal.print_line(
+            f"{held.looks} looks held out of the fit: marks are off by {held.before_m * 1e6:.2f} µm ({held.before:.2f} "
+            f"pixels) with the configured geometry, {held.after_m * 1e6:.2f} µm ({held.after:.2f} pixels) with this one"
+        )
+        if held.after >= held.before:
+            terminal.print_line(
+                "This geometry predicts them no better than the configured one: take more looks, or more marks."
+            )
+    systematic = "; larger than the noise: no geometry explains the rest" if result.is_systematic else ""
+    terminal.print_line(f"residual {result.noise:.3f} pixel, pictures at rest {result.picture_noise:.3f}{systematic}")
+
+
+def _labelled(name: str, labels: Sequence[str]) -> str:
+    """Return a parameter's name with the label of its slider."""
+    leg, _, parameter = name.partition(" ")
+    return f"{labels[NAMES.index(leg)]} {parameter}"
 
 
 def show_changes(changes: Iterable[ViewChange]) -> None:
@@ -60,32 +111,32 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
         )
 
 
-def printed(
-    wishes: Generator[AlignmentRequest, Observation, T], looks: int | None
+def print_looks(
+    requests: Generator[AlignmentRequest, Observation, T], looks: int | None
 ) -> Generator[AlignmentRequest, Observation, T]:
     """Wish for the same, and print each look as it comes; `looks` is how many there will be, where that is known."""
     from trirail.alignment.alignment_request import LookReport
 
     number = 0
     try:
-        wish = next(wishes)
+        request = next(requests)
         while True:
-            if isinstance(wish, LookReport) and wish.observation is not None:
+            if isinstance(request, LookReport) and request.observation is not None:
                 number += 1
                 of = "" if looks is None else f" of {looks}"
-                terminal.say(f"look {number}{of}: {_what(wish, wish.observation)}")
-            wish = wishes.send((yield wish))
+                terminal.print_line(f"look {number}{of}: {_describe_look(request, request.observation)}")
+            request = requests.send((yield request))
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
 
 
-def _what(report: LookReport, seen: Observation) -> str:
+def _describe_look(report: LookReport, seen: Observation) -> str:
     if report.measurement is None:
         return ", ".join(f"{name} ({u:.2f}, {v:.2f})" for name, (u, v) in seen.marks.items()) or "no marks"
-    return measured(report.measurement) + ("; corrects it" if report.correction is not None else "")
+    return format_measurement(report.measurement) + ("; corrects it" if report.correction is not None else "")
 
 
-def measured(found: Measurement) -> str:
+def format_measurement(found: Measurement) -> str:
     """Return how a part lies, in a line."""
     x, y = found.shift
     return (
@@ -104,4 +155,4 @@ def show_alignment(found: Alignment) -> None:
         "farther apart",
     }
     made = terminal.counted(len(found.corrections), "correction")
-    terminal.say(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")
+    terminal.print_line(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")

@@ -74,20 +74,20 @@ def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Litera
     lines = Log(form)
     can = settings.can
     drives = f"drives on {can.interface} {can.channel}".strip() if can.interface != "simulated" else "simulated drives"
-    lines.say(f"starting robot {settings.robot.name}: {drives}, {settings.loop.rate_hz} Hz")
+    lines.log(f"starting robot {settings.robot.name}: {drives}, {settings.loop.rate_hz} Hz")
 
     starting = Starting(settings.zenoh.listen)
 
     def up(ready: dict[str, dict[str, Any]]) -> None:
         starting.up()
         if form == "json":
-            lines.say(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
+            lines.log(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
         else:
             with suppress(OSError, SystemExit):  # a full disk, or a reader that has gone, at which Rich would exit
                 terminal.up(settings, ready)
 
     try:
-        return Supervisor(settings, record, lines.say, lines.event).run(up)
+        return Supervisor(settings, record, lines.log, lines.event).run(up)
     finally:
         starting.up()
         lines.close()
@@ -134,14 +134,14 @@ def doctor(
         Print one JSON object instead of words, with the numbers.
     """
     from trirail.cli import probes, rail_drawing
-    from trirail.cli.doctor import whole
-    from trirail.cli.doctor_cycle import measured
+    from trirail.cli.doctor import run_checks
+    from trirail.cli.doctor_cycle import compute_held_rate
     from trirail.cli.machine import Machine
     from trirail.config import SIM, Config, everything
     from trirail.diagnosis import stops
 
     path = config or SIM
-    found = everything(path)
+    findings = everything(path)
     read: list[Machine] = []
 
     def machine(config: Config) -> Machine:
@@ -149,17 +149,17 @@ def doctor(
             read.append(probes.machine(config, quick=quick, progress=progress))
         return read[-1]
 
-    checks = whole(path, found, machine)
+    checks = run_checks(path, findings, machine)
     fit = all(check.verdict != "failure" for check in checks)
-    way = None if found.mistakes else stops(found.config)
+    stop_distances = None if findings.mistakes else stops(findings.config)
     if json:
-        cycles = [measured(each.cycles) for each in read if not isinstance(each.cycles, str)]
-        content = {"checks": checks, "stops": way, "cycle": cycles[0] if cycles else None}
+        cycles = [compute_held_rate(each.cycles) for each in read if not isinstance(each.cycles, str)]
+        content = {"checks": checks, "stops": stop_distances, "cycle": cycles[0] if cycles else None}
         terminal.json({"ok": fit, **msgspec.to_builtins(content)})
         return 0 if fit else 1
-    terminal.checks(checks)
-    if way is not None:
-        rail_drawing.show(way)
+    terminal.print_checks(checks)
+    if stop_distances is not None:
+        rail_drawing.show(stop_distances)
     return 0 if fit else 1
 
 
@@ -190,10 +190,10 @@ def view(
     """
     from trirail.cli import view as viewer
 
-    def say(content: dict[str, str], words: str) -> None:
+    def print_source(content: dict[str, str], words: str) -> None:
         robot_commands.show(services, content, words)
 
-    return viewer.run(file, services.robot, services.connect, services.tls, web=web, records=records, say=say)
+    return viewer.run(file, services.robot, services.connect, services.tls, web=web, records=records, say=print_source)
 
 
 app.command(router_command.router)
@@ -233,7 +233,7 @@ def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] 
     install
         Write it where the shell finds it, and load it from the shell's start file where that is needed.
     """
-    with help_pages.everything(app):
+    with help_pages.show_all(app):
         return script(app, shell, install=install)
 
 
@@ -247,7 +247,7 @@ def help_(*command: str) -> int:
         A command, or all.
     """
     if command == ("all",):
-        with help_pages.everything(app):
+        with help_pages.show_all(app):
             app("--help")
     else:
         app([*command, "--help"])
@@ -269,7 +269,7 @@ def _terminated(number: int, _frame: FrameType | None) -> None:
 def main() -> None:
     """Run a command and exit as it says."""
     words = sys.argv[1:]
-    warnings.showwarning = lambda message, *_, **__: terminal.complain(str(message))
+    warnings.showwarning = lambda message, *_, **__: terminal.print_error(str(message))
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:  # not where it is ignored, as under nohup
@@ -281,13 +281,13 @@ def main() -> None:
             result_action="return_value",
         )
     except CycloptsError as error:
-        terminal.complain(_wrong_usage(error, words))
+        terminal.print_error(_wrong_usage(error, words))
         code = 2
     except TrirailError as error:
         if "--json" in words:
-            terminal.failed(error)
+            terminal.print_error_json(error)
         else:
-            terminal.complain(str(error))
+            terminal.print_error(str(error))
         code = 1
     except KeyboardInterrupt:
         code = 130
@@ -301,19 +301,19 @@ def main() -> None:
 
 def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
     """Say what is wrong with a command line, of what, and where its usage is told."""
-    said = str(error).strip()
+    message = str(error).strip()
     behind = words[words.index("--") :] if "--" in words else []
     unknown = error.token.keyword if isinstance(error, UnknownOptionError) else None
     if unknown and any(word.split("=")[0] == unknown for word in behind):
-        said = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
-    elif isinstance(error, CoercionError) and error.msg and error.argument and not said.startswith("Invalid value"):
-        said = f"Invalid value for {error.argument.name.strip('-')}: {said}"
+        message = f"{unknown} stands behind --, where options are none; negative numbers need no -- before them"
+    elif isinstance(error, CoercionError) and error.msg and error.argument and not message.startswith("Invalid value"):
+        message = f"Invalid value for {error.argument.name.strip('-')}: {message}"
     elif isinstance(error, UnusedCliTokensError):
         more = " ".join(quoted(word.strip()) for word in error.unused_tokens or ())
-        said = f"{more} {'is' if ' ' not in more else 'are'} more than it takes"
+        message = f"{more} {'is' if ' ' not in more else 'are'} more than it takes"
         options = error.app.assemble_argument_collection() if error.app else ()
         if more.endswith(".toml") and any("--config" in option.names for option in options):
-            said += f": a configuration is --config {more.split()[-1]}"
+            message += f": a configuration is --config {more.split()[-1]}"
     by_command = type(error) is CycloptsError  # raised by the command itself, which is not told how it was called
     command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
-    return f"{said} ({command} --help tells the usage)"
+    return f"{message} ({command} --help tells the usage)"

@@ -38,8 +38,8 @@ def shipped(*, json: Json = False) -> int:
         return 0
     width = max(map(len, files))
     for name, purpose in files.items():
-        terminal.say(f"{name:{width}}  {purpose}")
-    terminal.say(f"in {_folder()}; one to start from: trirail config copy sim.toml my.toml")
+        terminal.print_line(f"{name:{width}}  {purpose}")
+    terminal.print_line(f"in {_folder()}; one to start from: trirail config copy sim.toml my.toml")
     return 0
 
 
@@ -59,8 +59,8 @@ def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
     if target.is_dir():
         target /= source.name
     try:
-        with target.open("xb") as file, source.open("rb") as given:
-            shutil.copyfileobj(given, file)
+        with target.open("xb") as file, source.open("rb") as original:
+            shutil.copyfileobj(original, file)
     except FileExistsError:
         raise ConfigError(f"{target} exists already: name another file") from None
     except OSError as error:
@@ -68,7 +68,7 @@ def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
     if json:
         terminal.json({"source": str(source), "file": str(target)})
     else:
-        terminal.say(f"{target}: a copy of the shipped {source.name}")
+        terminal.print_line(f"{target}: a copy of the shipped {source.name}")
     return 0
 
 
@@ -89,7 +89,7 @@ def show(config: ConfigFile = None, /, *, json: Json = False) -> int:
         terminal.json({"config": effective, "differences": different})
         return 0
     for line in toml_lines(effective, simulated, BASE):
-        terminal.say(line)
+        terminal.print_line(line)
     return 0
 
 

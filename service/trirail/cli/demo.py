@@ -20,7 +20,7 @@ from trirail.errors import ConfigError, RefusedError
 from trirail.processes.operating_system import Signals
 from trirail.wire.state import State
 
-GOAL_WITHIN = 15.0
+GOAL_TIMEOUT_S = 15.0
 
 
 class Stage(NamedTuple):
@@ -45,7 +45,7 @@ ALIGNMENT = (
     Stage("back to the centre", *CENTRE),
 )
 """For stages of millimetres."""
-SMALL = 0.02
+STAGE_RANGE_M = 0.02
 """The greatest |x| of a stage's table up to which it is one of millimetres [m]."""
 TOUR = (
     Stage("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
@@ -71,7 +71,7 @@ class _Row(NamedTuple):
 
 def tour(config: Config) -> tuple[Stage, ...]:
     """Return the goals for a robot: the paper's and a round, or those of alignment."""
-    return ALIGNMENT if max(map(abs, config.limits.platform.x)) <= SMALL else TOUR
+    return ALIGNMENT if max(map(abs, config.limits.platform.x)) <= STAGE_RANGE_M else TOUR
 
 
 def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
@@ -88,8 +88,8 @@ def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
     )
     with contextlib.ExitStack() as stack:
         with out.status("starting the service") as status:
-            said = lambda words: status.update(f"starting the service: {plain(words)}")  # noqa: E731
-            service = stack.enter_context(own_service.service(file, recording, said))
+            show_progress = lambda words: status.update(f"starting the service: {plain(words)}")  # noqa: E731
+            service = stack.enter_context(own_service.service(file, recording, show_progress))
         with Robot(config.robot.name, locator, user="demo") as robot:
             robot.enable()
             rows = list(_tour(robot, tour(config)))
@@ -130,9 +130,9 @@ def _tour(robot: Robot, stages: Sequence[Stage]) -> Iterator[_Row]:
                     x, y, phi = state.pose
                     pose = f"x {x * 1e3:8.3f} mm  y {y * 1e3:8.3f} mm  φ {math.degrees(phi):8.3f}°"
                     progress.update(task, description=stage.name, note=pose)
-                    if goal.result or time.monotonic() - began > GOAL_WITHIN:
+                    if goal.result or time.monotonic() - began > GOAL_TIMEOUT_S:
                         break
-                result = goal.result or Result(goal.id, "unknown", f"no end within {GOAL_WITHIN:g} s")
+                result = goal.result or Result(goal.id, "unknown", f"no end within {GOAL_TIMEOUT_S:g} s")
             progress.advance(task)
             seconds = time.monotonic() - began
             colour = "green" if result.outcome == "done" else "red"

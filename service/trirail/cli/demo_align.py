@@ -28,20 +28,20 @@ from trirail.client.client import Robot
 from trirail.client.stage_as_built import StageAsBuilt, built_otherwise
 from trirail.config import corrected_geometry, load
 
-PARTS = 5
-OFF, TURNED = 0.4e-3, math.radians(0.25)
+PART_COUNT = 5
+MAX_OFFSET_M, MAX_ROTATION = 0.4e-3, math.radians(0.25)
 """How far parts lie away at most [m, rad]."""
 DISC = MarkShape("disc", 160e-6)
-PLACES: dict[str, Pair] = {"left": (-0.05, 0.0), "right": (0.05, 0.0)}
+MARK_POSITIONS: dict[str, Pair] = {"left": (-0.05, 0.0), "right": (0.05, 0.0)}
 VIEWS = {
-    "left": CameraView(PLACES["left"], (480.0, 360.0), ((2.6e5, 1.2e4), (1.5e4, -2.6e5))),
-    "right": CameraView(PLACES["right"], (480.0, 360.0), ((-2.6e5, 2e4), (1e4, 2.6e5))),
+    "left": CameraView(MARK_POSITIONS["left"], (480.0, 360.0), ((2.6e5, 1.2e4), (1.5e4, -2.6e5))),
+    "right": CameraView(MARK_POSITIONS["right"], (480.0, 360.0), ((-2.6e5, 2e4), (1e4, 2.6e5))),
 }
-BY, TURN = 0.5e-3, math.radians(0.5)
+MOVE_M, MOVE_ANGLE = 0.5e-3, math.radians(0.5)
 """Moves of the calibration [m, rad]."""
 SIZE = 960, 720
 EXPOSURE, DELAY = 0.004, 0.01
-WAIT = 0.02
+WAIT_S = 0.02
 """How long the cameras need to show what is: exposure and delay, and the drives' settling [s]."""
 BUILT_OFF, BUILT_TURNED, PLAY = 50e-6, 0.1e-3, 0.5e-6
 """By how much the stage is built otherwise than configured, in each place [m] and angle [rad]; the drives' play [m]."""
@@ -52,12 +52,12 @@ class DrawnCameras:
     """Two simulated cameras over a part, whose pictures go to Rerun as they are taken."""
 
     def __init__(self, stage: StageAsBuilt, stream: rr.RecordingStream, seed: int) -> None:
-        self.part: Mapping[str, Pair] = PLACES
+        self.part: Mapping[str, Pair] = MARK_POSITIONS
         self.targets: Mapping[str, Pair] = {}
         self._stage, self._stream = stage, stream
         self._rng = np.random.default_rng(seed)
 
-    def take_pictures(self) -> dict[str, Pair]:
+    def capture(self) -> dict[str, Pair]:
         """Take a picture with each, find the disc in it, and show both."""
         marks: dict[str, Pair] = {}
         now = time.monotonic()
@@ -68,9 +68,9 @@ class DrawnCameras:
                 VIEWS[name], marks_there, *SIZE, noise=3.0, shade=0.4, exposure=EXPOSURE, delay=DELAY
             )
             picture = camera.picture(self._stage.pose_at, now, self._rng)
-            found = find(picture, MarkShape("disc", DISC.size * VIEWS[name].scale))
-            if found is not None:
-                marks[name] = (found.u, found.v)
+            disc = find(picture, MarkShape("disc", DISC.size * VIEWS[name].scale))
+            if disc is not None:
+                marks[name] = (disc.u, disc.v)
             self._show(name, picture, marks.get(name))
         return marks
 
@@ -87,7 +87,7 @@ class DrawnCameras:
         self._stream.log(f"{camera}/residual", arrows)
 
 
-def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
+def run(file: Path, recording: Path, parts: int = PART_COUNT, seed: int = 0) -> int:
     """Calibrate, then lay so many parts right; return 0 if each was. Pictures go to `recording` and the live view."""
     config = load(file)
     recording.parent.mkdir(parents=True, exist_ok=True)
@@ -114,33 +114,33 @@ def run(file: Path, recording: Path, parts: int = PARTS, seed: int = 0) -> int:
 def _layout() -> rrb.Blueprint:
     """Return both cameras side by side, beside them what is left of each part."""
     cameras = [rrb.Spatial2DView(origin=f"/cameras/{name}", name=name) for name in VIEWS]
-    told = rrb.Vertical(
+    plots = rrb.Vertical(
         rrb.TimeSeriesView(origin="/residual/worst_um", name="A mark has to go  [µm]"),
         rrb.TimeSeriesView(origin="/residual/turn_urad", name="The part has to turn  [µrad]"),
         rrb.TextLogView(origin="/alignments", name="Parts"),
     )
     return rrb.Blueprint(
-        rrb.Horizontal(*cameras, told, column_shares=[3, 3, 2]),
+        rrb.Horizontal(*cameras, plots, column_shares=[3, 3, 2]),
         rrb.TimePanel(state="collapsed", timeline="time", play_state="Following"),
         collapse_panels=True,
     )
 
 
 def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, parts: int, seed: int) -> list[Alignment]:
-    moves = [(BY, 0, 0), (-BY, 0, 0), (0, BY, 0), (0, -BY, 0), (0, 0, TURN), (0, 0, -TURN)]
+    moves = [(MOVE_M, 0, 0), (-MOVE_M, 0, 0), (0, MOVE_M, 0), (0, -MOVE_M, 0), (0, 0, MOVE_ANGLE), (0, 0, -MOVE_ANGLE)]
     robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
-    time.sleep(WAIT)
-    calibration = robot.calibrate_camera(cameras.take_pictures, moves, looks=4, wait=WAIT)
-    cameras.targets = cameras.take_pictures()
+    time.sleep(WAIT_S)
+    calibration = robot.calibrate_camera(cameras.capture, moves, looks=4, wait=WAIT_S)
+    cameras.targets = cameras.capture()
     out.print(f"calibrated in {counted(len(moves), 'move')}: residual {calibration.noise:.3f} pixel")
     rng, results = np.random.default_rng(seed), []
     for number in range(parts):
         robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
-        time.sleep(WAIT)
-        x, y = rng.uniform(-OFF, OFF, 2).tolist()
-        error = x, y, float(rng.uniform(-TURNED, TURNED))
+        time.sleep(WAIT_S)
+        x, y = rng.uniform(-MAX_OFFSET_M, MAX_OFFSET_M, 2).tolist()
+        error = x, y, float(rng.uniform(-MAX_ROTATION, MAX_ROTATION))
         cameras.part = _placed(error)
-        result = robot.align(cameras.take_pictures, cameras.targets, calibration, looks=4, wait=WAIT)
+        result = robot.align(cameras.capture, cameras.targets, calibration, looks=4, wait=WAIT_S)
         left = [f"{1e6 * each.worst:.2f}" for each in result.measurements]
         made = counted(len(result.corrections), "correction")
         line = f"part {number + 1}: {' → '.join(left)} µm, {made}: {result.why}"
@@ -155,5 +155,5 @@ def _parts(robot: Robot, cameras: DrawnCameras, stream: rr.RecordingStream, part
 
 
 def _placed(error: Triple) -> dict[str, Pair]:
-    lying = {name: to_base_frame(place, error).tolist() for name, place in PLACES.items()}
+    lying = {name: to_base_frame(place, error).tolist() for name, place in MARK_POSITIONS.items()}
     return {name: (x, y) for name, (x, y) in lying.items()}

@@ -12,8 +12,8 @@ from trirail_drivers.protocols import PROTOCOLS
 
 from trirail.cli import notation
 from trirail.cli.doctor_cycle import cycle
-from trirail.cli.key_folder import Issued
-from trirail.cli.machine import Gathered, Machine, Passed
+from trirail.cli.key_folder import IssuedCertificate
+from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import Config, Findings, as_built, overlap
 from trirail.diagnosis import Check, Verdict, diagnose, failed_checks
 from trirail.wire.endpoints import ReachableBy, endpoint_of, reach, tcp_address
@@ -26,23 +26,23 @@ def network(config: Config, machine: Machine) -> list[Check]:
         ReachableBy.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
         ReachableBy.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
     }
-    found = []
+    checks = []
     for endpoint in config.zenoh.listen:
         by = reach(endpoint)
         verdict: Verdict = "warning" if by is ReachableBy.NETWORK else "ok"
-        found.append(Check("network", verdict, f"{endpoint}: {by} can command", remedies.get(by, "")))
+        checks.append(Check("network", verdict, f"{endpoint}: {by} can command", remedies.get(by, "")))
     if config.zenoh.tls is None:
-        return found
-    found.extend(_connection_limits(config, machine))
+        return checks
+    checks.extend(_connection_limits(config, machine))
     if isinstance(machine.guard, str):
-        return [*found, Check("certificates", "failure", machine.guard)]
+        return [*checks, Check("certificates", "failure", machine.guard)]
     if machine.guard is not None:
         users = ", ".join(f"{user} {role}" for user, role in machine.guard.users.items())
-        found.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
+        checks.append(Check("users", "ok" if users else "warning", users or "none, so nobody can do anything"))
         warnings = machine.guard.certificate_warnings()
-        found += [Check("certificates", "warning", warning) for warning in warnings]
-        found += without_certificate(machine.guard.users, machine.issued)
-    return found
+        checks += [Check("certificates", "warning", warning) for warning in warnings]
+        checks += without_certificate(machine.guard.users, machine.issued)
+    return checks
 
 
 def _connection_limits(config: Config, machine: Machine) -> list[Check]:
@@ -57,15 +57,15 @@ def _connection_limits(config: Config, machine: Machine) -> list[Check]:
     return [Check("firewall", "ok", "limits the connections of one address")]
 
 
-def without_certificate(users: Mapping[str, Role], issued: Sequence[Issued] | None) -> list[Check]:
+def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertificate] | None) -> list[Check]:
     """Return the users with a role but no certificate, as far as the authority's folder is on this machine."""
     if issued is None:
         return []
     known = {each.name: each for each in issued}
-    found = []
+    checks = []
     for user, role in users.items():
         if user not in known:
-            found.append(
+            checks.append(
                 Check(
                     "certificates",
                     "warning",
@@ -74,8 +74,8 @@ def without_certificate(users: Mapping[str, Role], issued: Sequence[Issued] | No
                 )
             )
         elif trouble := known[user].trouble():
-            found.append(Check("certificates", "warning", f"{user} cannot connect: {trouble}"))
-    return found
+            checks.append(Check("certificates", "warning", f"{user} cannot connect: {trouble}"))
+    return checks
 
 
 def routers(found: Sequence[tuple[str, str]]) -> list[Check]:
@@ -105,7 +105,7 @@ def metrics(config: Config) -> list[Check]:
 
 RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
 """Clock sources that are read without leaving the processor, or its virtual machine."""
-COARSE = 1e-6
+MAX_CLOCK_RESOLUTION_S = 1e-6
 """A clock of a coarser resolution cannot wake anybody in time [s]."""
 PERFORMANCE = "performance"
 """The governor that keeps a processor at its full frequency: cpufreq of the kernel."""
@@ -118,7 +118,7 @@ READS: Final = (
 """Keys of a configuration on which the machine's checks depend."""
 
 
-def whole(path: Path, found: Findings, read: Callable[[Config], Machine]) -> list[Check]:
+def run_checks(path: Path, found: Findings, read: Callable[[Config], Machine]) -> list[Check]:
     """Return each mistake of a file, and every check that can do without what is impossible; `read` reads the machine.
 
     It is not called where what it needs to know is impossible.
@@ -130,8 +130,9 @@ def whole(path: Path, found: Findings, read: Callable[[Config], Machine]) -> lis
     else:
         checks += examine(found.config, read(found.config), wrong)
     if wrong:
-        said = "what depends on the above" + (", and the machine," if overlap(READS, wrong) else "")
-        checks.append(Check("the rest", "warning", f"{said} is looked at once that is right", "correct it, ask again"))
+        skipped = "what depends on the above" + (", and the machine," if overlap(READS, wrong) else "")
+        later = f"{skipped} is looked at once that is right"
+        checks.append(Check("the rest", "warning", later, "correct it, ask again"))
     return checks
 
 
@@ -145,7 +146,7 @@ def examine(config: Config, machine: Machine, impossible: Sequence[str] = ()) ->
         governor(machine.governors),
         isolation(machine.cpu, machine.isolated, simulated=simulated),
         *can_interface(config, machine),
-        *corrected(config),
+        *correction(config),
         *diagnose(config, impossible),
         *network(config, machine),
         *routers(machine.routers),
@@ -158,10 +159,10 @@ def kernel(machine: Machine, *, simulated: bool) -> Check:
     """PREEMPT_RT bounds how late a tick can be; simulated drives do not mind."""
     if machine.preempt_rt:
         return Check("kernel", "ok", f"{machine.release}, PREEMPT_RT")
-    found = f"{machine.release}, without PREEMPT_RT"
+    release = f"{machine.release}, without PREEMPT_RT"
     if simulated:
-        return Check("kernel", "ok", f"{found}: enough for simulated drives")
-    return Check("kernel", "warning", found, "for a bounded lateness boot one with it: Debian's linux-image-rt-amd64")
+        return Check("kernel", "ok", f"{release}: enough for simulated drives")
+    return Check("kernel", "warning", release, "for a bounded lateness boot one with it: Debian's linux-image-rt-amd64")
 
 
 def rights(lacking: tuple[str, ...], realtime: str) -> Check:
@@ -177,9 +178,9 @@ def rights(lacking: tuple[str, ...], realtime: str) -> Check:
 
 def clock(source: str | None, resolution: float) -> Check:
     """The clock that the ticks come from."""
-    if resolution > COARSE:
-        found = f"{source or 'unknown source'}, resolution {resolution * 1e3:g} ms"
-        return Check("clock", "failure", found, "boot a kernel with high-resolution timers (CONFIG_HIGH_RES_TIMERS)")
+    if resolution > MAX_CLOCK_RESOLUTION_S:
+        reading = f"{source or 'unknown source'}, resolution {resolution * 1e3:g} ms"
+        return Check("clock", "failure", reading, "boot a kernel with high-resolution timers (CONFIG_HIGH_RES_TIMERS)")
     if source is None:
         return Check("clock", "ok", f"resolution {resolution * 1e9:g} ns; the machine does not name its source")
     if source in RELIABLE_CLOCKS:
@@ -211,7 +212,7 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
     return Check("processor", "warning", f"{cpu}, shared; {elsewhere}", "" if isolated else remedy)
 
 
-def corrected(config: Config) -> list[Check]:
+def correction(config: Config) -> list[Check]:
     """Report the correction of as-built errors, if one is on."""
     section = config.correction
     words = as_built.summary(section.map, section.as_built, section.backlash)
@@ -226,11 +227,11 @@ def can_interface(config: Config, machine: Machine) -> list[Check]:
     if section.interface != "socketcan":
         if machine.adapter:
             return [Check("CAN", "failure", f"{section.interface} needs {machine.adapter}")]
-        found = f"{section.interface}, channel {section.channel or 'by default'}: its state cannot be read"
-        return [Check("CAN", "warning", found, "look at it with its maker's tools; SocketCAN tells its state")]
+        state = f"{section.interface}, channel {section.channel or 'by default'}: its state cannot be read"
+        return [Check("CAN", "warning", state, "look at it with its maker's tools; SocketCAN tells its state")]
     if not machine.af_can:
         return [Check("CAN", "failure", "this kernel has no SocketCAN", "modprobe can_raw")]
-    return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine), *_traffic(config, machine.passed)]
+    return [Check("CAN", "ok", "SocketCAN"), *_link(config, machine), *_traffic(config, machine.traffic)]
 
 
 def _link(config: Config, machine: Machine) -> list[Check]:
@@ -249,27 +250,27 @@ def _link(config: Config, machine: Machine) -> list[Check]:
     outputs = sum(bool(each.outputs) for each in config.drive_io)
     traffic = PROTOCOLS[config.drives.protocol].traffic.with_outputs(outputs)
     queue = _queue(name, link.get("txqlen"), traffic.most_sent)
-    return [_bitrate(name, bitrate, data, up), _state(name, data, up), queue, *_coalescing(name, machine.gathered, up)]
+    return [_bitrate(name, bitrate, data, up), _state(name, data, up), queue, *_coalescing(name, machine.coalescing, up)]
 
 
-def _traffic(config: Config, passed: Passed | None) -> list[Check]:
+def _traffic(config: Config, passed: BusTraffic | None) -> list[Check]:
     """Report the present traffic of all nodes on the bus; the service itself counts only its own drives' frames."""
     if passed is None:
         return []
     share = bits_of(passed.frames, passed.data) / passed.seconds / config.can.bitrate
     name = f"{config.can.channel} traffic"
-    found = f"{share:.1%} of {config.can.bitrate} bit/s, {passed.frames} frames in {passed.seconds:.1f} s, by whomever"
+    load = f"{share:.1%} of {config.can.bitrate} bit/s, {passed.frames} frames in {passed.seconds:.1f} s, by whomever"
     if share <= HIGH_LOAD:
-        return [Check(name, "ok", found)]
-    return [Check(name, "warning", found, f"look who sends: candump {config.can.channel}")]
+        return [Check(name, "ok", load)]
+    return [Check(name, "warning", load, f"look who sends: candump {config.can.channel}")]
 
 
 def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:
-    found = data.get("bittiming", {}).get("bitrate")
-    if found == bitrate:
+    actual = data.get("bittiming", {}).get("bitrate")
+    if actual == bitrate:
         return Check(f"{name} bitrate", "ok", f"{bitrate} bit/s")
     remedy = f"ip link set {name} down && {up}; the drives must have the same"
-    return Check(f"{name} bitrate", "failure", f"{found} bit/s; can.bitrate is {bitrate}", remedy)
+    return Check(f"{name} bitrate", "failure", f"{actual} bit/s; can.bitrate is {bitrate}", remedy)
 
 
 def _state(name: str, data: dict[str, Any], up: str) -> Check:
@@ -291,11 +292,11 @@ def _queue(name: str, length: int | None, most_sent: int) -> Check:
     wanted = 2 * most_sent
     if length is None or length >= wanted:
         return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
-    found = f"{length} frames; two cycles may come together and take {wanted}"
-    return Check(f"{name} queue", "warning", found, f"ip link set {name} txqueuelen 100")
+    size = f"{length} frames; two cycles may come together and take {wanted}"
+    return Check(f"{name} queue", "warning", size, f"ip link set {name} txqueuelen 100")
 
 
-def _coalescing(name: str, gathered: Gathered | None, up: str) -> list[Check]:
+def _coalescing(name: str, gathered: ReceiveCoalescing | None, up: str) -> list[Check]:
     """A position that waits for frames after it is late, and the last of a cycle may wait for the next cycle."""
     if gathered is None:
         return []

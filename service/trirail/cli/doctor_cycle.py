@@ -9,7 +9,7 @@ from trirail.diagnosis import Check
 from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
 from trirail.wire.state import Percentiles
 
-SHARE = 0.5
+MAX_PERIOD_SHARE = 0.5
 """Of a period, after which 999 of 1000 bare cycles are to be over: the rest is for the service's own arithmetic."""
 RATES = (100, 250, 500, 1000, 2000)
 """Rates that are looked at beside the configured one [Hz]."""
@@ -35,11 +35,11 @@ class HeldRate(Struct, frozen=True):
     """The highest rate that would be held; None where none is."""
 
 
-def measured(cycles: Cycles) -> HeldRate:
+def compute_held_rate(cycles: Cycles) -> HeldRate:
     """What is to be said of cycles."""
     over, rate = compute_percentiles(cycles.lateness + cycles.work), 1_000_000_000 // cycles.period
     missed = [int(each) for each in cycles.missed]
-    held = [each for each in {*RATES, rate} if over.p999 <= SHARE * 1e6 / each]
+    held = [each for each in {*RATES, rate} if over.p999 <= MAX_PERIOD_SHARE * 1e6 / each]
     return HeldRate(
         rate_hz=rate,
         cycles=len(missed),
@@ -59,29 +59,29 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
         if cycles:
             return Check("cycle", "warning", f"not measured: {cycles}", "end that service, ask again")
         return Check("cycle", "ok", "not measured: --quick")
-    found = measured(cycles)
-    period = 1e6 / found.rate_hz
-    said = (
-        f"{_frequency(found.rate_hz)}: cycle p99.9 {found.cycle_us.p999:.0f} µs, "
-        f"lateness p99.9 {found.lateness_us.p999:.0f} µs"
+    held = compute_held_rate(cycles)
+    period = 1e6 / held.rate_hz
+    summary = (
+        f"{_frequency(held.rate_hz)}: cycle p99.9 {held.cycle_us.p999:.0f} µs, "
+        f"lateness p99.9 {held.lateness_us.p999:.0f} µs"
     )
-    lost = f"{found.missed} of {found.cycles} ticks missed" if found.missed else ""
+    lost = f"{held.missed} of {held.cycles} ticks missed" if held.missed else ""
     remedy = "see the lines above; end other programs, or isolate a processor"
-    if found.up_to_hz is None or found.up_to_hz < found.rate_hz:
-        lower = "no rate is held" if found.up_to_hz is None else f"loop.rate_hz = {found.up_to_hz} would be held"
+    if held.up_to_hz is None or held.up_to_hz < held.rate_hz:
+        lower = "no rate is held" if held.up_to_hz is None else f"loop.rate_hz = {held.up_to_hz} would be held"
         remedy = f"{remedy}; {lower}"
-    if found.missed_in_a_row > config.watchdogs.max_overruns:
+    if held.missed_in_a_row > config.watchdogs.max_overruns:
         return Check(
-            "cycle", "failure", f"{said}: {lost}, {found.missed_in_a_row} in a row, the service would stop", remedy
+            "cycle", "failure", f"{summary}: {lost}, {held.missed_in_a_row} in a row, the service would stop", remedy
         )
-    if found.over_us.p999 > period:
-        return Check("cycle", "failure", f"{said}: the period of {period:.0f} µs is not held, {lost}", remedy)
-    if found.over_us.p999 > SHARE * period:
+    if held.over_us.p999 > period:
+        return Check("cycle", "failure", f"{summary}: the period of {period:.0f} µs is not held, {lost}", remedy)
+    if held.over_us.p999 > MAX_PERIOD_SHARE * period:
         left = f"little is left of the period of {period:.0f} µs for the service" + (f", {lost}" if lost else "")
-        return Check("cycle", "warning", f"{said}: {left}", remedy)
+        return Check("cycle", "warning", f"{summary}: {left}", remedy)
     if lost:
-        return Check("cycle", "warning", f"{said}: {lost}", remedy)
-    return Check("cycle", "ok", f"{said}: fine; up to {_frequency(found.up_to_hz or found.rate_hz)}")
+        return Check("cycle", "warning", f"{summary}: {lost}", remedy)
+    return Check("cycle", "ok", f"{summary}: fine; up to {_frequency(held.up_to_hz or held.rate_hz)}")
 
 
 def _frequency(hertz: int) -> str:

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from trirail.config import Config
 
 app = App(name="drives", help="Show the drives; save, compare, restore their parameters.")
-UNTRIED = "no make of drive was tried on hardware yet: go on with trirail commission, the hand on the emergency stop"
+UNTESTED_NOTE = (
+    "no make of drive was tried on hardware yet: go on with trirail commission, the hand on the emergency stop"
+)
 """What the examples of makes say in their first line, too."""
 Axis = Literal["A", "B", "C"]
-_MOST_NAMED: Final = 8
+_MAX_NAMED: Final = 8
 """Greatest number of objects named in one line; --json and the file have all."""
 
 
@@ -56,19 +58,19 @@ def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False
     with open_bus(settings.can, settings.drives) as bus:
         fastest = settings.limits.slider.fastest
         timing = settings.period, time.monotonic, fastest
-        found = inspect(bus, settings.drives, *timing, apply=apply, io=settings.drive_io)
-    fit = not any(each["refused"] for each in found)
+        reports = inspect(bus, settings.drives, *timing, apply=apply, io=settings.drive_io)
+    fit = not any(each["refused"] for each in reports)
     if json:
-        terminal.json({"ok": fit, "applied": apply, "drives": found})
+        terminal.json({"ok": fit, "applied": apply, "drives": reports})
     else:
-        for each in found:
+        for each in reports:
             for line in (
                 *drive_report.format_identity(each, settings.geometry.labels),
                 *drive_report.format_differences(each, applied=apply),
             ):
-                terminal.say(line)
+                terminal.print_line(line)
         if not is_simulated(settings.can):
-            terminal.say(UNTRIED)
+            terminal.print_line(UNTESTED_NOTE)
     return 0 if fit else 1
 
 
@@ -93,7 +95,7 @@ def save(
     """
     from trirail_drivers.cia402 import parameter_file
 
-    settings, protocol = _loaded(config)
+    settings, protocol = _load_config(config)
     paths: dict[str, Path] = {name: folder / f"drive-{name}.dcf" for name in sorted(set(drive))}
     for path in paths.values():
         if path.exists():
@@ -118,16 +120,17 @@ def save(
         terminal.json({"ok": not failed, "drives": files, "failed": failed})
         return 1 if failed else 0
     for name, saved in read.items():
-        terminal.say(f"drive {name}, node {saved.origin.node}: {len(saved.parameters)} parameters in {paths[name]}")
+        number = len(saved.parameters)
+        terminal.print_line(f"drive {name}, node {saved.origin.node}: {number} parameters in {paths[name]}")
         reasons: dict[str, list[str]] = {}
         for key, why in saved.unread.items():
             reasons.setdefault(why, []).append(_named(key))
         for why, objects in reasons.items():
-            terminal.say(f"  {len(objects)} could not be read: {_some(objects)}: {why}")
+            terminal.print_line(f"  {len(objects)} could not be read: {_abbreviate(objects)}: {why}")
         if getattr(settings.drives, name).eds is None:
-            terminal.say(f"  named by the built-in servo.eds: its maker's own objects need drives.{name}.eds")
+            terminal.print_line(f"  named by the built-in servo.eds: its maker's own objects need drives.{name}.eds")
     for words in failed.values():
-        terminal.complain(words)
+        terminal.print_error(words)
     return 1 if failed else 0
 
 
@@ -156,26 +159,32 @@ def compare(
     if other is not None:
         one, two, heading = parameter_file.read(file), parameter_file.read(other), str(other)
     else:
-        settings, protocol = _loaded(config)
-        name, one = _opened(file, drive, settings)
+        settings, protocol = _load_config(config)
+        name, one = _load_file(file, drive, settings)
         (end,) = _read(settings, protocol, [name]).values()
         if isinstance(end, DriveError):
             raise end
         two, heading = end, f"drive {name}"
-    found = parameter_file.compare(one, two)
+    differences = parameter_file.compare(one, two)
     if json:
         terminal.json(
-            {"ok": not found, "one": str(file), "other": heading, "differences": [_as_json(e) for e in found]}
+            {
+                "ok": not differences,
+                "one": str(file),
+                "other": heading,
+                "differences": [_as_json(each) for each in differences],
+            }
         )
-        return 1 if found else 0
+        return 1 if differences else 0
     for field in ("vendor", "product", "revision", "serial"):
         mine, theirs = getattr(one.origin, field), getattr(two.origin, field)
         if mine != theirs:
-            terminal.say(f"{field}: {parameter_file.format_number(mine)} and {parameter_file.format_number(theirs)}")
-    if found:
-        _table(str(file), heading, [(each, "") for each in found])
-    terminal.say(f"{len(found)} of {len(parameter_file.comparable(one, two))} parameters differ")
-    return 1 if found else 0
+            here, there = map(parameter_file.format_number, (mine, theirs))
+            terminal.print_line(f"{field}: {here} and {there}")
+    if differences:
+        _print_differences(str(file), heading, [(each, "") for each in differences])
+    terminal.print_line(f"{len(differences)} of {len(parameter_file.comparable(one, two))} parameters differ")
+    return 1 if differences else 0
 
 
 def restore(
@@ -207,22 +216,22 @@ def restore(
     """
     from trirail_drivers.connection.opening import open_bus
 
-    settings, protocol = _loaded(config)
-    name, saved = _opened(file, drive, settings)
+    settings, protocol = _load_config(config)
+    name, saved = _load_file(file, drive, settings)
     if protocol.restore is None:
-        raise _nothing(protocol)
+        raise _no_dictionary_error(protocol)
     with open_bus(settings.can, settings.drives) as bus:
         done = protocol.restore(bus, settings.drives, time.monotonic, name, saved, replace=replace, store=store)
     if json:
         left = [_as_json(each.different) | {"why": each.why, "meant": each.intended} for each in done.left]
         written = [_named(key) for key in done.written]
-        said = {"ok": done.ok, "drive": name, "written": written, "left": left, "stored": done.stored}
-        terminal.json(said | ({"not_stored": done.not_stored} if done.not_stored else {}))
+        summary = {"ok": done.ok, "drive": name, "written": written, "left": left, "stored": done.stored}
+        terminal.json(summary | ({"not_stored": done.not_stored} if done.not_stored else {}))
         return 0 if done.ok else 1
-    terminal.say(f"drive {name}: {len(done.written)} parameters written and read back")
-    _left(str(file), name, done.left)
+    terminal.print_line(f"drive {name}: {len(done.written)} parameters written and read back")
+    _print_unrestored(str(file), name, done.left)
     if store:
-        terminal.say(f"  not stored: {done.not_stored}" if done.not_stored else "  stored in the drive")
+        terminal.print_line(f"  not stored: {done.not_stored}" if done.not_stored else "  stored in the drive")
     return 0 if done.ok else 1
 
 
@@ -230,7 +239,7 @@ for command in (save, compare, restore):
     app.command(command)
 
 
-def _loaded(config: Path | None) -> tuple[Config, Protocol]:
+def _load_config(config: Path | None) -> tuple[Config, Protocol]:
     from trirail_drivers.protocols import PROTOCOLS
 
     from trirail.config import SIM, load
@@ -239,7 +248,7 @@ def _loaded(config: Path | None) -> tuple[Config, Protocol]:
     return settings, PROTOCOLS[settings.drives.protocol]
 
 
-def _opened(file: Path, drive: Axis | None, settings: Config) -> tuple[str, SavedParameters]:
+def _load_file(file: Path, drive: Axis | None, settings: Config) -> tuple[str, SavedParameters]:
     """Return what a file has, and the drive that is meant: by name, or by the node id of the file."""
     from trirail_drivers.cia402 import parameter_file
 
@@ -261,28 +270,28 @@ def _read(settings: Config, protocol: Protocol, names: Sequence[str]) -> dict[st
     from trirail_drivers.connection.opening import open_bus
 
     if protocol.save is None:
-        raise _nothing(protocol)
+        raise _no_dictionary_error(protocol)
     with open_bus(settings.can, settings.drives) as bus:
         return protocol.save(bus, settings.drives, time.monotonic, names)
 
 
-def _nothing(protocol: Protocol) -> DriveError:
+def _no_dictionary_error(protocol: Protocol) -> DriveError:
     return DriveError(
         f"drives of protocol {protocol.name} have no object dictionary to be saved: use their maker's tool"
     )
 
 
-def _left(file: str, name: str, left: Iterable[UnrestoredParameter]) -> None:
+def _print_unrestored(file: str, name: str, left: Iterable[UnrestoredParameter]) -> None:
     intended = [_named(each.different.key) for each in left if each.intended]
     if intended:
         kinds = "the set-up's, node id, bitrate or no parameter"
-        terminal.say(f"  {len(intended)} left as they are, {kinds}: {_some(intended)}")
+        terminal.print_line(f"  {len(intended)} left as they are, {kinds}: {_abbreviate(intended)}")
     if others := [(each.different, each.why) for each in left if not each.intended]:
-        terminal.say(f"  {len(others)} differ still:")
-        _table(file, f"drive {name}", others)
+        terminal.print_line(f"  {len(others)} differ still:")
+        _print_differences(file, f"drive {name}", others)
 
 
-def _table(one: str, other: str, rows: Iterable[tuple[ParameterDifference, str]]) -> None:
+def _print_differences(one: str, other: str, rows: Iterable[tuple[ParameterDifference, str]]) -> None:
     table = terminal.table("object", "", one, other, "")
     for each, why in rows:
         values = (_value(each.one), _value(each.other))
@@ -299,9 +308,9 @@ def _value(held: Held | None) -> str:
     return "–" if held is None else str(held.value)
 
 
-def _some(objects: Sequence[str]) -> str:
-    more = len(objects) - _MOST_NAMED
-    return ", ".join(objects[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+def _abbreviate(objects: Sequence[str]) -> str:
+    more = len(objects) - _MAX_NAMED
+    return ", ".join(objects[:_MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _named(key: tuple[int, int]) -> str:

@@ -19,9 +19,9 @@ from trirail.wire.text import wall_clock
 if TYPE_CHECKING:
     from trirail.client.fleet import Fleet, Member
 
-LOOK = 2.5
+SNAPSHOT_S = 2.5
 """How long it is listened before what was heard is printed with --json [s]: each robot says something once a second."""
-REFRESH = 0.5
+REFRESH_S = 0.5
 """How often the table is drawn [s]."""
 
 
@@ -36,41 +36,41 @@ def fleet(*, service: Service = HERE) -> int:
 
     with Fleet(service.connect, service.robot, service.tls) as seen:
         if service.json:
-            never.wait(LOOK)
+            never.wait(SNAPSHOT_S)
             now = time.monotonic()
-            terminal.json({"robots": [_described(member, now) for member in seen.members()]})
+            terminal.json({"robots": [_as_json(member, now) for member in seen.members()]})
             return 0
         with contextlib.suppress(KeyboardInterrupt):
             if not terminal.out.is_terminal:
-                _say_changes(seen, never)
+                _print_changes(seen, never)
             with Live(console=terminal.out, auto_refresh=False) as live:
-                while not never.wait(REFRESH):
+                while not never.wait(REFRESH_S):
                     live.update(table(seen.members(), time.monotonic()), refresh=True)
     return 0
 
 
-def _say_changes(seen: Fleet, never: threading.Event) -> None:
+def _print_changes(seen: Fleet, never: threading.Event) -> None:
     """Print a line for each robot, and again whenever that has changed."""
-    said: dict[str, str] = {}
-    while not never.wait(REFRESH):
+    printed: dict[str, str] = {}
+    while not never.wait(REFRESH_S):
         for member in seen.members():
             line = _line(member, time.monotonic())
-            if said.get(member.robot) != line:
-                said[member.robot] = line
-                terminal.say(f"{wall_clock(time.time())}  {line}")
+            if printed.get(member.robot) != line:
+                printed[member.robot] = line
+                terminal.print_line(f"{wall_clock(time.time())}  {line}")
 
 
 def _line(member: Member, now: float) -> str:
     from trirail.client.fleet import Attention
 
-    said, need = member.summary, member.need(now)
+    summary, need = member.summary, member.need(now)
     if need is Attention.SILENT:
         return f"{member.robot}  silent"
-    words = (member.robot, said.mode, said.fault or "", f"goal {said.goal}" if said.goal else "")
+    words = (member.robot, summary.mode, summary.fault or "", f"goal {summary.goal}" if summary.goal else "")
     return "  ".join(filter(None, words))
 
 
-def _described(member: Member, now: float) -> dict[str, object]:
+def _as_json(member: Member, now: float) -> dict[str, object]:
     fields = msgspec.to_builtins(member.summary)
     return {"robot": member.robot, "need": member.need(now).name.lower(), **fields, "age": round(member.age(now), 2)}
 
@@ -81,21 +81,21 @@ def table(members: Sequence[Member], now: float) -> Table:
 
     drawn = Table("robot", "mode", "needs", "goal", "lateness p99.9", "missed", "version", box=None, pad_edge=False)
     for member in members:
-        said, need = member.summary, member.need(now)
+        summary, need = member.summary, member.need(now)
         needs = {
             Attention.SILENT: f"[bold red]silent for {member.age(now):.0f} s[/]",
-            Attention.FAULT: f"[bold red]{terminal.plain(said.fault or 'reset')}[/]",
+            Attention.FAULT: f"[bold red]{terminal.plain(summary.fault or 'reset')}[/]",
             Attention.NOTHING: "",
         }[need]
-        mode = f"[{terminal.COLOURS.get(said.mode, 'white')}]{terminal.plain(said.mode)}[/]"
+        mode = f"[{terminal.COLOURS.get(summary.mode, 'white')}]{terminal.plain(summary.mode)}[/]"
         drawn.add_row(
             terminal.plain(member.robot),
             "[dim]unknown[/]" if need is Attention.SILENT else mode,
             needs,
-            terminal.plain(said.goal or ""),
-            f"{said.lateness:.0f} µs",
-            str(said.missed),
-            terminal.plain(said.version),
+            terminal.plain(summary.goal or ""),
+            f"{summary.lateness:.0f} µs",
+            str(summary.missed),
+            terminal.plain(summary.version),
         )
     needy = sum(member.need(now) is not Attention.NOTHING for member in members)
     drawn.caption = f"{terminal.counted(len(members), 'robot')}, {needy} need{'s' if needy == 1 else ''} somebody"

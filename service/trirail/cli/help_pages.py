@@ -68,6 +68,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail align calibrate camera.json --program ./marks",
             "trirail align run camera.json --camera left=0 --camera right=1 --shape disc --size 80",
             "trirail align check camera.json --pictures shots --json",
+            "trirail align geometry robot.toml --field 4096 3000 --program ./marks --looks 4",
         ),
         "pause": ("trirail pause",),
         "resume": ("trirail resume",),
@@ -116,7 +117,7 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
     },
 }
 """The commands by group, with lines that can be typed."""
-SELDOM: Final = (
+ADVANCED_COMMANDS: Final = (
     *("keys", "router", "completion", "acquire", "release", "goal", "fleet", "replay"),
     *GROUPS["Mathematics"],
 )
@@ -130,7 +131,7 @@ def arrange(app: App) -> None:
         group = Group.create_ordered(name)
         for position, (command, examples) in enumerate(commands.items()):
             page = app[command]
-            page.group, page.sort_key, page.show = (group,), position, command not in SELDOM
+            page.group, page.sort_key, page.show = (group,), position, command not in ADVANCED_COMMANDS
             page.help_epilogue = "```\n" + "\n".join(examples) + "\n```"
     _arrange_others(app)
     app["help"].show = False
@@ -146,14 +147,14 @@ def _arrange_others(app: App) -> None:
 
 
 @contextmanager
-def everything(app: App) -> Iterator[None]:
+def show_all(app: App) -> Iterator[None]:
     """Have the page of all commands show every one, while the context lasts."""
-    for command in SELDOM:
+    for command in ADVANCED_COMMANDS:
         app[command].show = True
     app.help_epilogue = None
     try:
         yield
     finally:
-        for command in SELDOM:
+        for command in ADVANCED_COMMANDS:
             app[command].show = False
         app.help_epilogue = MORE

@@ -31,7 +31,7 @@ USERS = "users"
 PRIVATE, PUBLIC = 0o600, 0o644
 
 
-class Issued(NamedTuple):
+class IssuedCertificate(NamedTuple):
     """A certificate that the authority has made, or a folder in which there is none."""
 
     name: str
@@ -62,7 +62,7 @@ class KeyFolder:
         if self.folder.exists():
             raise ServiceError(f"{self.folder} exists already: name another folder, or renew what is in it")
         by = authority(robot)
-        with _made_whole(self.folder) as made:
+        with _atomic_folder(self.folder) as made:
             _write(made / AUTHORITY, by.certificate, PUBLIC)
             _write(made / AUTHORITY_KEY, by.key, PRIVATE)
             _write_pair(made, issue(by, robot, days, addresses, serves=True))
@@ -81,12 +81,12 @@ class KeyFolder:
         if folder.exists():
             raise ServiceError(f"{folder} exists already: trirail keys renew {user} makes it good for longer")
         by = self._authority()
-        with _made_whole(folder) as made:
+        with _atomic_folder(folder) as made:
             _write(made / AUTHORITY, by.certificate, PUBLIC)
             _write_pair(made, issue(by, user, days, addresses, serves=bool(addresses)))
         return Credentials.read(folder)
 
-    def renew(self, name: str, days: float) -> Issued:
+    def renew(self, name: str, days: float) -> IssuedCertificate:
         """Make a new certificate for the key of a user, or of the robot."""
         there = self._find(name)
         file = there.folder / CERTIFICATE
@@ -104,22 +104,22 @@ class KeyFolder:
             raise ServiceError(f"{user} is the robot itself: a new authority makes its certificate worthless")
         names = sorted({*revoked(self.folder), user})
         _write(self.folder / REVOKED, "".join(f"{name}\n" for name in names).encode(), PUBLIC)
-        with _said():
+        with _as_service_error():
             rmtree(there.folder)
 
-    def issued(self) -> list[Issued]:
+    def issued(self) -> list[IssuedCertificate]:
         """Return what has been issued and not been revoked: the robot's first, then those of users, by name."""
         folder = self.folder / USERS
         users = sorted(each for each in folder.iterdir() if each.name[0] != ".") if folder.exists() else []
         return [self._robot(), *(_issued(each, is_robot=False) for each in users)]
 
-    def _find(self, name: str) -> Issued:
+    def _find(self, name: str) -> IssuedCertificate:
         found = [each for each in self.issued() if each.name == name]
         if not found:
             raise ServiceError(f"{self.folder}: nobody is called {name}; trirail keys list shows who there is")
         return found[0]
 
-    def _robot(self) -> Issued:
+    def _robot(self) -> IssuedCertificate:
         return _issued(self.folder, is_robot=True)
 
     def _authority(self) -> Pair:
@@ -128,15 +128,17 @@ class KeyFolder:
         return pair
 
 
-def _issued(folder: Path, *, is_robot: bool) -> Issued:
+def _issued(folder: Path, *, is_robot: bool) -> IssuedCertificate:
     file = folder / CERTIFICATE
     if not is_robot and not file.exists():
-        return Issued(folder.name, False, False, None, folder)
+        return IssuedCertificate(folder.name, False, False, None, folder)
     try:
         certificate = x509.load_pem_x509_certificate(_read(file))
     except ValueError as error:
         raise ServiceError(f"{file}: not a certificate as PEM") from error
-    return Issued(common_name(certificate), is_robot, serves(certificate), certificate.not_valid_after_utc, folder)
+    return IssuedCertificate(
+        common_name(certificate), is_robot, serves(certificate), certificate.not_valid_after_utc, folder
+    )
 
 
 def _write_pair(folder: Path, pair: Pair) -> None:
@@ -145,9 +147,9 @@ def _write_pair(folder: Path, pair: Pair) -> None:
 
 
 @contextmanager
-def _made_whole(folder: Path) -> Iterator[Path]:
+def _atomic_folder(folder: Path) -> Iterator[Path]:
     """Give a folder to write to, that nobody else can open; it gets its name when the context ends without an error."""
-    with _said():
+    with _as_service_error():
         folder.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
         try:
@@ -159,17 +161,17 @@ def _made_whole(folder: Path) -> Iterator[Path]:
 
 
 def _write(file: Path, content: bytes, mode: int) -> None:
-    with _said():
+    with _as_service_error():
         files.replace(file, content, mode)
 
 
 def _read(file: Path) -> bytes:
-    with _said():
+    with _as_service_error():
         return file.read_bytes()
 
 
 @contextmanager
-def _said() -> Iterator[None]:
+def _as_service_error() -> Iterator[None]:
     """Say what the system says of a file in one line."""
     try:
         yield

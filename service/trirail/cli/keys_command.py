@@ -32,7 +32,7 @@ Addresses = Annotated[
 HERE = Path("keys")
 LOCAL = ("localhost", "127.0.0.1", "::1")
 """Addresses that every robot's certificate has: those of its own machine."""
-LONGEST = 3650.0
+MAX_DAYS = 3650.0
 """For how many days a certificate is made at most: the authority itself is good for no longer."""
 
 
@@ -45,8 +45,8 @@ def _check_hosts(addresses: tuple[str, ...]) -> None:
 
 
 def _check_days(days: float) -> None:
-    if not 0.0 < days <= LONGEST:
-        raise ValueError(f"above 0, at most {LONGEST:g}")
+    if not 0.0 < days <= MAX_DAYS:
+        raise ValueError(f"above 0, at most {MAX_DAYS:g}")
 
 
 @app.command
@@ -79,11 +79,11 @@ def init(
     if json:
         terminal.json({"folder": str(folder), "robot": robot, "addresses": addresses, "expires": made.expires})
         return 0
-    terminal.say(f"{folder}: an authority, and the certificate of {robot} at {', '.join(addresses)}")
-    terminal.say(f"good until {made.expires:%Y-%m-%d}; keep ca-key.pem where only you can read it")
-    terminal.say("in the robot's configuration:")
+    terminal.print_line(f"{folder}: an authority, and the certificate of {robot} at {', '.join(addresses)}")
+    terminal.print_line(f"good until {made.expires:%Y-%m-%d}; keep ca-key.pem where only you can read it")
+    terminal.print_line("in the robot's configuration:")
     for line in ("[zenoh]", 'listen = ["tls/0.0.0.0:7447"]', "[zenoh.tls]", f'directory = "{folder}"'):
-        terminal.say(f"    {line}")
+        terminal.print_line(f"    {line}")
     return 0
 
 
@@ -115,11 +115,11 @@ def add(
     if json:
         terminal.json({"user": user, "role": role, "folder": str(made.folder), "expires": made.expires})
         return 0
-    terminal.say(f"{made.folder}: {user}'s certificate, good until {made.expires:%Y-%m-%d}")
-    terminal.say("give it to nobody else; on the user's machine it belongs in ~/.config/trirail/<robot>/")
-    terminal.say("in the robot's configuration, then start the service again while the robot stands:")
+    terminal.print_line(f"{made.folder}: {user}'s certificate, good until {made.expires:%Y-%m-%d}")
+    terminal.print_line("give it to nobody else; on the user's machine it belongs in ~/.config/trirail/<robot>/")
+    terminal.print_line("in the robot's configuration, then start the service again while the robot stands:")
     for line in ("[zenoh.users]", f'{user} = "{role}"'):
-        terminal.say(f"    {line}")
+        terminal.print_line(f"    {line}")
     return 0
 
 
@@ -151,8 +151,9 @@ def further(
     if json:
         terminal.json({"robot": name, "folder": str(made.folder), "addresses": addresses, "expires": made.expires})
         return 0
-    terminal.say(f"{made.folder}: the certificate of {name} at {', '.join(addresses)}, until {made.expires:%Y-%m-%d}")
-    terminal.say("give it to that robot's machine alone, and name it there: [zenoh.tls] directory")
+    until = f"{made.expires:%Y-%m-%d}"
+    terminal.print_line(f"{made.folder}: the certificate of {name} at {', '.join(addresses)}, until {until}")
+    terminal.print_line("give it to that robot's machine alone, and name it there: [zenoh.tls] directory")
     return 0
 
 
@@ -204,7 +205,7 @@ def renew(name: str, /, *, days: Days = 365.0, folder: AuthorityFolder = HERE, j
         terminal.json({"name": name, "folder": str(made.folder), "expires": made.expires})
         return 0
     then = "start the service again while the robot stands" if made.is_robot else "give its cert.pem to the user"
-    terminal.say(f"{made.folder}: good until {made.expires:%Y-%m-%d}; {then}")
+    terminal.print_line(f"{made.folder}: good until {made.expires:%Y-%m-%d}; {then}")
     return 0
 
 
@@ -225,8 +226,8 @@ def revoke(user: str, /, *, folder: Folder = HERE, json: Json = False) -> int:
     if json:
         terminal.json({"user": user, "revoked": True})
         return 0
-    terminal.say(f"{user} has no role any more wherever this {folder / 'revoked.txt'} is read")
-    terminal.say(
+    terminal.print_line(f"{user} has no role any more wherever this {folder / 'revoked.txt'} is read")
+    terminal.print_line(
         "copy it to the folder of [zenoh.tls] of every robot and router of this authority, and start them again"
     )
     return 0

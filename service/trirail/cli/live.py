@@ -15,7 +15,7 @@ from trirail_drivers.interface import MissingProtection
 
 from trirail import naming
 from trirail.cli import notation
-from trirail.cli.terminal import COLOURS, SILENT, json, left, out, percentiles, plain, say
+from trirail.cli.terminal import COLOURS, SERVICE_TIMEOUT_S, json, left, out, percentiles, plain, print_line
 from trirail.errors import ServiceError
 from trirail.naming import Labels
 from trirail.wire.decoding import converted
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from trirail.client.client import Jog, Robot
     from trirail.config import Limits
 
-NEAR = 0.05
+NEAR_SHARE = 0.05
 """A position is near a limit in the last such share of its range, a rate in that below its limit."""
 _ALONG = (("x", "mm", "mm/s", 3), ("y", "mm", "mm/s", 3), ("φ", "°", "°/s", 4))
 
@@ -46,34 +46,34 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
     limits = limits_of(info)
     with contextlib.suppress(KeyboardInterrupt):
         if json_lines:
-            for state in robot.states(SILENT):
+            for state in robot.states(SERVICE_TIMEOUT_S):
                 json(msgspec.to_builtins(state))
         elif not out.is_terminal:
-            _say_once_a_second(robot)
+            _print_once_a_second(robot)
         else:
             with Live(console=out, refresh_per_second=10, transient=False) as live:
-                for state in robot.states(SILENT):
+                for state in robot.states(SERVICE_TIMEOUT_S):
                     live.update(table(state, robot.name, info.labels, limits))
         raise ServiceError("the service has gone silent")
 
 
-def _say_once_a_second(robot: Robot) -> None:
+def _print_once_a_second(robot: Robot) -> None:
     """Print a line of the state once a second, for a file or pipe, in which nothing can be drawn anew."""
     due = -math.inf
-    for state in robot.states(SILENT):
+    for state in robot.states(SERVICE_TIMEOUT_S):
         if time.monotonic() >= due:
             due = time.monotonic() + 1.0
             goal = f"  goal {state.goal.id} {state.goal.progress:.0%}" if state.goal else ""
             faults = "".join(f"  {fault}" for fault in state.faults)
-            say(f"{state.t:.2f} s  {state.mode}  {notation.pose(state.pose)}{goal}{faults}")
+            print_line(f"{state.t:.2f} s  {state.mode}  {notation.pose(state.pose)}{goal}{faults}")
 
 
-def jogging(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
+def show_jog(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
     """Show where a jog leads, until it ends or its time is over."""
     labels = robot.info().labels
     ends = math.inf if seconds is None else time.monotonic() + seconds
     with Live(console=out, refresh_per_second=10, transient=True) as live:
-        for state in robot.states(SILENT):
+        for state in robot.states(SERVICE_TIMEOUT_S):
             if show:
                 live.update(table(state, robot.name, labels))
             if time.monotonic() >= ends or jog.error is not None or jog.result is not None:
@@ -140,12 +140,12 @@ def near_limits(state: State, limits: Limits, labels: Labels) -> Iterator[str]:
 def _position(name: str, at: float, ends: Sequence[float], unit: str, digits: int) -> Iterator[str]:
     low, high = ends
     limit = low if at - low < high - at else high
-    if abs(limit - at) <= NEAR * (high - low) or not low <= at <= high:
+    if abs(limit - at) <= NEAR_SHARE * (high - low) or not low <= at <= high:
         yield f"{name} {notation.written(at, unit, digits)}, limit {notation.written(limit, unit, digits)}"
 
 
 def _rate(name: str, at: float, most: float, unit: str, digits: int) -> Iterator[str]:
-    if abs(at) >= (1.0 - NEAR) * most:
+    if abs(at) >= (1.0 - NEAR_SHARE) * most:
         limit = math.copysign(most, at)
         yield f"{name} {notation.written(at, unit, digits)}, limit {notation.written(limit, unit, digits)}"
 

@@ -6,12 +6,12 @@ from typing import Any
 
 from msgspec import Struct
 
-from trirail.cli.key_folder import Issued
+from trirail.cli.key_folder import IssuedCertificate
 from trirail.diagnosis.bare_loop import Cycles
 from trirail.processes.session_guard import Guard
 
 
-class Passed(Struct, frozen=True):
+class BusTraffic(Struct, frozen=True):
     """What the kernel counted on a network interface."""
 
     seconds: float
@@ -22,7 +22,7 @@ class Passed(Struct, frozen=True):
     """Bytes in them."""
 
 
-class Gathered(Struct, frozen=True):
+class ReceiveCoalescing(Struct, frozen=True):
     """After how many frames, or how long, a network interface hands over what it has received: ethtool -c."""
 
     frames: int
@@ -51,9 +51,9 @@ class Machine(Struct, frozen=True):
     """The CAN interface as `ip -details -json link` has it."""
     cycles: Cycles | str
     """What cycles took that only exchange the frames, or why none were measured; "" where nobody asked for it."""
-    passed: Passed | None = None
+    traffic: BusTraffic | None = None
     """What passed on the CAN interface meanwhile."""
-    gathered: Gathered | None = None
+    coalescing: ReceiveCoalescing | None = None
     """How the CAN interface hands frames over; None where its driver does not say."""
     adapter: str = ""
     """What python-can's interface would lack, with the remedy; "" for nothing."""
@@ -61,7 +61,7 @@ class Machine(Struct, frozen=True):
     """Who may do what over the network, or why its certificates cannot be used."""
     routers: tuple[tuple[str, str], ...] = ()
     """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
-    issued: tuple[Issued, ...] | None = None
+    issued: tuple[IssuedCertificate, ...] | None = None
     """The certificates of the authority whose folder is that of [zenoh.tls]; None where it is elsewhere."""
     limited_ports: tuple[int, ...] | None = None
     """Ports at which the firewall limits the connections of one address; None where it cannot be read."""

@@ -19,6 +19,7 @@ import msgspec
 from cyclopts import Parameter
 from trirail_drivers.errors import TrirailError
 
+from trirail.alignment.code_family import CodeFamily
 from trirail.cli import notation
 from trirail.wire.decoding import decoded, prepare
 
@@ -30,12 +31,12 @@ Look = Callable[[], "Marks"]
 LINE = dict[str, tuple[float, float]]
 prepare(LINE)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
-NEWER_WITHIN, WRITTEN_WITHIN, POLL = 30.0, 1.0, 0.02
+PICTURE_TIMEOUT_S, WRITE_TIMEOUT_S, POLL_S = 30.0, 1.0, 0.02
 """How long a line or newer pictures are waited for, how long one may take to be written, how often it is looked [s]."""
-ENDS_WITHIN = 5.0
+EXIT_TIMEOUT_S = 5.0
 """How long a program may take to end when it is told to [s]."""
 INSTALL = "pip install 'trirail[vision]'"
-AT_ONCE, MOST_KEPT = 0.002, 16
+BUFFERED_S, MAX_BUFFERED = 0.002, 16
 """A picture that comes sooner was waiting [s]; so many may wait."""
 
 
@@ -75,15 +76,17 @@ def program(command: str) -> Iterator[Source]:
     except (OSError, ValueError) as error:
         raise TrirailError(f"cannot run {command!r}: {error}; it is to print one line of JSON for each look") from error
 
-    def look() -> Marks:
+    def find_marks() -> Marks:
         with contextlib.suppress(BrokenPipeError):  # it has ended, and may have said something before
             stdin.write("look\n")
             stdin.flush()
-        if not select.select([stdout], [], [], NEWER_WITHIN)[0]:
-            raise TrirailError(f"{command!r} has printed no line in {NEWER_WITHIN:g} s: does it flush what it prints?")
+        if not select.select([stdout], [], [], PICTURE_TIMEOUT_S)[0]:
+            raise TrirailError(
+                f"{command!r} has printed no line in {PICTURE_TIMEOUT_S:g} s: does it flush what it prints?"
+            )
         line = stdout.readline()
         if not line:
-            code = process.wait(ENDS_WITHIN)
+            code = process.wait(EXIT_TIMEOUT_S)
             raise TrirailError(f"{command!r} has ended with exit code {code}: it is to print a line for each it reads")
         try:
             marks: Marks = decoded(line, LINE)
@@ -93,11 +96,11 @@ def program(command: str) -> Iterator[Source]:
         return marks
 
     try:
-        yield Source(look)
+        yield Source(find_marks)
     finally:
         process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(ENDS_WITHIN)
+            process.wait(EXIT_TIMEOUT_S)
         process.kill()
         process.wait()
         for pipe in (stdin, stdout):
@@ -107,13 +110,18 @@ def program(command: str) -> Iterator[Source]:
 
 @contextlib.contextmanager
 def folder(
-    path: Path, shape: MarkShape, turn: float, windows: Mapping[str, MarkWindow] = NO_WINDOWS
+    path: Path,
+    shape: MarkShape,
+    turn: float,
+    windows: Mapping[str, MarkWindow] = NO_WINDOWS,
+    family: CodeFamily | None = None,
 ) -> Iterator[Source]:
     """Find marks in the newest pictures of a folder: of each mark the picture named after it, as left.png.
 
-    With `windows` each of their marks is found there instead. What takes the pictures replaces them: each look but the
-    first waits until all have been written anew since it was asked for, as the one from before may show the robot in
-    motion. Raises TrirailError, also where none comes within NEWER_WITHIN seconds.
+    With `windows` each of their marks is found there instead, with a `family` the codes in any picture, named by their
+    numbers. What takes the pictures replaces them: each look but the first waits until all have been written anew since
+    it was asked for, as the one from before may show the robot in motion. Raises TrirailError, also where none comes
+    within NEWER_WITHIN seconds.
     """
     cv2 = _opencv()
     if not path.is_dir():
@@ -121,40 +129,76 @@ def folder(
 
     used: set[Path] = set()
 
-    def look() -> Marks:
-        deadline = time.monotonic() + NEWER_WITHIN
+    def find_marks() -> Marks:
+        deadline = time.monotonic() + PICTURE_TIMEOUT_S
         asked = {each: _written(each) for each in used}
         while any(_written(each) <= at for each, at in asked.items()):
             if time.monotonic() > deadline:
-                raise TrirailError(f"{path}: no newer pictures within {NEWER_WITHIN:g} s: does what takes them run?")
-            time.sleep(POLL)
+                raise TrirailError(
+                    f"{path}: no newer pictures within {PICTURE_TIMEOUT_S:g} s: does what takes them run?"
+                )
+            time.sleep(POLL_S)
         pictures = {each.stem: each for each in sorted(path.glob("[!.]*")) if each.suffix.lower() in PICTURES}
         if not pictures:
             raise TrirailError(f"{path}: no picture in it; wanted is one for each mark, as left.png")
         wanted = windows or {name: MarkWindow(name) for name in pictures}
         marks: dict[str, tuple[float, float]] = {}
+        codes = None if family is None else Codes(family)
         for name, window in wanted.items():
             if (file := pictures.get(window.picture)) is None:
                 raise TrirailError(
                     f"{path}: no picture {window.picture} for mark {name}; there are {', '.join(pictures)}"
                 )
-            whole_by = time.monotonic() + WRITTEN_WITHIN
+            whole_by = time.monotonic() + WRITE_TIMEOUT_S
             while (grey := cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) is None:
                 if time.monotonic() > whole_by:
                     raise TrirailError(f"{file}: no picture that OpenCV reads; write it as .{file.name} and rename it")
-                time.sleep(POLL)
+                time.sleep(POLL_S)
             used.add(file)
-            marks.update(_marks(name, grey, window, shape, turn))
+            if codes is not None:
+                codes.add(name, grey)
+            else:
+                marks.update(_marks(name, grey, window, shape, turn))
+        if codes is not None:
+            views.update(codes.views)
+            return codes.marks
         return marks
 
-    yield Source(look, {name: window.picture for name, window in windows.items()} or None)
+    views = {name: window.picture for name, window in windows.items()}
+    yield Source(find_marks, views if views or family is not None else None)
+
+
+class Codes:
+    """Codes of the pictures of a look, named by their numbers; each may be in one picture only."""
+
+    def __init__(self, family: CodeFamily) -> None:
+        self._family = family
+        self.marks: dict[str, tuple[float, float]] = {}
+        self.views: dict[str, str] = {}
+
+    def add(self, picture: str, grey: Any) -> None:
+        """Take a picture. Raises TrirailError where a code is in an earlier one too."""
+        from trirail.alignment.coded_marks import find_codes
+
+        for code in find_codes(grey, self._family):
+            name = str(code.number)
+            if name in self.marks:
+                both = f"{self.views[name]} and {picture}"
+                raise TrirailError(f"code {name} is in the pictures {both}: give each mark a number of its own")
+            self.marks[name], self.views[name] = (code.mark.u, code.mark.v), picture
 
 
 @contextlib.contextmanager
 def cameras(
-    devices: dict[str, str], shape: MarkShape, turn: float, windows: Mapping[str, MarkWindow] = NO_WINDOWS
+    devices: dict[str, str],
+    shape: MarkShape,
+    turn: float,
+    windows: Mapping[str, MarkWindow] = NO_WINDOWS,
+    family: CodeFamily | None = None,
 ) -> Iterator[Source]:
     """Open cameras through OpenCV, {mark: device}, a number or an address, and find a mark in a picture of each.
+
+    With a `family` a camera shows any number of codes, named by their numbers, and its own name is of its view.
 
     Marks of one device are found in one picture, each in its window. Raises TrirailError.
     """
@@ -175,19 +219,26 @@ def cameras(
                 raise TrirailError(f"cannot open camera {device} of {names}: is it plugged in, and may you read it?")
             captures[device] = capture
 
-        def look() -> Marks:
+        def find_marks() -> Marks:
             marks: dict[str, tuple[float, float]] = {}
+            codes = None if family is None else Codes(family)
             for device, capture in captures.items():
                 frame = newest(capture, cv2.CAP_PROP_FRAME_COUNT)
                 if frame is None:
                     raise TrirailError(f"camera {device} gives no picture any more")
                 grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
                 for name, its in devices.items():
-                    if its == device:
+                    if its == device and codes is not None:
+                        codes.add(name, grey)
+                    elif its == device:
                         marks.update(_marks(name, grey, windows.get(name, MarkWindow(name)), shape, turn))
+            if codes is not None:
+                views.update(codes.views)
+                return codes.marks
             return marks
 
-        yield Source(look, {name: f"camera {device}" for name, device in devices.items()} if windows else None)
+        views = {name: f"camera {device}" for name, device in devices.items()} if windows else {}
+        yield Source(find_marks, views if windows or family is not None else None)
 
 
 def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.monotonic) -> Any:
@@ -197,9 +248,9 @@ def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.mon
     comes. The first new one may have been begun before.
     """
     film = capture.get(frame_count) > 0
-    for _ in range(0 if film else MOST_KEPT):
+    for _ in range(0 if film else MAX_BUFFERED):
         asked = clock()
-        if not capture.grab() or clock() - asked > AT_ONCE:
+        if not capture.grab() or clock() - asked > BUFFERED_S:
             break
     if film:
         capture.grab()
@@ -222,8 +273,8 @@ def _marks(name: str, grey: Any, window: MarkWindow, shape: MarkShape, turn: flo
     if window.width and (window.u + window.width > columns or window.v + window.height > rows):
         raise TrirailError(f"the window of {name} is beyond its picture of {columns} × {rows} pixels")
     bottom, right = (window.v + window.height, window.u + window.width) if window.width else (rows, columns)
-    found = find(grey[window.v : bottom, window.u : right], shape, turn)
-    return {} if found is None else {name: (found.u + window.u, found.v + window.v)}
+    mark = find(grey[window.v : bottom, window.u : right], shape, turn)
+    return {} if mark is None else {name: (mark.u + window.u, mark.v + window.v)}
 
 
 def _opencv() -> Any:
@@ -247,8 +298,10 @@ class MarkSource:
     window: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """MARK=U,V,WIDTH,HEIGHT, the part of its picture in which a mark is, in pixels, where one picture shows several;
     with --pictures as MARK=PICTURE:U,V,WIDTH,HEIGHT."""
-    shape: Literal["cross", "disc", "corner"] = "cross"
-    "What is looked for in pictures."
+    shape: Literal["cross", "disc", "corner", "code"] = "cross"
+    "Shape of the marks in pictures; codes are named by their numbers, wherever they are."
+    family: CodeFamily = "4x4_50"
+    "Family of the codes, ArUco or AprilTag."
     size: float = 100.0
     "Its size in pixels: a disc's diameter, a cross's bars, a corner's sides."
     turn: float = 0.0
@@ -265,10 +318,13 @@ class MarkSource:
         """Open it. Raises TrirailError."""
         from trirail.alignment.shapes import MarkShape
 
-        given = [self.program is not None, self.pictures is not None, bool(self.camera)]
-        if sum(given) != 1:
+        selected = [self.program is not None, self.pictures is not None, bool(self.camera)]
+        if sum(selected) != 1:
             raise TrirailError("marks are from one of --program, --pictures and --camera; give one of them")
         shape, turn = MarkShape(self.shape, self.size), math.radians(self.turn)
+        family = self.family if self.shape == "code" else None
+        if family is not None and self.window:
+            raise TrirailError("--window is not for codes: each is known by its number")
         if self.window and self.program is not None:
             raise TrirailError("--window is for pictures: a program tells where its marks are")
         windows = dict(map(_window, self.window))
@@ -276,10 +332,10 @@ class MarkSource:
             if self.program is not None:
                 yield stack.enter_context(program(self.program))
             elif self.pictures is not None:
-                yield stack.enter_context(folder(self.pictures, shape, turn, windows))
+                yield stack.enter_context(folder(self.pictures, shape, turn, windows, family))
             else:
                 devices = dict(map(_device, self.camera))
-                yield stack.enter_context(cameras(devices, shape, turn, windows))
+                yield stack.enter_context(cameras(devices, shape, turn, windows, family))
 
 
 def _device(text: str) -> tuple[str, str]:

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from trirail.motion.limits import Violation
     from trirail.workspace.workspace import Extent
 
-STEPS = (1, 2, 5, 10, 15, 20, 30, 45)
+SLICE_STEPS_DEG = (1, 2, 5, 10, 15, 20, 30, 45)
 """From one slice to the next, if no angles are asked for [°]."""
 CM2 = 1e4
 """Areas are shown in cm²: a stage has some, a large robot a thousand."""
-SLICES = 8
+MAX_SLICES = 8
 """So many of them at most."""
 
 
@@ -81,11 +81,11 @@ def ik(
         return 0
     _print_pose(pose)
     _print_joints(robot, solved, sensitivities)
-    terminal.say(
+    terminal.print_line(
         f"conditioning {isotropy:.3f} (1 is isotropic), singular {notation.written(distance, '°', 2)} away in φ"
     )
     for warning in warnings:
-        terminal.complain(f"warning: the service would refuse this: {warning}")
+        terminal.print_error(f"warning: the service would refuse this: {warning}")
     return 0
 
 
@@ -132,9 +132,9 @@ def _check_reach(config: Config, robot: Geometry, pose: Array) -> None:
     """Raise KinematicsError if the robot itself cannot be at a pose; it says all that is wrong."""
     from trirail.workspace.violations import violations
 
-    found = violations(robot, config.limits, pose)
-    if found:
-        raise _out_of_reach(found)
+    exceeded = violations(robot, config.limits, pose)
+    if exceeded:
+        raise _out_of_reach(exceeded)
 
 
 def _out_of_reach(found: list[Violation]) -> KinematicsError:
@@ -145,7 +145,7 @@ def _out_of_reach(found: list[Violation]) -> KinematicsError:
 
 def _print_pose(pose: Array) -> None:
     values = pose.tolist()
-    terminal.say(f"{notation.pose(values)} = {notation.written(values[2], 'rad', 6)}")
+    terminal.print_line(f"{notation.pose(values)} = {notation.written(values[2], 'rad', 6)}")
 
 
 def _print_joints(robot: Geometry, solved: dict[str, list[float]], sensitivities: Array) -> None:
@@ -214,19 +214,19 @@ def workspace(
         )
         return 0
     _print_extents(service, reach, at_zero)
-    terminal.say("")
+    terminal.print_line("")
     _print_slices([(angle, polygon_area(inside), polygon_area(whole)) for angle, inside, whole in slices])
     if plot:
-        terminal.say("")
-        terminal.say(f"drawn to {plot}")
+        terminal.print_line("")
+        terminal.print_line(f"drawn to {plot}")
     return 0
 
 
 def _round_angles(low: float, high: float) -> list[float]:
     """Return the multiples [rad] of a round number of degrees in a range, few enough to look at together."""
-    for step in STEPS:
+    for step in SLICE_STEPS_DEG:
         first, last = math.ceil(math.degrees(low) / step), math.floor(math.degrees(high) / step)
-        if last - first < SLICES:
+        if last - first < MAX_SLICES:
             break
     return [math.radians(step * k) for k in range(first, last + 1)]
 

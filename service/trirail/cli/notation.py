@@ -15,7 +15,7 @@ from cyclopts import Parameter, Token
 
 from trirail.naming import Labels
 from trirail.wire.decoding import converted, prepare
-from trirail.wire.state import CorrectionTold
+from trirail.wire.state import CorrectionInfo
 from trirail.wire.text import NAME_RULE, comma_hint, is_name, quoted
 from trirail.wire.units import (
     ACCELERATION,
@@ -58,7 +58,7 @@ def pose(values: Sequence[float], width: int = 0) -> str:
     return f"x {written(x, 'mm', 3, width)}   y {written(y, 'mm', 3, width)}   φ {written(phi, '°', 4, width)}"
 
 
-def correction(told: CorrectionTold, labels: Labels) -> str:
+def correction(told: CorrectionInfo, labels: Labels) -> str:
     """Write what as-built errors are corrected by on a line."""
     words = []
     if told.file:

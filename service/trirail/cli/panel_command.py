@@ -81,7 +81,7 @@ def wait_for_robot(service: Service) -> None:
                 return
         except ServiceError as error:
             if not is_announced:
-                terminal.complain(f"{error}; waiting for it, Ctrl-C ends")
+                terminal.print_error(f"{error}; waiting for it, Ctrl-C ends")
                 is_announced = True
             time.sleep(RETRY_S)
 

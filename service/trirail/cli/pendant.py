@@ -41,24 +41,24 @@ def keys(typed: bytes) -> Iterator[str]:
 
     Other keys' sequences are skipped as a whole: none of their characters is taken for a key.
     """
-    for found in _KEY.finditer(typed.decode("utf-8", errors="ignore")):
-        if found["final"]:
-            if arrow := _ARROWS.get(found["final"]):
+    for match in _KEY.finditer(typed.decode("utf-8", errors="ignore")):
+        if match["final"]:
+            if arrow := _ARROWS.get(match["final"]):
                 yield arrow
-        elif found["escape"]:
+        elif match["escape"]:
             yield "escape"
         else:
-            yield {"=": "+", "_": "-"}.get(found["character"], found["character"].lower())
+            yield {"=": "+", "_": "-"}.get(match["character"], match["character"].lower())
 
 
-REPEAT = 0.15
+KEY_TIMEOUT_S = 0.15
 """A key that has not come again for so long is let go [s]: a terminal tells of no key's end, and repeats one that is
 held every 30 to 50 ms, but for the pause before the first repeat."""
-DRAWN = 0.1
+REDRAW_S = 0.1
 """The numbers are drawn so often [s]."""
-STALLED = 0.5
+STALL_S = 0.5
 """After standing still for so long the program does not know what was pressed meanwhile [s]."""
-SILENT = 1.0
+STATE_TIMEOUT_S = 1.0
 """After so long without a state the service is taken for silent [s]."""
 AXES = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "a": (0, 0, 1), "d": (0, 0, -1)}
 """Directions along x, y and φ."""
@@ -72,7 +72,7 @@ class Pendant:
         self._robot = robot
         self._tool = tool
         self._top = top
-        self._jog = HeldJog(robot.send, self._say)
+        self._jog = HeldJog(robot.send, self._set_message)
         self._until = -math.inf
         self._choice = USUAL
         self.said = HELP
@@ -91,7 +91,7 @@ class Pendant:
         if key in AXES:
             self.hold(AXES[key], now)
             return
-        self.let_go()
+        self.release_key()
         if key in (" ", "escape"):
             threading.Thread(target=self._stop, name="stop", daemon=True).start()
         elif key in "+-":
@@ -102,15 +102,15 @@ class Pendant:
     def hold(self, direction: Sequence[float], now: float) -> None:
         """Take in that the hand wants to go along x, y and φ, each by a share of the speed, -1 to 1."""
         x, y, phi = (share * speed for share, speed in zip(direction, self.speed, strict=True))
-        self._until = now + REPEAT
+        self._until = now + KEY_TIMEOUT_S
         self._jog.hold((x, y, phi), self._tool)
 
     def tick(self, now: float) -> None:
         """Let go of a key that has not come again."""
         if now > self._until:
-            self.let_go()
+            self.release_key()
 
-    def let_go(self) -> None:
+    def release_key(self) -> None:
         """Let go of the key that is held, if one is."""
         if self._until > -math.inf:
             self._until = -math.inf
@@ -123,22 +123,22 @@ class Pendant:
     def _stop(self) -> None:
         try:
             self._robot.stop()
-            self._say("stopped")
+            self._set_message("stopped")
         except TrirailError as error:
-            self._say(str(error))
+            self._set_message(str(error))
 
-    def _say(self, words: str) -> None:
+    def _set_message(self, words: str) -> None:
         self.said = words
 
 
-class _Newest:
+class _StateReader:
     """The newest state, heard by a thread of its own until the context ends; None where the service is silent."""
 
     def __init__(self, robot: Robot) -> None:
         self.state: State | None = None
         self._robot = robot
         self._over = False
-        self._thread = threading.Thread(target=self._hear, name="states", daemon=True)
+        self._thread = threading.Thread(target=self._read_states, name="states", daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -148,9 +148,9 @@ class _Newest:
         self._over = True
         self._thread.join()
 
-    def _hear(self) -> None:
+    def _read_states(self) -> None:
         while not self._over:
-            for state in self._robot.states(SILENT):
+            for state in self._robot.states(STATE_TIMEOUT_S):
                 if self._over:
                     return
                 self.state = state
@@ -167,25 +167,25 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
     top = converted(robot.info().limits, Limits).platform.velocity
     pendant = Pendant(robot, top, tool)
-    with _Newest(robot) as newest:
+    with _StateReader(robot) as newest:
         try:
             with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
                 _serve(pendant, newest, live)
-        except (KeyboardInterrupt, _HungUp, OSError):
+        except (KeyboardInterrupt, _TerminalClosed, OSError):
             pass  # an OSError is that of a terminal that is gone
         finally:
             pendant.close()
     return 0
 
 
-def _serve(pendant: Pendant, newest: _Newest, live: Live) -> None:
+def _serve(pendant: Pendant, newest: _StateReader, live: Live) -> None:
     descriptor = sys.stdin.fileno()
     drawn, last = -math.inf, time.monotonic()
     while not pendant.over:
-        ready, _, _ = select.select([descriptor], [], [], REPEAT / 5.0)
+        ready, _, _ = select.select([descriptor], [], [], KEY_TIMEOUT_S / 5.0)
         now = time.monotonic()
-        if now - last > STALLED:  # stopped and continued: what waits in the terminal is from before
-            pendant.let_go()
+        if now - last > STALL_S:  # stopped and continued: what waits in the terminal is from before
+            pendant.release_key()
             termios.tcflush(descriptor, termios.TCIFLUSH)
         elif descriptor in ready:
             typed = os.read(descriptor, 1024)
@@ -195,7 +195,7 @@ def _serve(pendant: Pendant, newest: _Newest, live: Live) -> None:
                 pendant.press(key, now)
         pendant.tick(now)
         last = now
-        if now - drawn > DRAWN:
+        if now - drawn > REDRAW_S:
             live.update(_shown(pendant, newest.state), refresh=True)
             drawn = now
 
@@ -214,7 +214,7 @@ def _shown(pendant: Pendant, state: State | None) -> Text:
     return Text("\n".join(map(printable, lines)), no_wrap=True, overflow="ellipsis")
 
 
-class _HungUp(Exception):
+class _TerminalClosed(Exception):
     """The terminal is gone, or the program is told to end."""
 
 
@@ -225,10 +225,10 @@ def _raw(pendant: Pendant) -> Iterator[None]:
     before = termios.tcgetattr(descriptor)
 
     def hung_up(_number: int, _frame: FrameType | None) -> None:
-        raise _HungUp
+        raise _TerminalClosed
 
     def suspended(number: int, _frame: FrameType | None) -> None:
-        pendant.let_go()
+        pendant.release_key()
         termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)  # here it stands until it is continued

@@ -20,8 +20,8 @@ from typing import Any
 from msgspec import structs
 from trirail_drivers.bus import adapters
 
-from trirail.cli.key_folder import AUTHORITY_KEY, Issued, KeyFolder
-from trirail.cli.machine import Gathered, Machine, Passed
+from trirail.cli.key_folder import AUTHORITY_KEY, IssuedCertificate, KeyFolder
+from trirail.cli.machine import BusTraffic, Machine, ReceiveCoalescing
 from trirail.config import Config, LoopTable
 from trirail.diagnosis import bare_loop
 from trirail.diagnosis.bare_loop import Cycles
@@ -34,11 +34,11 @@ SYSTEM = Path("/sys")
 PROCESSES = Path("/proc")
 _SIOCETHTOOL, _GCOALESCE, _COALESCE = 0x8946, 0x0E, 23
 """A request of linux/sockios.h, a command of linux/ethtool.h, and the 32-bit words of its struct ethtool_coalesce."""
-MEASURED = 10.0
+MEASUREMENT_S = 10.0
 """Duration of the measurement of cycles [s]."""
-COMMAND_WITHIN = 5.0
+COMMAND_TIMEOUT_S = 5.0
 """Timeout of a command that reads the machine [s]."""
-COUNTED = 1.0
+COUNTING_S = 1.0
 """Duration of counting frames where cycles are not measured [s]."""
 
 
@@ -53,15 +53,15 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
     if measures:
         bare_loop.prepare()
     channel = config.can.channel if config.can.interface == "socketcan" else ""
-    before = counted(channel)
+    before = read_counters(channel)
     cycles: Cycles | str = ""
     with _rights_of(config.loop) as lacking:
         if measures:
-            cycles = bare_loop.measure(config.loop, config.loop.rate_hz, MEASURED, progress)
+            cycles = bare_loop.measure(config.loop, config.loop.rate_hz, MEASUREMENT_S, progress)
     if running is not None:
         cycles = f"a service's loop, process {running}, runs on processor {cpu}"
     if not measures and before is not None:
-        time.sleep(COUNTED)
+        time.sleep(COUNTING_S)
     door = guard(config)
     return Machine(
         release=platform.release(),
@@ -75,8 +75,8 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
         isolated=processors(_text(SYSTEM / "devices/system/cpu/isolated") or ""),
         link=link(config.can.channel) if config.can.interface == "socketcan" else None,
         cycles=cycles,
-        passed=passed(before, counted(channel)),
-        gathered=gathered(channel) if channel else None,
+        traffic=traffic_between(before, read_counters(channel)),
+        coalescing=read_coalescing(channel) if channel else None,
         adapter=adapters.missing_support(config.can.interface),
         guard=door,
         issued=issued(config),
@@ -99,20 +99,20 @@ def limited_ports() -> tuple[int, ...] | None:
     """Read at which ports the rules of configs/trirail.nft limit connections; None without nft or the right to ask."""
     try:
         listed = subprocess.run(
-            ("nft", "--json", "list", "tables"), capture_output=True, check=True, timeout=COMMAND_WITHIN
+            ("nft", "--json", "list", "tables"), capture_output=True, check=True, timeout=COMMAND_TIMEOUT_S
         )
         tables = [each["table"] for each in json.loads(listed.stdout)["nftables"] if "table" in each]
         if not any(table["family"] == "inet" and table["name"] == "trirail" for table in tables):
             return ()
         command = ("nft", "--json", "list", "set", "inet", "trirail", "ports")
-        listed = subprocess.run(command, capture_output=True, check=True, timeout=COMMAND_WITHIN)
+        listed = subprocess.run(command, capture_output=True, check=True, timeout=COMMAND_TIMEOUT_S)
         (ports,) = [each["set"] for each in json.loads(listed.stdout)["nftables"] if "set" in each]
         return tuple(ports.get("elem", ()))
     except (OSError, ValueError, KeyError, subprocess.SubprocessError):
         return None
 
 
-def issued(config: Config) -> tuple[Issued, ...] | None:
+def issued(config: Config) -> tuple[IssuedCertificate, ...] | None:
     """Read which certificates there are, where the authority's folder is that of [zenoh.tls]."""
     if config.zenoh.tls is None:
         return None
@@ -125,11 +125,11 @@ def issued(config: Config) -> tuple[Issued, ...] | None:
 
 def processors(text: str) -> tuple[int, ...]:
     """Read the kernel's way to write a set of processors: "2-4,7"."""
-    found: list[int] = []
+    numbers: list[int] = []
     for part in filter(None, text.split(",")):
         first, _, last = part.partition("-")
-        found += range(int(first), int(last or first) + 1)
-    return tuple(found)
+        numbers += range(int(first), int(last or first) + 1)
+    return tuple(numbers)
 
 
 def link(name: str) -> dict[str, Any] | None:
@@ -138,31 +138,31 @@ def link(name: str) -> dict[str, Any] | None:
         return None
     command = ("ip", "-details", "-json", "link", "show", "dev", name)
     try:
-        said = subprocess.run(command, capture_output=True, check=True)
+        result = subprocess.run(command, capture_output=True, check=True)
     except FileNotFoundError as error:
         raise ServiceError(
             "the program ip, which tells a CAN interface's state, is missing: install iproute2"
         ) from error
     except subprocess.CalledProcessError as error:
         raise ServiceError(f"{' '.join(command)}: {error.stderr.decode(errors='replace').strip()}") from error
-    (found,) = json.loads(said.stdout)
-    return dict(found)
+    (report,) = json.loads(result.stdout)
+    return dict(report)
 
 
-def gathered(name: str) -> Gathered | None:
+def read_coalescing(name: str) -> ReceiveCoalescing | None:
     """Return the receive coalescing of a network interface; None where its driver does not tell (linux/ethtool.h)."""
-    said = (ctypes.c_uint32 * _COALESCE)(_GCOALESCE)
-    request = struct.pack("16sP", name.encode(), ctypes.addressof(said))
+    settings = (ctypes.c_uint32 * _COALESCE)(_GCOALESCE)
+    request = struct.pack("16sP", name.encode(), ctypes.addressof(settings))
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
             fcntl.ioctl(asking, _SIOCETHTOOL, request)
     except OSError:
         return None
-    _, time_of_any, any_frames, time_of_irq, irq_frames, *_ = said
-    return Gathered(max(any_frames, irq_frames), max(time_of_any, time_of_irq))
+    _, time_of_any, any_frames, time_of_irq, irq_frames, *_ = settings
+    return ReceiveCoalescing(max(any_frames, irq_frames), max(time_of_any, time_of_irq))
 
 
-def counted(name: str) -> Passed | None:
+def read_counters(name: str) -> BusTraffic | None:
     """Return the counters of a network interface since its creation; None where the kernel has none."""
     at = time.monotonic()
     statistics = SYSTEM / "class/net" / name / "statistics"
@@ -170,14 +170,14 @@ def counted(name: str) -> Passed | None:
     if not texts or not all(text and text.isdecimal() for text in texts):
         return None
     received, sent, received_bytes, sent_bytes = (int(text) for text in texts if text)
-    return Passed(at, received + sent, received_bytes + sent_bytes)
+    return BusTraffic(at, received + sent, received_bytes + sent_bytes)
 
 
-def passed(before: Passed | None, after: Passed | None) -> Passed | None:
+def traffic_between(before: BusTraffic | None, after: BusTraffic | None) -> BusTraffic | None:
     """Return the traffic between two counts; None without both."""
     if before is None or after is None:
         return None
-    return Passed(after.seconds - before.seconds, after.frames - before.frames, after.data - before.data)
+    return BusTraffic(after.seconds - before.seconds, after.frames - before.frames, after.data - before.data)
 
 
 def governors() -> dict[int, str]:
@@ -204,13 +204,13 @@ def _rights_of(loop: LoopTable) -> Iterator[tuple[str, ...]]:
     """Have the loop's rights and its processor meanwhile; which of them it would lack."""
     allowed, policy, priority = os.sched_getaffinity(0), os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        yield realtime.acquire(structs.replace(loop, realtime=_wished(loop)))
+        yield realtime.acquire(structs.replace(loop, realtime=_available_rights(loop)))
     finally:
         os.sched_setscheduler(0, policy, priority)
         os.sched_setaffinity(0, allowed)
 
 
-def _wished(loop: LoopTable) -> Any:
+def _available_rights(loop: LoopTable) -> Any:
     # What is missing is for the doctor to say; the loop would refuse to run.
     return "off" if loop.realtime == "off" else "prefer"
 

@@ -7,20 +7,20 @@ from typing import Final
 from trirail.cli import terminal
 from trirail.diagnosis import Stops
 
-_WIDE: Final = 60
+_RAIL_COLUMNS: Final = 60
 """Characters in which a rail is drawn."""
 
 
-def drawn(found: Stops) -> list[str]:
+def draw_lines(found: Stops) -> list[str]:
     """Return the lines of the drawing: to scale, but that nothing is too short to be seen."""
     low, high = found.rail or found.travel
     low, high = min(low, found.travel[0]), max(high, found.travel[1])
 
     def wide(length: float) -> int:
-        return min(max(1, round(length / (high - low) * _WIDE)), _WIDE)
+        return min(max(1, round(length / (high - low) * _RAIL_COLUMNS)), _RAIL_COLUMNS)
 
     def at(place: float) -> int:
-        return round((place - low) / (high - low) * _WIDE)
+        return round((place - low) / (high - low) * _RAIL_COLUMNS)
 
     begin, end = (at(place) for place in found.travel)
     rows = [("travel", " " * begin + "━" * max(1, end - begin))]
@@ -28,19 +28,19 @@ def drawn(found: Stops) -> list[str]:
         first, last = (at(place) for place in found.rail)
         rows.insert(0, ("rail", " " * first + "─" * max(1, last - first)))
     for name, way in (("stop", found.way), ("quick stop", found.quick_way)):
-        rows.append((name, " " * end + "▶" * min(wide(way), _WIDE // 3)))
-    ends = f"{low * 1e3:<{_WIDE // 2}.4g}{high * 1e3:>{_WIDE // 2}.4g} mm"
+        rows.append((name, " " * end + "▶" * min(wide(way), _RAIL_COLUMNS // 3)))
+    ends = f"{low * 1e3:<{_RAIL_COLUMNS // 2}.4g}{high * 1e3:>{_RAIL_COLUMNS // 2}.4g} mm"
     return [f"{name:10} {line}" for name, line in rows] + [f"{'':10} {ends}"]
 
 
 def show(found: Stops) -> None:
     """Print it, and the numbers as a table."""
-    terminal.say("")
-    for line in drawn(found):
-        terminal.say(line)
-    told = terminal.table(f"from {found.velocity * 1e3:g} mm/s", "mm", "s")
-    told.add_row("stop", f"{found.way * 1e3:.3g}", f"{found.time:.3g}")
-    told.add_row("quick stop", f"{found.quick_way * 1e3:.3g}", f"{found.quick_time:.3g}")
+    terminal.print_line("")
+    for line in draw_lines(found):
+        terminal.print_line(line)
+    table = terminal.table(f"from {found.velocity * 1e3:g} mm/s", "mm", "s")
+    table.add_row("stop", f"{found.way * 1e3:.3g}", f"{found.time:.3g}")
+    table.add_row("quick stop", f"{found.quick_way * 1e3:.3g}", f"{found.quick_time:.3g}")
     if found.left is not None:
-        told.add_row("rail left beyond the travel", f"{found.left * 1e3:.3g}", "")
-    terminal.out.print(told)
+        table.add_row("rail left beyond the travel", f"{found.left * 1e3:.3g}", "")
+    terminal.out.print(table)

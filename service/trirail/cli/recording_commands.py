@@ -86,8 +86,8 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
         return 0
     _print_summary(summed)
     if plot:
-        terminal.say("")
-        terminal.say(f"drawn to {plot}")
+        terminal.print_line("")
+        terminal.print_line(f"drawn to {plot}")
     return 0
 
 
@@ -131,7 +131,7 @@ def export(
     if json:
         terminal.json({"file": str(path), "rows": rows})
     else:
-        terminal.say(f"{rows} rows written to {path}")
+        terminal.print_line(f"{rows} rows written to {path}")
     return 0
 
 

@@ -25,7 +25,7 @@ from trirail.wire.state import Info, State
 
 HISTORY_MB = 256.0
 """Memory for what viewers that connect late are shown of the past; nothing else runs in this process [1e6 bytes]."""
-FIRST_WITHIN = 5.0
+FIRST_RECORDS_TIMEOUT_S = 5.0
 """How long the first records may take [s]."""
 MISSING = "missing so far: {} cycles on the way here, {} batches in this view (viewer too slow)"
 
@@ -120,7 +120,7 @@ class RemoteRobot:
 
     def _first(self, info: Info) -> bytes:
         """Return the first records; what came before them comes again afterwards."""
-        deadline = time.monotonic() + FIRST_WITHIN
+        deadline = time.monotonic() + FIRST_RECORDS_TIMEOUT_S
         before: list[Event | State | None] = []
         while (left := deadline - time.monotonic()) > 0.0:
             try:
@@ -133,7 +133,7 @@ class RemoteRobot:
                 return item
             before.append(item)
         raise ServiceError(
-            f"robot {info.robot!r} answers, but no records come from it within {FIRST_WITHIN:g} s: "
+            f"robot {info.robot!r} answers, but no records come from it within {FIRST_RECORDS_TIMEOUT_S:g} s: "
             "may this user read them, and does every router on the way pass them on?"
         )
 

@@ -30,7 +30,7 @@ from trirail.cli.options import (
 from trirail.cli.options import poses as poses_of_robot
 from trirail.naming import Labels
 from trirail.wire import boundary
-from trirail.wire.goals import Goal, MoveGoal, PoseGoal
+from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrajectoryGoal
 from trirail.wire.messages import CommandReply
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.units import LENGTH, quantity
@@ -137,9 +137,9 @@ def goal(content: str, /, *, wait: Wait = False, service: Service = HERE) -> int
     content
         Its kind and what it says, as on the wire, in SI units and radians.
     """
-    meant: Goal = boundary.decode(content.encode(), Goal, "not a goal")
+    request: Goal = boundary.decode(content.encode(), Goal, "not a goal")
     with service.open() as robot:
-        return _follow(service, robot, robot.send(meant), wait, str(meant.__struct_config__.tag))
+        return _follow(service, robot, robot.send(request), wait, str(request.__struct_config__.tag))
 
 
 def sliders(
@@ -206,16 +206,16 @@ def jog(
     with service.open() as robot:
         try:
             with robot.jog(x=vx, y=vy, phi=w, tool=tool) as jogging:
-                taken = jogging.reply
-                if not service.json and taken is not None and (words := terminal.slowed(taken)):
-                    terminal.complain(words)
-                live.jogging(robot, jogging, seconds, show=not service.json)
+                reply = jogging.reply
+                if not service.json and reply is not None and (words := terminal.slowed(reply)):
+                    terminal.print_error(words)
+                live.show_jog(robot, jogging, seconds, show=not service.json)
         except KeyboardInterrupt:
             pass
         if jogging.error is not None:
             raise jogging.error
         result = jogging.result
-    slowed = {"slowed": taken.slowed} if taken else {}
+    slowed = {"slowed": reply.slowed} if reply else {}
     show(service, (result._asdict() if result else {}) | slowed, result.message if result else NO_END)
     return 0 if result and result.outcome == "done" else 1
 
@@ -224,7 +224,7 @@ def follow(
     file: Path,
     /,
     *,
-    stretch: Annotated[bool, Flag] = False,
+    stretch: Annotated[bool, Flag, described(TrajectoryGoal, "stretch")] = False,
     go_there: Annotated[bool, Flag] = False,
     wait: Wait = False,
     service: Service = HERE,
@@ -235,8 +235,6 @@ def follow(
     ----------
     file
         CSV with columns t, x, y, phi (and vx, vy, w, and ax, ay, e), or JSON with a list of points.
-    stretch
-        Slow down what is too fast, instead of refusing it.
     go_there
         Go to its first point before, by an ordinary goal, if the robot is not there.
     """
@@ -285,16 +283,17 @@ def forget(name: Annotated[str, Parameter(completer=taught_poses)], /, *, servic
 def poses(*, service: Service = HERE) -> int:
     """List the poses that have names."""
     with service.open() as robot:
-        found = robot.poses()
+        named_poses = robot.poses()
     if service.json:
-        terminal.json({name: msgspec.to_builtins(pose) for name, pose in found.items()})
+        terminal.json({name: msgspec.to_builtins(pose) for name, pose in named_poses.items()})
         return 0
-    width = max(map(len, found), default=0)
-    for name, pose in found.items():
+    width = max(map(len, named_poses), default=0)
+    for name, pose in named_poses.items():
         whose = "taught" if pose.taught else "of [poses]"
-        terminal.say(f"{name:<{width}}   {notation.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
-    if not found:
-        terminal.say("there is none: trirail teach NAME makes one of where the robot stands")
+        whose += ", with another geometry: look at it, and teach it again" if pose.other_geometry else ""
+        terminal.print_line(f"{name:<{width}}   {notation.pose((pose.x, pose.y, pose.phi), 9)}   {whose}")
+    if not named_poses:
+        terminal.print_line("there is none: trirail teach NAME makes one of where the robot stands")
     return 0
 
 
@@ -328,7 +327,7 @@ def output(name: str, value: Literal["on", "off"], /, *, service: Service = HERE
     return 0
 
 
-WAKE_EVERY = 0.2
+WAKE_INTERVAL_S = 0.2
 """How often who waits looks for a signal: the kernel may have handed it to another thread, which wakes nobody [s]."""
 
 
@@ -351,7 +350,7 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.
     ):
         show(service, {"lease": robot.user}, f"{robot.user} holds the lease until Ctrl-C")
         with contextlib.suppress(KeyboardInterrupt):
-            while not lease.wait(WAKE_EVERY):
+            while not lease.wait(WAKE_INTERVAL_S):
                 pass
     if lease.lost is not None:
         raise lease.lost
@@ -377,7 +376,7 @@ def watch(*, service: Service = HERE) -> int:
     return 0
 
 
-PAST_WITHIN = 1.0
+HISTORY_TIMEOUT_S = 1.0
 """After so long without another event the past is over: a thousand of them come in a tenth of that [s]."""
 
 
@@ -403,7 +402,7 @@ def events(
         seen = 0
         if last is not None:
             until_now = itertools.takewhile(
-                lambda event: event.t <= now, robot.events(history=True, timeout=PAST_WITHIN)
+                lambda event: event.t <= now, robot.events(history=True, timeout=HISTORY_TIMEOUT_S)
             )
             for event in deque(until_now, maxlen=last or None):
                 _show_event(service, event)
@@ -419,7 +418,7 @@ def _show_event(service: Service, event: Event) -> None:
     if service.json:
         terminal.json(msgspec.to_builtins(event))
     else:
-        terminal.event(event)
+        terminal.print_event(event)
 
 
 COMMANDS = (goto, move, goal, sliders, jog, follow, teach, forget, poses, status, watch, events)
@@ -475,7 +474,7 @@ def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title:
         show(service, msgspec.to_builtins(goal.reply), words)
         return 0
     if not service.json and (words := terminal.slowed(goal.reply)):
-        terminal.complain(words)
+        terminal.print_error(words)
     result = terminal.follow(robot, goal, title, show=not service.json)
     show(service, result._asdict() | {"slowed": goal.reply.slowed}, result.message)
     return 0 if result.outcome == "done" else 1
@@ -486,4 +485,4 @@ def show(service: Address, content: object, words: str) -> None:
     if service.json:
         terminal.json(content)
     else:
-        terminal.say(words)
+        terminal.print_line(words)

@@ -43,7 +43,7 @@ class Log:
         self._looked = clock()
         self._left_out = 0
 
-    def say(self, words: str, level: Level = "info") -> None:
+    def log(self, words: str, level: Level = "info") -> None:
         """Write what the service says of itself."""
         now = self._clock()
         self._write(now, level, words, {"time": now, "kind": "service", "level": level, "message": words})
@@ -58,7 +58,7 @@ class Log:
             return
         if self._left_out:
             number, self._left_out = self._left_out, 0
-            self.say(f"{number} events came too quickly to be written here: `trirail events` has them", "warning")
+            self.log(f"{number} events came too quickly to be written here: `trirail events` has them", "warning")
             self._room -= 1.0
         self._room -= 1.0
         self._write(event.time, event.level, event.message, event)

@@ -90,15 +90,15 @@ def sessions(
         robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
     )
     files = recorded(folder, reread=rebuild, on_read=_ReadingReport())
-    found = find(files, wanted)
+    matches = find(files, wanted)
     known = fault_codes(files) if fault is not None and not find(files, Wanted(fault=fault)) else []
-    shown = found[-last:] if last else found
+    shown = matches[-last:] if last else matches
     if json:
-        terminal.json({"folder": str(folder), "found": len(found), "sessions": msgspec.to_builtins(shown)})
+        terminal.json({"folder": str(folder), "found": len(matches), "sessions": msgspec.to_builtins(shown)})
         return 0
-    _print(shown, len(found))
+    _print(shown, len(matches))
     if known:
-        terminal.say(f"no recorded fault says {quoted(fault or '')}: there are {', '.join(known)}")
+        terminal.print_line(f"no recorded fault says {quoted(fault or '')}: there are {', '.join(known)}")
     return 0
 
 
@@ -108,7 +108,7 @@ def _check_code(words: str | None) -> None:
         raise ValueError(f"{quoted(words)!r} is no code such as 0x8700")
 
 
-REPORT_EVERY = 1.0
+REPORT_INTERVAL_S = 1.0
 """How often progress of reading recordings is printed [s]."""
 
 
@@ -116,13 +116,13 @@ class _ReadingReport:
     """Prints which recording is read, where that takes long."""
 
     def __init__(self) -> None:
-        self._due = time.monotonic() + REPORT_EVERY
+        self._due = time.monotonic() + REPORT_INTERVAL_S
         self._count = 0
 
     def __call__(self, path: Path) -> None:
         self._count += 1
         if time.monotonic() >= self._due:
-            self._due = time.monotonic() + REPORT_EVERY
+            self._due = time.monotonic() + REPORT_INTERVAL_S
             print(f"reading {path.name}, recording {self._count} without a usable .json", file=sys.stderr)  # noqa: T201
 
 
@@ -143,7 +143,7 @@ def _print(found: list[RecordedSession], of: int) -> None:
         for line in filter(None, (*map(terminal.plain, session.files), _faults(session))):
             terminal.out.print(Padding(line, (0, 0, 0, 4)))
     sessions = terminal.counted(of, "session")
-    terminal.say(f"{len(found)} of {sessions}" if len(found) < of else sessions)
+    terminal.print_line(f"{len(found)} of {sessions}" if len(found) < of else sessions)
 
 
 def _lasted(session: RecordedSession) -> str:

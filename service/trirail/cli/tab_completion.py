@@ -20,7 +20,7 @@ def script(app: App, shell: Shell | None, *, install: bool) -> int:
 
     try:
         if install:
-            terminal.say(f"installed: {app.install_completion(shell=shell)}; new shells complete trirail")
+            terminal.print_line(f"installed: {app.install_completion(shell=shell)}; new shells complete trirail")
         else:
             sys.stdout.write(app.generate_completion(shell=shell))
     except ShellDetectionError as error:

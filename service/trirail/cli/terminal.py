@@ -36,7 +36,7 @@ err = Console(stderr=True, highlight=False, emoji=False)
 COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.items()}
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
 VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
-SILENT = 3.0
+SERVICE_TIMEOUT_S = 3.0
 """A service from which nothing is heard for so long is taken for gone [s]."""
 
 
@@ -50,7 +50,7 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def say(words: str) -> None:
+def print_line(words: str) -> None:
     """Print a line."""
     out.print(plain(words), soft_wrap=True)
 
@@ -66,7 +66,7 @@ def drawing(file: Path) -> Iterator[None]:
         raise TrirailError(f"cannot draw to {file}: {getattr(error, 'strerror', None) or error}") from error
 
 
-def complain(words: str) -> None:
+def print_error(words: str) -> None:
     """Print an error as one line of bounded length on standard error."""
     err.print(f"trirail: {plain(shortened(' '.join(words.split())))}", soft_wrap=True)
 
@@ -77,13 +77,13 @@ def json(content: object) -> None:
     sys.stdout.flush()
 
 
-def failed(error: TrirailError) -> None:
+def print_error_json(error: TrirailError) -> None:
     """Print an error as one JSON object, with the code of a refusal and the value that a limit forbids."""
-    found = {"ok": False, "error": type(error).__name__, "message": str(error)}
+    content = {"ok": False, "error": type(error).__name__, "message": str(error)}
     if isinstance(error, RefusedError):
-        found["code"] = error.code
+        content["code"] = error.code
     beyond = {name: getattr(error, name, None) for name in ("slider", "leg", "value", "limit")}
-    json(found | {name: value for name, value in beyond.items() if value not in (None, "")})
+    json(content | {name: value for name, value in beyond.items() if value not in (None, "")})
 
 
 def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
@@ -119,23 +119,23 @@ def _reach(config: Config) -> list[str]:
     return options
 
 
-SLOWED = 1.001
+MIN_SLOWDOWN = 1.001
 """A goal that is slowed by less is as asked."""
 
 
 def slowed(reply: GoalReply) -> str:
     """Say how much slower an accepted goal is than was asked for; nothing where it is not."""
-    return f"slowed {reply.slowed:.4g} times: it would be beyond the limits" if reply.slowed > SLOWED else ""
+    return f"slowed {reply.slowed:.4g} times: it would be beyond the limits" if reply.slowed > MIN_SLOWDOWN else ""
 
 
 def notes(reply: GoalReply) -> str:
     """Say what is out of the ordinary with an accepted goal; nothing where all is as asked."""
-    said = [words] if (words := slowed(reply)) else []
+    remarks = [words] if (words := slowed(reply)) else []
     if reply.stops_first:
-        said.append("stops on the old path first")
+        remarks.append("stops on the old path first")
     if reply.queued:
-        said.append("waits for the goal before it")
-    return f" ({', '.join(said)})" if said else ""
+        remarks.append("waits for the goal before it")
+    return f" ({', '.join(remarks)})" if remarks else ""
 
 
 @contextlib.contextmanager
@@ -159,8 +159,8 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
     with Progress(*columns, console=out, transient=True, disable=not (show and out.is_terminal)) as progress:
         task = progress.add_task(plain(title) + notes(goal.reply), total=1.0, left="")
 
-        def until_its_end() -> Result:
-            for state in robot.states(SILENT):
+        def wait_for_end() -> Result:
+            for state in robot.states(SERVICE_TIMEOUT_S):
                 if goal.result is not None:
                     return goal.result
                 if state.goal is not None and state.goal.id == goal.id:
@@ -170,13 +170,13 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
             raise ServiceError(f"the service has gone silent; goal {goal.id} has no known end")
 
         try:
-            return until_its_end()
+            return wait_for_end()
         except KeyboardInterrupt:
             # Beside the waiting, so that a second Ctrl-C is heard at once.
             threading.Thread(target=_cancel, args=(goal,), name="cancel", daemon=True).start()
             progress.update(task, description="stopping; Ctrl-C again leaves")
         try:
-            return until_its_end()
+            return wait_for_end()
         except KeyboardInterrupt as second:
             raise ServiceError(
                 f"goal {goal.id} goes on: that it has stopped was not confirmed; trirail stop stops the robot"
@@ -197,13 +197,13 @@ def left(state: State, goal: GoalState) -> str:
     return f"{goal.remaining:.1f} s left" if state.override else "no expected end while the override is 0"
 
 
-def event(happened: Event) -> None:
+def print_event(occurred: Event) -> None:
     """Print an event on a line, with the time of the clock on the wall."""
-    level = f"[{LEVELS[happened.level]}]{happened.level:7}[/]"
-    out.print(f"{happened.seq:5}  {wall_clock(happened.time)}  {level}  {plain(happened.message)}", soft_wrap=True)
+    level = f"[{LEVELS[occurred.level]}]{occurred.level:7}[/]"
+    out.print(f"{occurred.seq:5}  {wall_clock(occurred.time)}  {level}  {plain(occurred.message)}", soft_wrap=True)
 
 
-def checks(found: Sequence[Check]) -> None:
+def print_checks(found: Sequence[Check]) -> None:
     """Print each check on a line, and under it what to do."""
     for check in found:
         verdict = f"[{VERDICTS[check.verdict]}]{check.verdict:8}[/]"

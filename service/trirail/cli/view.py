@@ -27,7 +27,7 @@ from trirail.wire.endpoints import is_local
 
 WEB_PORT = 9090
 """The web viewer's port, where it is free."""
-START_WITHIN = 20.0
+START_TIMEOUT_S = 20.0
 """How long the web viewer may take to answer [s]."""
 
 
@@ -107,12 +107,12 @@ def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
     address = source if "://" in source else f"rerun+http://{HOST}:{data_port}/proxy"
     url = f"http://{HOST}:{port}/?url={quote(address, safe='')}&hide_welcome_screen=1"
     with _rerun("--serve-web", "--web-viewer-port", str(port), "--port", str(data_port), source) as server:
-        deadline = time.monotonic() + START_WITHIN
+        deadline = time.monotonic() + START_TIMEOUT_S
         while not _answers(port):
             if server.poll() is not None:
                 return
             if time.monotonic() > deadline:
-                raise ServiceError(f"the web viewer does not answer on port {port} within {START_WITHIN:g} s")
+                raise ServiceError(f"the web viewer does not answer on port {port} within {START_TIMEOUT_S:g} s")
             time.sleep(0.05)
         say({"url": url, "source": source}, f"{source} in the browser, on this machine alone, until Ctrl-C: {url}")
         if has_display():

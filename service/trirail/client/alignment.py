@@ -122,11 +122,12 @@ async def drive_async(
                 if isinstance(wish, StageMotion):
                     for goal in goals(wish, speed):
                         await _move(robot, goal, next(ids))
-                    await _done(sleep(wait))
+                    await completed(sleep(wait))
                     marks = sight.marks
                 else:
-                    marks = await _done(look())
-                sight = Observation(marks, (await _done(robot.state())).pose, time.monotonic())
+                    marks = await completed(look())
+                state = await completed(robot.state())
+                sight = Observation(marks, state.pose, time.monotonic(), state.sliders.position)
             wish = wishes.send(sight)
     except StopIteration as end:
         return cast(T, end.value)
@@ -135,7 +136,7 @@ async def drive_async(
         raise
 
 
-async def _done(called: Any) -> Any:
+async def completed(called: Any) -> Any:
     """Return the result of a call, awaited if it is of AsyncRobot."""
     return await called if inspect.isawaitable(called) else called
 
@@ -144,18 +145,18 @@ async def _report(robot: StageRobot, reports: LookReports, message: bytes | None
     if message is None:
         return
     try:
-        await _done(robot._report_look(message))
+        await completed(robot._report_look(message))
     except TrirailError as error:
         reports.lost(error)
 
 
 async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
-    handle: SentMotion = await _done(robot.send(structs.replace(goal, id=goal_id)))
+    handle: SentMotion = await completed(robot.send(structs.replace(goal, id=goal_id)))
     try:
-        check(await _done(handle.wait(GOAL_WITHIN)))
+        check(await completed(handle.wait(GOAL_WITHIN)))
     except BaseException:
         if handle.result is None:
-            await _done(robot.stop())
+            await completed(robot.stop())
         raise
 
 

@@ -41,6 +41,7 @@ from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Overr
 if TYPE_CHECKING:  # numpy, which most programs do without
     from trirail.alignment.alignment_request import AlignmentRequest, Observation
     from trirail.alignment.camera_calibration import CameraCalibration
+    from trirail.alignment.geometry_calibration import GeometryCalibration
     from trirail.alignment.images import Lens
     from trirail.alignment.procedure import Alignment
     from trirail.client.alignment import Look
@@ -391,6 +392,38 @@ class AsyncRobot:
 
         wishes = align(task(calibration)) if calibration is not None else calibrate_and_align(task, looks, approach)
         return await self._converse(look, wishes, speed, wait)
+
+    async def calibrate_geometry(
+        self,
+        look: Look,
+        field: tuple[float, float],
+        *,
+        views: Mapping[str, str] | None = None,
+        lens: Lens = "radial",
+        poses: int = 30,
+        looks: int = 4,
+        approach: Triple | None = None,
+        speed: float = 1.0,
+        wait: float = 0.0,
+    ) -> GeometryCalibration:
+        """Find the stage's own geometry, encoder scales and cameras by the marks of a part; return what to change.
+
+        `field` is the size of the pictures, (columns, rows) in pixels. The stage looks at its pose and after moves of
+        1 mm and 1°, then at poses all over its travel at which marks stay in the pictures: `poses` looks in all, 12 at
+        least; then it returns. They are chosen by the information matrix. `.parameters` are corrections to the
+        configuration by name [m, rad, share], `.deviations` their standard deviations, `.undetermined` the names of
+        those that the looks do not tell, `.residual` how well looks that were held out are predicted, before and
+        after. Nothing is written, and the service keeps its geometry: `trirail align geometry` writes a configuration
+        for its next start. The rest is as for calibrate_camera; needs trirail[analysis].
+        """
+        from trirail.client.alignment import completed
+        from trirail.client.stage_geometry import geometry_task
+
+        info: Info = await completed(self.info())
+        task = geometry_task(info, field, views, lens, poses, looks, approach)
+        from trirail.alignment.geometry_calibration import calibrate_geometry
+
+        return await self._converse(look, calibrate_geometry(task), speed, wait)
 
     async def _converse(
         self, look: Look, wishes: Generator[AlignmentRequest, Observation, T], speed: float, wait: float

@@ -28,14 +28,27 @@ class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     calibration: CameraCalibration
     targets: dict[str, Pair] = {}
     """Targets of the marks [pixel]: their pixels at the calibration's first look, until others are taught."""
+    geometry: str = ""
+    """Checksum of the [geometry] of the calibration; "" where an earlier version did not note it."""
+
+    def is_of_geometry(self, geometry: str) -> bool:
+        """True unless the calibration was made with another geometry."""
+        return self.geometry in ("", geometry)
 
 
 prepare(CalibrationFile)
 
 
-def write(path: Path, robot: str, calibration: CameraCalibration, targets: Marks, made: datetime | None = None) -> None:
+def write(
+    path: Path,
+    robot: str,
+    calibration: CameraCalibration,
+    targets: Marks,
+    made: datetime | None = None,
+    geometry: str = "",
+) -> None:
     """Write the file such that a power cut leaves the old or the new one. Raises FileError."""
-    content = CalibrationFile(VERSION, robot, made or datetime.now(UTC), calibration, dict(targets))
+    content = CalibrationFile(VERSION, robot, made or datetime.now(UTC), calibration, dict(targets), geometry)
     try:
         files.replace(path, msgspec.json.format(msgspec.json.encode(content)) + b"\n")
     except OSError as error:

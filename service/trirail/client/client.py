@@ -211,6 +211,7 @@ class Robot:
     track = _context(AsyncRobot.track, Track)
     calibrate_camera = _conversation(AsyncRobot.calibrate_camera)
     align = _conversation(AsyncRobot.align)
+    calibrate_geometry = _conversation(AsyncRobot.calibrate_geometry)
 
     enable = _call(AsyncRobot.enable)
     disable = _stop(AsyncRobot.disable)
@@ -257,7 +258,13 @@ class Robot:
         is done when its path has ended, whether or not the robot is measured to be there.
         """
         points = points_of(points)  # in the caller's thread: an iterator of theirs may call this robot
-        how: dict[str, Any] = {"stretch": stretch, "settle": settle, "go_there": go_there, "marks": marks, "stop_at": stop_at}
+        how: dict[str, Any] = {
+            "stretch": stretch,
+            "settle": settle,
+            "go_there": go_there,
+            "marks": marks,
+            "stop_at": stop_at,
+        }
         return GoalHandle(self._loop.call(self._robot.follow(points, **how, id=id)), self._loop, self.command)
 
     # ------------------------------------------------------------------ what the service tells

@@ -9,10 +9,12 @@ import msgspec
 import tomlkit
 from tomlkit.items import Table
 from trirail_drivers.config import Drives
-from trirail_drivers.interface import NAMES
+from trirail_drivers.interface import NAMES, Triple
 
-from trirail.config import Config, parse
+from trirail.config import Config, geometry, parse
+from trirail.config.as_built import geometry_of
 from trirail.errors import ConfigError
+from trirail.kinematics.geometry import Geometry
 
 
 def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
@@ -35,6 +37,54 @@ def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
     if parse(result) != replace_values(parse(text), changes):
         raise ConfigError(f"changes {dict(changes)}: cannot be written into this file; edit it by hand")
     return result
+
+
+def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | None) -> str:
+    """Return a configuration's text with the legs of `robot`, encoder scales corrected by `scales`, and another map.
+
+    A slider moves by 1 + scale for a metre by its encoder. A correction map of the old geometry is left out; `map_file`
+    names the one that takes its place, or None. Raises ConfigError if the result is not a valid configuration, or
+    differs in any other value.
+    """
+    document = tomlkit.parse(text)
+    if "correction" in document:
+        for key in ("map", "as_built"):
+            document["correction"].pop(key, None)
+    before = parse(tomlkit.dumps(document))
+    section = document["geometry"]
+    rows = [{key: _rounded(value) for key, value in leg.keys().items()} for leg in robot.each]
+    if "leg" in section:
+        for table, row in zip(section["leg"], rows, strict=True):
+            for key, value in row.items():
+                if key not in table or table[key] != value:
+                    table[key] = value
+    else:
+        section.remove("l0")
+        legs = tomlkit.aot()
+        for row in rows:
+            legs.append(tomlkit.item(row))
+        section["leg"] = legs
+    counts = {
+        f"drives.{name}.counts_per_metre": float(f"{drive.counts_per_metre / (1.0 + scale):.10g}")
+        for name, drive, scale in zip(NAMES, before.drives.each, scales, strict=True)
+    }
+    result = edit_text(tomlkit.dumps(document), counts)
+    after = parse(result)
+    expected = msgspec.structs.replace(replace_values(before, counts), geometry=after.geometry)
+    if after != expected or geometry_of(geometry(after.geometry)) != geometry_of(robot):
+        raise ConfigError("the new geometry cannot be written into this file; edit it by hand")
+    if map_file is None:
+        return result
+    document = tomlkit.parse(result)
+    document.setdefault("correction", tomlkit.table())["map"] = map_file
+    return tomlkit.dumps(document)
+
+
+def _rounded(value: object) -> object:
+    """Return numbers rounded to a nanometre or nanoradian, which is all that a checksum of the geometry tells."""
+    if isinstance(value, tuple):
+        return [round(each, 9) for each in value]
+    return round(value, 9) if isinstance(value, float) else value
 
 
 def replace_values(config: Config, changes: Mapping[str, int | float]) -> Config:
@@ -75,12 +125,12 @@ def resolve_eds_paths(text: str, folder: Path) -> str:
     return tomlkit.dumps(document)
 
 
-def find_free_path(path: Path) -> Path:
-    """Return an unused path beside a configuration, for the corrected one."""
-    number, free = 1, path.with_name(f"{path.stem}-commissioned.toml")
+def find_free_path(path: Path, word: str = "commissioned") -> Path:
+    """Return an unused path beside a configuration, with a `word` in its name, for the corrected one."""
+    number, free = 1, path.with_name(f"{path.stem}-{word}.toml")
     while free.exists():
         number += 1
-        free = path.with_name(f"{path.stem}-commissioned-{number}.toml")
+        free = path.with_name(f"{path.stem}-{word}-{number}.toml")
     return free
 
 

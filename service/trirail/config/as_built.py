@@ -7,6 +7,7 @@ trirail.kinematics.correction.
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import tomllib
 import zlib
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from trirail.kinematics.correction import STEEPEST, Correction
 from trirail.kinematics.geometry import Geometry, Room, travels
 from trirail.quantities import worded
 from trirail.wire.decoding import converted, prepare
-from trirail.wire.state import CorrectionTold
+from trirail.wire.state import CorrectionInfo
 
 RESERVE = (0.02, 0.02, 0.07)
 """Share of the sliders' limits of velocity, acceleration and jerk that plans leave free (motion.feasibility.PLANNED).
@@ -83,6 +84,12 @@ def correction(as_built: AsBuilt) -> Correction:
         raise ConfigError(f"correction.as_built.nodes: {error}") from error
 
 
+def measured_today(errors: Correction, robot: Geometry) -> AsBuilt:
+    """Return the map of a correction that was measured today on a robot with this [geometry]."""
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    return AsBuilt(today, geometry_of(robot), errors.low, errors.high, errors.nodes.tolist())
+
+
 def read(path: Path) -> AsBuilt:
     """Read a map's file. Raises ConfigError with the file and the problem in one line."""
     try:
@@ -121,12 +128,12 @@ def format_map(as_built: AsBuilt) -> str:
     )
 
 
-def summary(file: str | None, as_built: AsBuilt | None, backlash: Triple) -> CorrectionTold | None:
+def summary(file: str | None, as_built: AsBuilt | None, backlash: Triple) -> CorrectionInfo | None:
     """Return the summary of a correction for people; None without a correction."""
     if as_built is None:
-        return CorrectionTold("", "", (0.0, 0.0, 0.0), backlash) if any(backlash) else None
+        return CorrectionInfo("", "", (0.0, 0.0, 0.0), backlash) if any(backlash) else None
     x, y, phi = correction(as_built).greatest.tolist()
-    return CorrectionTold(file or "as_built", as_built.made, (x, y, phi), backlash)
+    return CorrectionInfo(file or "as_built", as_built.made, (x, y, phi), backlash)
 
 
 def check(as_built: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, sliders: Sequence[Triple]) -> None:

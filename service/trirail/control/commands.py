@@ -127,7 +127,7 @@ class Commands:
 
     def carry_out(self, request: CommandRequest) -> None:
         """Begin to carry out a command. Raises RefusedError where that is not allowed."""
-        if not request.name.everybodys:
+        if not request.name.ignores_lease:
             self._lease.check(request.user)
         EFFECTS[request.name].begin(self, request)
         self._ledger.undertake(request, self._modes.cycle)

@@ -100,8 +100,8 @@ class Control:
             drives, self.schedule, self._planner, self.ledger, self.goal_queue, self.measured, self.setpoints
         )
         self._commands = Commands(
-            *(config, self.modes, self.lease, self.ledger),
-            *(self.goal_queue, self._planner, self.measured, self.setpoints, self.outputs),
+            *(config, self.modes, self.lease, self.ledger, self.goal_queue),
+            *(self._planner, self.measured, self.setpoints, self.outputs),
         )
         self._returning = ReturningDrives(robot.labels, config.limits.in_position.sliders)
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
@@ -131,7 +131,9 @@ class Control:
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         if stopped_now or self.ledger.busy or mode in (Mode.ENABLING, Mode.HOMING):
             return None
-        self.outputs.follow_mode(mode)
+        if self.outputs.any:
+            self.outputs.follow_mode(mode)
+            self._drives.set_outputs(self.outputs.words.tolist())
         if len(runs) > 1 or (mode is Mode.STOPPING and not runs):
             return None
         run = runs[0] if runs and not follows else None

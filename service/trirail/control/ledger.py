@@ -206,7 +206,7 @@ class Ledger:
     def is_all_of(self, user: str | None) -> bool:
         """Whether all goals and commands under way that need the lease belong to a user."""
         commands = (request for under_way in self._commands.values() for request, _ in under_way)
-        senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.everybodys]
+        senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.ignores_lease]
         return all(sender == user for sender in senders)
 
     def refuse(self, request: GoalRequest | CommandRequest, refusal: RefusedError) -> None:

@@ -213,10 +213,10 @@ class Outputs:
         output = self._find(name)
         if mode in (Mode.DISABLED, Mode.FAULT) and not output.always:
             code = RefusalCode.FAULT if mode is Mode.FAULT else RefusalCode.NOT_ENABLED
-            safe = "on" if output.safe else "off"
+            safe, where = "on" if output.safe else "off", "in fault" if mode is Mode.FAULT else mode
             raise RefusedError(
                 code,
-                f"output {name!r} keeps its safe value, {safe}, while the robot is {'in ' * (mode is Mode.FAULT)}{mode}: "
+                f"output {name!r} keeps its safe value, {safe}, while the robot is {where}: "
                 "send enable first, or set always = true in its section of the configuration",
             )
         row = self.state[self._names.index(name)]

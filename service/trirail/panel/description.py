@@ -66,7 +66,7 @@ def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dic
         "homes": info.homes,
         "sliders": robot.geometry.labels,
         "resolution": MICROMETRES if platform.x[1] - platform.x[0] <= STAGE else MILLIMETRES,
-        "everybodys": [each.value for each in Command if each.everybodys],
+        "ignores_lease": [each.value for each in Command if each.ignores_lease],
         "legs": [
             {
                 "anchor": leg.anchor,

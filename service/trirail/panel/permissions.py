@@ -11,5 +11,7 @@ GOAL, POSES, TAKEOVER = "goal", "poses", "takeover"
 
 def permissions(role: Role | None, takeover: Role) -> frozenset[str]:
     """Return the permissions of a role, none for None; `takeover` is the lowest role that may take the lease over."""
-    least = {GOAL: access.GOALS, POSES: access.POSES, TAKEOVER: takeover} | {each.value: each.role for each in Command}
+    least = {GOAL: access.GOAL_ROLE, POSES: access.POSE_ROLE, TAKEOVER: takeover} | {
+        each.value: each.role for each in Command
+    }
     return frozenset(what for what, needed in least.items() if role is not None and role.includes(needed))

@@ -25,7 +25,7 @@ from trirail.processes.heartbeats import BEAT_EVERY, PROCESSES, Heartbeats
 from trirail.processes.order import Order
 from trirail.processes.ports import Ports
 from trirail.wire import links
-from trirail.wire.links import Closed
+from trirail.wire.links import LinkClosed
 from trirail.wire.messages import Event
 from trirail.wire.plan_packets import Overtaken, decode_plan_request, encode
 
@@ -159,7 +159,7 @@ def _plan(child: Child) -> int:
             if newest is not None:
                 with suppress(Overtaken):
                     link.send(encode(planner.plan(decode_plan_request(newest))))
-    except Closed:
+    except LinkClosed:
         heart.rest()
     return 0
 

@@ -35,7 +35,7 @@ from trirail.processes.trajectory_parts import TrajectoryParts
 from trirail.processes.zenoh_links import Crowding, RouterLinks
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal, TrajectoryGoal
-from trirail.wire.links import Closed, PacketLink
+from trirail.wire.links import LinkClosed, PacketLink
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, ErrorReply, Event, Notice, RoleReply
 from trirail.wire.packets import (
@@ -147,11 +147,11 @@ class Gateway:
                 self._summarize()
                 self._refusals.tell_of_overruns()
                 self._heap.poll()
-        except Closed:
+        except LinkClosed:
             self._hear_the_rest(ready)
             self._tell_of_its_end()
         finally:
-            with contextlib.suppress(Closed):
+            with contextlib.suppress(LinkClosed):
                 self._poses.close()
             self._routers.close()
             for incoming in (*self._requests, *self._parts):
@@ -178,7 +178,7 @@ class Gateway:
                 self._replies.send(incoming, reply)
         except RefusedError as refusal:
             self._refusals.refuse(incoming, refusal)
-        except Closed:
+        except LinkClosed:
             raise
         except Exception as error:  # noqa: BLE001 - a message that is read wrongly must not end the gateway
             self._refusals.refuse(
@@ -224,7 +224,7 @@ class Gateway:
                 return
             answer = decode_answer(content)
             self._on_answer(answer)
-        except Closed:
+        except LinkClosed:
             raise
         except Exception as error:  # noqa: BLE001 - it would come again after every restart
             self._refusals.warn_everyone(
@@ -286,10 +286,10 @@ class Gateway:
 
     def _hear_the_rest(self, ready: Callable[[], None]) -> None:
         """Process the loop's last messages: they may include its farewell."""
-        with contextlib.suppress(Closed):
+        with contextlib.suppress(LinkClosed):
             while (packet := self._link.receive()) is not None:
                 self._loop_death.heard()
-                with contextlib.suppress(Closed):  # the loop receives nothing any more
+                with contextlib.suppress(LinkClosed):  # the loop receives nothing any more
                     self._hear(packet, ready)
 
     def _tell_of_its_end(self) -> None:

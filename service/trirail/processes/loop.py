@@ -25,7 +25,7 @@ from trirail.wire.packets import (
     DrivesFault,
     Request,
 )
-from trirail.wire.records import LONGEST, Part
+from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import Mode
 
 DECIDING_NS = 300_000
@@ -224,7 +224,7 @@ class Loop:
     def _mark(self, part: Part) -> None:
         """Record how long a part of the cycle took, at its end; 0 if a simulated time was ahead."""
         now = time.perf_counter_ns()
-        self._parts_ns[part] = min(max(0, now - self._marked_ns), LONGEST)
+        self._parts_ns[part] = min(max(0, now - self._marked_ns), MAX_PART_NS)
         self._marked_ns = now
 
     def _watch(self, tick: Tick, feedback: Feedback) -> Iterator[Disturbance]:

@@ -77,7 +77,7 @@ class GatewayLink:
 
         Its requests that were read and not handled are dropped: nobody is there to stop their effects.
         """
-        if self._port.take_lost():
+        if self._port.clear_lost():
             self.frozen = False
             self._in_hand.clear()
             return coded("the gateway is gone: controlled stop", EventCode.GATEWAY_LOST)
@@ -134,7 +134,7 @@ class PlannerLink:
             if answer.number == self._awaited:
                 self._awaited = None
             yield answer
-        if self._port.take_lost() and self._awaited is not None:
+        if self._port.clear_lost() and self._awaited is not None:
             self._awaited = None
             yield PlannerLost("the planner has died")
 

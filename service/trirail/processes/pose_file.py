@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 from trirail_drivers import files
@@ -15,12 +16,31 @@ from trirail_drivers.errors import FileError
 
 from trirail.errors import ServiceError
 from trirail.wire.decoding import decoded, prepare
-from trirail.wire.goal_kind import Coordinates, PoseName
+from trirail.wire.goal_kind import Coordinate, Coordinates, PoseName
 
 NAME = "poses.json"
 
-Taught = dict[PoseName, Coordinates]
-"""x, y [m] and phi [rad] of each pose by its name."""
+
+class TaughtPose(NamedTuple):
+    """A taught pose; in the file an array."""
+
+    x: Coordinate
+    """[m]."""
+    y: Coordinate
+    """[m]."""
+    phi: Coordinate
+    """[rad]."""
+    geometry: str = ""
+    """Checksum of the [geometry] with which it was taught; "" where an earlier version did not note it."""
+
+    @property
+    def pose(self) -> Coordinates:
+        """x, y [m] and phi [rad]."""
+        return self.x, self.y, self.phi
+
+
+Taught = dict[PoseName, TaughtPose]
+"""Taught poses by their names."""
 prepare(Taught)
 
 
@@ -62,7 +82,7 @@ class PoseFile:
         """Whether it has been deleted or moved away: its folder is made with it, and it stays without a pose in it."""
         return self.path.parent.is_dir() and not self.path.exists()
 
-    def change(self, name: str, pose: Coordinates | None, known: Taught | None = None) -> None:
+    def change(self, name: str, pose: TaughtPose | None, known: Taught | None = None) -> None:
         """Save a pose under a name, or remove it for None; return once that is on the disk, however long it takes.
 
         Poses that another service of the same robot has written meanwhile stay; if the file has gone, it starts from

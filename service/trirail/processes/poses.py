@@ -17,11 +17,11 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from trirail.config import Config, corrected_geometry
+from trirail.config import Config, as_built, corrected_geometry, geometry
 from trirail.errors import RefusalCode, RefusedError, ServiceError
 from trirail.kinematics.geometry import travels
 from trirail.processes.incoming import Incoming
-from trirail.processes.pose_file import PoseFile, Taught, state_directory
+from trirail.processes.pose_file import PoseFile, Taught, TaughtPose, state_directory
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.goals import Coordinates, Goal, NamedGoal
 from trirail.wire.kinds.pose import pose_in_place_of
@@ -47,7 +47,7 @@ class _Change(NamedTuple):
     incoming: Incoming
     user: str
     name: str
-    pose: Coordinates | None
+    pose: TaughtPose | None
 
 
 class Poses:
@@ -70,6 +70,7 @@ class Poses:
         again: bool = False,
     ) -> None:
         self._geometry = corrected_geometry(config)
+        self._geometry_id = as_built.geometry_of(geometry(config.geometry))
         self._configured = config.poses
         self._file = PoseFile(state_directory(config.robot.name))
         self._lacking = ""
@@ -89,10 +90,16 @@ class Poses:
     def warnings(self) -> tuple[str, ...]:
         """Return warnings, one line each: a file that has gone, names that are now in the configuration."""
         both = sorted(self._taught.keys() & self._configured.keys())
-        gone = tuple(filter(None, (self._lacking, self._gone)))
-        return *gone, *(
+        foreign = sorted(name for name in self._taught.keys() - both if self._is_foreign(self._taught[name]))
+        other = (
+            f"taught with another [geometry]: {', '.join(foreign)}; check each: trirail goto NAME, trirail teach NAME"
+        )
+        return *filter(None, (self._lacking, self._gone, other if foreign else "")), *(
             f"pose {name} is that of [poses]; the taught one is not used: trirail forget {name}" for name in both
         )
+
+    def _is_foreign(self, pose: TaughtPose) -> bool:
+        return pose.geometry not in ("", self._geometry_id)
 
     def poll(self) -> None:
         """Check at intervals that the file of taught poses is still there; announce it if it is not."""
@@ -131,17 +138,20 @@ class Poses:
 
     def table(self) -> NamedPoses:
         """Return all poses."""
-        found = {**self._taught, **self._configured}
-        return NamedPoses(
-            tuple(NamedPose(name, *found[name], taught=name not in self._configured) for name in sorted(found))
-        )
+        named = {name: self._named(name, pose) for name, pose in self._taught.items()}
+        named |= {name: NamedPose(name, *pose, taught=False) for name, pose in self._configured.items()}
+        return NamedPoses(tuple(named[name] for name in sorted(named)))
+
+    def _named(self, name: str, pose: TaughtPose) -> NamedPose:
+        return NamedPose(name, *pose.pose, taught=True, other_geometry=self._is_foreign(pose))
 
     def of_name(self, goal: Goal) -> Goal:
         """Return the pose goal that a named one means; any other goal, and one with an unknown name, unchanged."""
-        pose = (self._configured.get(goal.name) or self._taught.get(goal.name)) if isinstance(goal, NamedGoal) else None
-        if pose is None:
+        if not isinstance(goal, NamedGoal):
             return goal
-        return pose_in_place_of(goal, *pose)
+        taught = self._taught.get(goal.name)
+        pose = self._configured.get(goal.name) or (taught.pose if taught is not None else None)
+        return goal if pose is None else pose_in_place_of(goal, *pose)
 
     def edit(self, incoming: Incoming, user: str, name: str) -> None:
         """Handle a query on …/teach or …/forget. Raises RefusedError."""
@@ -167,7 +177,7 @@ class Poses:
             wanted = self._to_measure.popleft()
             self._under_way -= 1
             try:
-                self._write(wanted._replace(pose=self._measured(record)))
+                self._write(wanted._replace(pose=TaughtPose(*self._measured(record), self._geometry_id)))
             except RefusedError as refusal:
                 self._refuse(wanted.incoming, refusal)
 
@@ -188,7 +198,7 @@ class Poses:
                 self._taught[change.name] = pose
             else:
                 del self._taught[change.name]
-            self._reply(change.incoming, NamedPose(change.name, *pose, taught=True))
+            self._reply(change.incoming, self._named(change.name, pose))
             text = _words(change)
             self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))
 
@@ -243,7 +253,7 @@ def _words(change: _Change) -> EventText:
     if change.pose is None:
         words = f"pose {change.name} removed by {change.user}"
         return coded(words, EventCode.POSE_REMOVED, pose=change.name, user=change.user)
-    x, y, phi = (f"{round(value, 4) + 0.0:g}" for value in np.array(change.pose) * (1e3, 1e3, np.degrees(1.0)))
+    x, y, phi = (f"{round(value, 4) + 0.0:g}" for value in np.array(change.pose.pose) * (1e3, 1e3, np.degrees(1.0)))
     words = f"pose {change.name} taught by {change.user}: x {x} mm, y {y} mm, phi {phi}°"
-    x_m, y_m, phi_rad = change.pose
+    x_m, y_m, phi_rad = change.pose.pose
     return coded(words, EventCode.POSE_TAUGHT, pose=change.name, user=change.user, x=x_m, y=y_m, phi=phi_rad)

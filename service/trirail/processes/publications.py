@@ -19,7 +19,7 @@ from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import Event
 from trirail.wire.packets import Status, Welcome
 from trirail.wire.state import (
-    Commanded,
+    CommandedMotion,
     FrameCounts,
     GoalState,
     Info,
@@ -161,7 +161,7 @@ class StateMaker:
             pose=Pose(*row["pose"].tolist()),
             velocity=_triple(self._velocity),
             acceleration=_triple(self._acceleration),
-            commanded=Commanded(
+            commanded=CommandedMotion(
                 pose=Pose(*row["commanded_pose"].tolist()),
                 pose_velocity=_triple(row["commanded_pose_velocity"]),
                 pose_acceleration=_triple(row["commanded_pose_acceleration"]),

@@ -38,7 +38,7 @@ from trirail.processes.cycle_frames import (
     take_frames,
 )
 from trirail.processes.heartbeats import HASTE
-from trirail.wire.records import LONGEST, Part
+from trirail.wire.records import MAX_PART_NS, Part
 
 _GONE: Final = (0x008 | 0x010) << 16
 """POLLERR and POLLHUP of poll.h, at the place of `revents`."""
@@ -144,7 +144,7 @@ def _wait(state: NDArray[np.void], moment: NDArray[np.int64], doors: NDArray[np.
 def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None:
     """Record how long a part of the cycle took, at its end."""
     now = _now_ns(state, moment)
-    state[0].parts_ns[part] = min(now - state[0].marked_ns, LONGEST)
+    state[0].parts_ns[part] = min(now - state[0].marked_ns, MAX_PART_NS)
     state[0].marked_ns = now
 
 

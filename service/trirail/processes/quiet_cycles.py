@@ -18,7 +18,7 @@ from trirail.processes.heartbeats import HASTE, PROCESSES, Haste, Heartbeats, Wa
 from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port
-from trirail.wire.records import LONGEST, Part
+from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import MODES
 
 _NAMES = quiet.STATE.names or ()
@@ -102,7 +102,7 @@ class QuietCycles:
         wait to be sent behind it. At the end of a batch the next call continues, if no message has come meanwhile.
         """
         control, state = self._control, self._state[0]
-        if not ((once or self._reports.idle) and self._gateway.calm and self._goes_on()):
+        if not ((once or self._reports.idle) and self._gateway.no_peer_lost and self._goes_on()):
             self.leave()
             return None
         watch = self._watch
@@ -164,7 +164,7 @@ class QuietCycles:
     def add(self, part: Part) -> None:
         """Add the time since the newest cycle to a part of it; none if a simulated time is ahead."""
         passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
-        self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, LONGEST)
+        self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, MAX_PART_NS)
 
     def _write_state(self, calm: Calm) -> None:
         state, run = self._state[0], calm.run

@@ -23,7 +23,7 @@ from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import Standing
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.event_codes import EventCode, EventText, coded
-from trirail.wire.links import Closed, PacketLink
+from trirail.wire.links import LinkClosed, PacketLink
 from trirail.wire.messages import Level, Notice
 from trirail.wire.packets import (
     Announcement,
@@ -133,7 +133,7 @@ class Intake:
 
     def _send(self, said: RecorderSaid) -> bool:
         """Send a packet to the loop; return False if that takes no more now, or has gone."""
-        with contextlib.suppress(Closed):
+        with contextlib.suppress(LinkClosed):
             return self._link.send(message(said))
         return False
 
@@ -172,7 +172,7 @@ def main(
             if config.telemetry.metrics_port and time.monotonic() >= told + TOLD_EVERY:
                 told = time.monotonic()
                 measured(RecorderMeasured(*intake.recorder.missing))
-    except Closed:
+    except LinkClosed:
         intake.loop_gone()
     finally:
         heart.rest()  # files take their time to be completed

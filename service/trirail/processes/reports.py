@@ -29,7 +29,7 @@ from trirail.wire.packets import (
     event_packet,
     message,
 )
-from trirail.wire.records import HEAD, SIZE
+from trirail.wire.records import HEADER, SIZE
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import MODES
 
@@ -102,7 +102,7 @@ class Reports:
         """Append the newest cycle's record."""
         control = self._control
         ticks = control.modes.cycle, tick.deadline_ns, tick.lateness_ns, overruns
-        HEAD.pack_into(self._made, 0, *ticks, *parts_ns, MODES.index(control.state.mode))
+        HEADER.pack_into(self._made, 0, *ticks, *parts_ns, MODES.index(control.state.mode))
         begin = 1 + self.batched * SIZE
         self._batch[begin : begin + SIZE] = self._made
         self.batched += 1
@@ -188,7 +188,7 @@ class Reports:
     def listen(self) -> None:
         """Announce the recorder's messages, and its loss."""
         packet = self._recorder.receive()
-        if self._recorder.take_lost() and self._recorded:
+        if self._recorder.clear_lost() and self._recorded:
             self._recorded = False
             self._unrecorded = "the recorder has gone: nothing is recorded until it is back"
             lost = coded(self._unrecorded, EventCode.RECORDER_LOST)

@@ -25,7 +25,7 @@ from trirail.processes.replies import Replies
 from trirail.processes.session_guard import Guard
 from trirail.wire.goals import Goal
 from trirail.wire.links import PacketLink
-from trirail.wire.looks import WELL, AlignmentLook, in_words, look_text
+from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, alignment_event_text, in_words
 from trirail.wire.messages import CommandReply, ErrorReply, Level, Notice
 from trirail.wire.packets import CommandRequest, GoalRequest, message
 from trirail.wire.stop_protocol import STOPS
@@ -239,7 +239,7 @@ class CommandReader:
         if goal is not None and self._inbox.earlier(incoming.number):
             self._of_unread.add(ticket)
             backlog.withdraw_coming(goal, reason, incoming.number)
-        if name.stops and goal is None and (name.everybodys or self._states.lease in (None, user)):
+        if name.stops and goal is None and (name.ignores_lease or self._states.lease in (None, user)):
             backlog.withdraw_all(reason, incoming.number)
 
 
@@ -258,8 +258,8 @@ class Looks:
         if self._pace.wait(user, now) > 0.0:
             raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks a second: send fewer")
         self._pace.count(user, now)
-        level: Level = "info" if look.end in WELL else "warning"
-        text = look_text(look, in_words(look))
+        level: Level = "info" if look.end in SUCCESSFUL_ENDS else "warning"
+        text = alignment_event_text(look, in_words(look))
         if not self._announce(Notice("alignment", level, text.text, user=user, alignment=look, **text.fields)):
             raise RefusedError(RefusalCode.BUSY, "the loop takes no more now: send it again")
         return look

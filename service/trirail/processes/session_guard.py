@@ -15,7 +15,7 @@ from trirail.processes.stop_door import Answer, StopDoor
 from trirail.wire import tls, zenoh_session
 from trirail.wire.access import access_control
 from trirail.wire.credentials import Admission, Credentials
-from trirail.wire.dialling import why_not
+from trirail.wire.dialling import connection_problem
 from trirail.wire.endpoints import ReachableBy, reach, same_port, socket_file, tcp_address
 from trirail.wire.stop_protocol import StopRequest, command_of, stop_address
 from trirail.wire.text import quoted
@@ -105,7 +105,7 @@ class Guard:
 
     def why_not_linked(self, endpoint: str) -> str:
         """Return the obstacle to a link with an endpoint of `connect`, "" if none is seen; it may take seconds."""
-        return why_not(endpoint, self._credentials, self._router)
+        return connection_problem(endpoint, self._credentials, self._router)
 
     def role(self, user: str) -> Role | None:
         """Return a user's role: the highest if no certificates are required, None for an unknown user."""

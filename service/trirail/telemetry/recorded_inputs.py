@@ -13,7 +13,7 @@ import msgspec
 
 from trirail.wire.decoding import converted, decoded, prepare
 from trirail.wire.event_codes import EventCode
-from trirail.wire.looks import AlignmentLook, look_text
+from trirail.wire.looks import AlignmentLook, alignment_event_text
 from trirail.wire.messages import GoalReply, Notice
 from trirail.wire.packets import Announcement, ControlInput
 from trirail.wire.plan_packets import Extended, Planned
@@ -99,7 +99,7 @@ def _announcement(entry: _Line) -> _Line:
     notice |= {field: entry[recorded] for field, recorded in fields.items() if recorded in entry}
     if "alignment" in notice:
         look = converted(notice["alignment"], AlignmentLook)
-        notice |= look_text(look, str(notice.get("message"))).fields
+        notice |= alignment_event_text(look, str(notice.get("message"))).fields
     return {"type": Announcement.__name__, "notice": notice}
 
 

@@ -16,7 +16,7 @@ from trirail.errors import ServiceError
 from trirail.telemetry.journal import Line
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.packets import ControlInput, GoalRequest
-from trirail.wire.records import DTYPE, PARTS
+from trirail.wire.records import DTYPE, PART_NAMES
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import MODES
 
@@ -195,7 +195,7 @@ def _columns(name: str, values: NDArray[np.void]) -> Iterator[tuple[str, pa.Arra
     elif values.ndim == 1:
         yield name, pa.array(np.ascontiguousarray(values))
     else:
-        ends = PARTS if name == "parts_ns" else _COORDINATES if "pose" in name else _SLIDERS
+        ends = PART_NAMES if name == "parts_ns" else _COORDINATES if "pose" in name else _SLIDERS
         for place, end in enumerate(ends):
             yield f"{name}_{end}", pa.array(np.ascontiguousarray(values[:, place]))
 

@@ -1,1 +1,1 @@
-"""What goes between processes and over Zenoh: messages, packets, records, and the connections that carry them."""
+"""Messages, packets and records between processes and over Zenoh, and the connections that carry them."""

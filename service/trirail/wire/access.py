@@ -1,9 +1,9 @@
-"""Who may do what on the network: the roles, and Zenoh's access control made of them.
+"""Permissions on the network: the roles, and Zenoh's access control derived from them.
 
-Zenoh has one set of rules for each certificate's common name and one for every certificate; what no rule allows is
-dropped, without a word to whoever sent it. Each direction is a rule of its own: what the robot publishes may leave and
-not come in, so nobody else's state, event or answer reaches a client; what clients ask may come in and not leave.
-A rule holds where its key includes the message's: who asks for `goal/*` is not allowed for being allowed `goal/ann`.
+Zenoh applies one set of rules to each certificate's common name and one to every certificate. It drops a message that
+no rule allows, and the sender is not informed. Each direction has its own rule: the robot's publications may leave but
+not enter, so no other user can forge a state, event or reply; clients' queries may enter but not leave.
+A rule applies if its key expression includes that of the message: permission for `goal/ann` does not permit `goal/*`.
 """
 
 from __future__ import annotations
@@ -14,41 +14,42 @@ from typing import Any
 from trirail.wire.vocabulary import Command, Role
 from trirail.wire.zenoh_session import key
 
-GOALS = Role.OPERATOR
-"""The least role that may send goals, and tell of the looks of an alignment, which sends some."""
-POSES = Role.MAINTAINER
-"""The least role that may teach and remove poses."""
+GOAL_ROLE = Role.OPERATOR
+"""Lowest role that may send goals, and report the looks of an alignment, which sends goals."""
+POSE_ROLE = Role.MAINTAINER
+"""Lowest role that may teach and remove poses."""
 
 PUBLISHED = ("state", "summary", "event", "records")
-"""What the robot alone publishes."""
+"""Keys on which only the robot publishes."""
 
 _Rule = dict[str, Any]
 
 
 def least_role(*parts: str) -> Role:
-    """Return the least role that may use the resource of these parts of a robot's key, as ("cmd", user, "enable")."""
+    """Return the lowest role that may use a resource, given as parts of its key, such as ("cmd", user, "enable")."""
     if parts[0] in ("goal", "alignment"):
-        return GOALS
+        return GOAL_ROLE
     if parts[0] in ("teach", "forget"):
-        return POSES
+        return POSE_ROLE
     return Command(parts[2]).role if parts[0] == "cmd" else Role.VIEWER
 
 
 def access_control(robot: str, users: Mapping[str, Role], router: str | None = None) -> dict[str, Any]:
-    """Return section access_control of Zenoh's configuration for the service of a robot with these users.
+    """Return section access_control of Zenoh's configuration for the service of a robot.
 
-    A user sends in his own name only: the key has it, and the rule is for the certificate of that common name. Every
-    certificate may ask for its role, so that who is denied all else can learn why. What comes through a router has no
-    user's certificate: the certificate of that common name may all, in every name, and has its users' rules itself.
+    Users can send only in their own name: the key contains it, and the rule applies to the certificate with that
+    common name. Every certificate may query its role, so that a user without permissions can find out why. Messages
+    through a router do not carry a user's certificate: the router may send in every name, and enforces the rules of
+    its users itself.
     """
-    asking, using = list(_of_every_certificate(robot)), list(_of_every_user(robot))
+    asking, using = list(_certificate_rules(robot)), list(_viewer_rules(robot))
     rules, policies = asking + using, [_policy("every certificate", asking)]
     if router is not None:
-        through = list(_of_router(robot))
+        through = list(_router_rules(robot))
         rules += through
         policies.append(_policy(router, using + through))
     for user, role in users.items():
-        own = list(_of_user(robot, user, role))
+        own = list(_user_rules(robot, user, role))
         rules += own
         policies.append(_policy(user, using + own))
     return {
@@ -56,7 +57,7 @@ def access_control(robot: str, users: Mapping[str, Role], router: str | None = N
         "default_permission": "deny",
         "rules": rules,
         "subjects": [
-            {"id": "every certificate", "link_protocols": ["tls"]},  # no user is called so: his name has no space
+            {"id": "every certificate", "link_protocols": ["tls"]},  # not a possible user: names have no spaces
             *map(_subject, (*users, *([router] if router is not None else []))),
         ],
         "policies": policies,
@@ -68,16 +69,21 @@ def router_access_control(
 ) -> dict[str, Any]:
     """Return section access_control for a router between robots and users.
 
-    Its users may with every robot what they may with one. `behind` has who dials it: a robot with itself, or another
-    router with the robots behind that. Either may what robots let their router do, the other way round, and that with
-    keys of these robots only. The robot that is asked tells a user's role. `router` is one that it dials itself, as a
-    robot does.
+    Parameters
+    ----------
+    behind
+        Robots that each connecting robot or router speaks for: the robot itself, or the robots behind that router.
+        Their rules mirror those of a robot for its router, limited to the keys of these robots.
+    users
+        Roles of the users, which apply to every robot. The robot itself answers queries for a role.
+    router
+        Common name of another router that this one connects to.
     """
     section = access_control("*", users, router)
     for name, robots in behind.items():
         through: list[_Rule] = []
         for robot in robots:
-            rules = (*_of_every_certificate(robot), *_of_every_user(robot), *_of_router(robot))
+            rules = (*_certificate_rules(robot), *_viewer_rules(robot), *_router_rules(robot))
             through += [_mirrored(f"{name}: {robot}", rule) for rule in rules]
         section["rules"] += through
         section["policies"].append(_policy(name, through))
@@ -85,55 +91,55 @@ def router_access_control(
     return section
 
 
-def _of_every_certificate(robot: str) -> Iterator[_Rule]:
+def _certificate_rules(robot: str) -> Iterator[_Rule]:
     role = key(robot, "role", "*")
     yield _rule("ask for a role", "ingress", ("query",), role)
     yield _rule("answer with a role", "egress", ("declare_queryable", "reply"), role)
 
 
-def _of_router(robot: str) -> Iterator[_Rule]:
-    """Yield what only a router may beside what every user may: pass on what users send, in the name of each."""
-    yield from _of_user(robot, "*", Role.MAINTAINER)
+def _router_rules(robot: str) -> Iterator[_Rule]:
+    """Yield the rules for a router alone: it may forward messages in the name of every user."""
+    yield from _user_rules(robot, "*", Role.MAINTAINER)
 
 
 def _mirrored(name: str, rule: _Rule) -> _Rule:
-    """A rule of a robot's, as its other side has it: what may leave here comes in there."""
+    """Return a robot's rule for the other end of the connection, with the directions swapped."""
     (flow,) = rule["flows"]
     return rule | {"id": f"{name}: {rule['id']}", "flows": ["egress" if flow == "ingress" else "ingress"]}
 
 
-def _of_every_user(robot: str) -> Iterator[_Rule]:
-    """Yield what a viewer may, but for what has his name in its key; and what the robot may send to him."""
+def _viewer_rules(robot: str) -> Iterator[_Rule]:
+    """Yield the rules for every user: a viewer's, except for keys with the user's name, and the robot's replies."""
     published = [key(robot, name) for name in PUBLISHED]
-    # Of the advanced publisher: its past, that it is there, and the number of its last event.
+    # Keys of the advanced publisher: its history, its liveliness token, and the number of its last event.
     past, alive = key(robot, "event", "@adv", "**"), key(robot, "alive")
-    told = [key(robot, "info"), key(robot, "poses")]
+    info_keys = [key(robot, "info"), key(robot, "poses")]
     taught = [key(robot, name, "*", "*") for name in ("teach", "forget")]
-    asked = [key(robot, "goal", "*"), key(robot, "alignment", "*"), key(robot, "cmd", "*", "*"), *taught, *told]
+    asked = [key(robot, "goal", "*"), key(robot, "alignment", "*"), key(robot, "cmd", "*", "*"), *taught, *info_keys]
     yield _rule("publish", "egress", ("put",), *published, past)
     yield _rule("subscribe", "ingress", ("declare_subscriber",), *published, past)
-    # A fleet's clients subscribe to all robots at once; what they then see of this one is its own.
+    # A fleet client subscribes to all robots with one key expression; it receives only this robot's publications.
     yield _rule("subscribe to all", "ingress", ("declare_subscriber",), *(key("*", name) for name in PUBLISHED))
-    yield _rule("ask", "ingress", ("query",), *told, past)
+    yield _rule("ask", "ingress", ("query",), *info_keys, past)
     yield _rule("listen", "egress", ("declare_queryable",), *asked, past)
     yield _rule("listen to puts", "egress", ("declare_subscriber",), key(robot, "goal", "*"))
     yield _rule("answer", "egress", ("reply",), *asked, past, *published)
-    # Clients look for every robot's at once; what they then see of this one is its own.
-    looked = ("liveliness_query", "declare_liveliness_subscriber")
+    # Clients query the liveliness of all robots with one key expression; they receive only this robot's.
+    presence = ("liveliness_query", "declare_liveliness_subscriber")
     here = key(robot, "here", "*")
-    yield _rule("look who is there", "ingress", looked, key("*", "alive"), here, past)
+    yield _rule("look who is there", "ingress", presence, key("*", "alive"), here, past)
     yield _rule("be there", "egress", ("liveliness_token", "reply"), alive, here, past)
 
 
-def _of_user(robot: str, user: str, role: Role) -> Iterator[_Rule]:
-    """Yield what has a user's name in its key."""
+def _user_rules(robot: str, user: str, role: Role) -> Iterator[_Rule]:
+    """Yield the rules for keys that contain a user's name."""
     commands = [key(robot, "cmd", user, command) for command in Command if role.includes(command.role)]
     yield _rule(f"{user} commands", "ingress", ("query",), *commands)
     yield _rule(f"{user} is there", "ingress", ("liveliness_token",), key(robot, "here", user))
-    if role.includes(POSES):
+    if role.includes(POSE_ROLE):
         poses = [key(robot, name, user, "*") for name in ("teach", "forget")]
         yield _rule(f"{user} teaches poses", "ingress", ("query",), *poses)
-    if role.includes(GOALS):
+    if role.includes(GOAL_ROLE):
         yield _rule(f"{user} sends goals", "ingress", ("query", "put"), key(robot, "goal", user))
         yield _rule(f"{user} aligns", "ingress", ("query",), key(robot, "alignment", user))
 

@@ -1,6 +1,7 @@
-"""What comes from outside becomes a value here, or a refusal that says what would be right. Nothing behind it raises.
+"""Decoding and validation of everything that arrives from outside; code behind this boundary need not check it again.
 
-Both ways: keys, goals and commands that come to the service; replies, states, events and records that come to a client.
+Invalid input raises RefusedError with the expected form. The service decodes keys, goals and commands here; clients
+decode replies, states, events and records.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from trirail.wire.vocabulary import Command
 JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
 _READ_AS = {
     "": JSON,
-    "zenoh/bytes": JSON,  # what Zenoh says where nobody said anything
+    "zenoh/bytes": JSON,  # Zenoh's default if the sender gave no encoding
     "zenoh/string": JSON,
     "text/plain": JSON,
     "text/json": JSON,
@@ -37,16 +38,19 @@ prepare(State, Event, Info, NamedPose, NamedPoses, RobotSummary, AlignmentLook)
 
 
 def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
-    """Return the parts of a key after its prefix, as many as are wanted; the first is a user.
+    """Return the parts of a key after its prefix, one for each name in `wanted`.
 
-    Raises RefusedError for wildcards, for too few or too many parts, and for what cannot name a user or a pose.
+    Raises
+    ------
+    RefusedError
+        The key contains wildcards or has another number of parts, or a part is not a valid name of a user or a pose.
     """
     form = "/".join((prefix, *(f"<{name}>" for name in wanted)))
     if "*" in key:
-        raise RefusedError(RefusalCode.WILDCARD, f"{quoted(key)}: name one robot and one user, as {form}")
+        raise RefusedError(RefusalCode.WILDCARD, f"key {quoted(key)} contains a wildcard; send to {form}")
     parts = key.removeprefix(f"{prefix}/").split("/")
     if not key.startswith(f"{prefix}/") or len(parts) != len(wanted):
-        raise RefusedError(RefusalCode.UNKNOWN_KEY, f"{quoted(key)}: no such key; there is {form}")
+        raise RefusedError(RefusalCode.UNKNOWN_KEY, f"key {quoted(key)} does not exist; send to {form}")
     for part, name in zip(parts, wanted, strict=True):
         if name in ("user", "pose"):
             check_name(part, name)
@@ -54,40 +58,40 @@ def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
 
 
 def check_size(size: int) -> None:
-    """Raise RefusedError for more bytes than are decoded."""
+    """Raise RefusedError if a message exceeds the maximum size."""
     if size > MAX_MESSAGE:
         raise RefusedError(RefusalCode.TOO_LARGE, too_large(size))
 
 
 def too_large(size: int) -> str:
-    """Return why a message of so many bytes is refused."""
-    return f"the message has {size} bytes: at most {MAX_MESSAGE} are taken"
+    """Return the refusal of a message with too many bytes."""
+    return f"message: {size} bytes exceed the maximum of {MAX_MESSAGE} bytes"
 
 
 def encoding(name: str) -> str:
-    """Return how a payload is to be read, JSON or MSGPACK. Raises RefusedError where neither is meant."""
+    """Return the format of a payload, JSON or MSGPACK. Raises RefusedError for another encoding."""
     read_as = _READ_AS.get(name.split(";", maxsplit=1)[0])
     if read_as is None:
-        problem = f"encoding {quoted(name)}: JSON ({JSON}, also where none is given) and {MSGPACK} are taken"
+        problem = f"encoding {quoted(name)} is not supported; use {JSON} (the default) or {MSGPACK}"
         raise RefusedError(RefusalCode.UNKNOWN_ENCODING, problem)
     return read_as
 
 
 def decode(payload: bytes, kind: Any, what: str, encoded: str = JSON) -> Any:
-    """Read a message of a kind, a type or union; an empty one is null. Raises RefusedError, beginning with `what`."""
+    """Return a decoded message of a type or union; an empty payload is null. Raises RefusedError, prefixed `what`."""
     check_size(len(payload))
     read_as = encoding(encoded)
     try:
         content = payload or _NULL[read_as]
         return decoded(content, kind) if read_as == JSON else decoder(kind, packed=True).decode(content)
     except RecursionError as error:
-        raise RefusedError(RefusalCode.MALFORMED, f"{what}: nested too deep") from error
+        raise RefusedError(RefusalCode.MALFORMED, f"{what}: nested too deeply") from error
     except (msgspec.MsgspecError, ValueError, OverflowError) as error:
         raise RefusedError(RefusalCode.MALFORMED, f"{what}: {quoted(_plain(error))}") from error
 
 
 def encode(content: msgspec.Struct, encoded: str = JSON) -> bytes:
-    """Write a message as JSON, or as msgpack where that is named."""
+    """Return a message encoded as JSON, or as msgpack if `encoded` is MSGPACK."""
     return msgspec.msgpack.encode(content) if encoded == MSGPACK else msgspec.json.encode(content)
 
 

@@ -1,7 +1,7 @@
-"""Certificates by which robot and users know each other: an authority of one's own, and what it signs. X.509, P-256.
+"""X.509 certificates (P-256) by which robot and users authenticate each other, and the authority that signs them.
 
-A user's certificate is good for a client and no more: nobody can pass himself off as the robot with one. A robot's
-names the addresses at which clients find it, and is good for both sides, since a robot may dial as well.
+A user's certificate is valid for clients only, so it cannot impersonate the robot. A robot's certificate lists the
+addresses at which clients connect, and is valid for both sides, because a robot can also connect to a router.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS = 3650
-"""How long an authority is good [days]."""
-CLOCKS_APART = timedelta(minutes=10)
-"""A certificate is good from so long before it was made: the clocks of two machines differ."""
+"""Validity of an authority's certificate [days]."""
+CLOCK_TOLERANCE = timedelta(minutes=10)
+"""Time before its creation from which a certificate is valid, because the clocks of two machines differ."""
 
 
 class Pair(NamedTuple):
@@ -30,7 +30,7 @@ class Pair(NamedTuple):
 
 
 def authority(robot: str, now: datetime | None = None) -> Pair:
-    """Make an authority: what it signs is known by its certificate."""
+    """Return a new authority: a self-signed certificate and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"{robot} authority")
     builder = (
@@ -51,31 +51,40 @@ def issue(
     serves: bool = False,
     now: datetime | None = None,
 ) -> Pair:
-    """Make a private key and its certificate in this name, good for so many days, signed by an authority.
+    """Return a new private key and its certificate, signed by the authority `by`.
 
-    Only one that `serves` is good for a robot; `addresses` are the host names and IP addresses where clients find it.
+    Parameters
+    ----------
+    name
+        Common name.
+    days
+        Validity.
+    addresses
+        Host names and IP addresses at which clients connect to a robot.
+    serves
+        Make a certificate for a robot or router; otherwise it is valid for clients only.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     return Pair(_certificate(by, name, key.public_key(), days, addresses, serves, now), _key_pem(key))
 
 
 def renew(by: Pair, certificate: bytes, days: float, now: datetime | None = None) -> bytes:
-    """Make a certificate like another one, for the same key, good for so many days from now. Raises ValueError."""
+    """Return a copy of a certificate for the same key, valid for `days` from now. Raises ValueError."""
     old = x509.load_pem_x509_certificate(certificate)
     key = old.public_key()
     if not isinstance(key, ec.EllipticCurvePublicKey):
-        raise ValueError("the certificate's key is none of an elliptic curve")  # noqa: TRY004 - content of a file
+        raise ValueError("the certificate's key is not an elliptic-curve key")  # noqa: TRY004 - content of a file
     return _certificate(by, common_name(old), key, days, addresses_of(old), serves(old), now)
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """Return in whose name a certificate is: that of its common name, "" where it has none or several."""
+    """Return the common name of a certificate; "" if it has none or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
 
 
 def serves(certificate: x509.Certificate) -> bool:
-    """Whether clients take who shows it for a robot or router; a user's is good for a client and no more."""
+    """Whether clients accept the certificate from a robot or router; a user's is valid for clients only."""
     try:
         purposes = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     except x509.ExtensionNotFound:
@@ -98,7 +107,7 @@ def _builder(subject: x509.Name, key: ec.EllipticCurvePublicKey, now: datetime, 
         .subject_name(subject)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - CLOCKS_APART)
+        .not_valid_before(now - CLOCK_TOLERANCE)
         .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
@@ -116,7 +125,7 @@ def _certificate(
     issuer = x509.load_pem_x509_certificate(by.certificate)
     issuer_key = serialization.load_pem_private_key(by.key, password=None)
     if not isinstance(issuer_key, ec.EllipticCurvePrivateKey):
-        raise ValueError("the authority's key is none of an elliptic curve")  # noqa: TRY004 - content of a file
+        raise ValueError("the authority's key is not an elliptic-curve key")  # noqa: TRY004 - content of a file
     identifier = issuer.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if serves else [])]
     builder = (

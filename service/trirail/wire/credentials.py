@@ -1,4 +1,4 @@
-"""The folder by which a robot or a user is known on the network: ca.pem, cert.pem and key.pem, read and checked."""
+"""The folder with which a robot or user authenticates on the network: ca.pem, cert.pem and key.pem."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from trirail.wire.endpoints import ReachableBy, reach
 from trirail.wire.vocabulary import Role
 
 AUTHORITY, CERTIFICATE, KEY, REVOKED = "ca.pem", "cert.pem", "key.pem", "revoked.txt"
-WARNED = timedelta(days=30)
-"""So long before a certificate expires it is told."""
+EXPIRY_NOTICE = timedelta(days=30)
+"""Time before the expiry of a certificate from which a warning is given."""
 
 
 class Credentials(NamedTuple):
-    """What was found in such a folder."""
+    """Content of such a folder."""
 
     folder: Path
     name: str
-    """In whose name the certificate is: a user's, or a robot's; "" where it names nobody."""
+    """Common name of the certificate: a user's or a robot's; "" if it has none."""
     expires: datetime
-    """When it, or that of its authority, ends, whichever is first."""
+    """Expiry of the certificate or that of its authority, whichever is first."""
     addresses: tuple[str, ...]
-    """At which host names and IP addresses clients find a robot; none for a user's."""
+    """Host names and IP addresses at which clients connect to a robot; empty for a user."""
     serves: bool = False
-    """Whether it is a robot's or a router's; a user's is good for a client alone."""
+    """Whether it is a robot's or a router's certificate; a user's is valid for clients only."""
     contents: tuple[bytes, ...] = ()
-    """Contents of the three files, as they were checked."""
+    """Contents of the three files, as checked."""
     copies: tuple[Path, ...] = ()
-    """Files in this process's memory with these contents, in place of those in the folder."""
+    """Files in this process's memory with these contents, used instead of those in the folder."""
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
-        """The authority's certificate, one's own, and its private key."""
+        """Paths of the authority's certificate, the own certificate, and its private key."""
         authority, certificate, key = self.copies or (self.folder / name for name in (AUTHORITY, CERTIFICATE, KEY))
         return authority, certificate, key
 
     def in_memory(self) -> Self:
-        """Return the same with files in this process's memory: what happens in the folder matters no more."""
+        """Return the same credentials with files in this process's memory, independent of changes in the folder."""
         return self._replace(copies=tuple(map(_memory_file, self.contents)))
 
     @classmethod
     def read(cls, folder: Path, now: datetime | None = None) -> Self:
-        """Read and check a folder. Raises ServiceError, with file and remedy, for what cannot open a session."""
-        # Not at the top: whoever needs no certificates does not wait for it.
+        """Return the checked credentials of a folder. Raises ServiceError, with file and remedy, for unusable ones."""
+        # Imported here, because clients without certificates need not wait for it.
         from cryptography import x509
         from cryptography.exceptions import InvalidSignature
         from cryptography.hazmat.primitives.serialization import load_pem_private_key
@@ -72,12 +72,12 @@ class Credentials(NamedTuple):
         now = now or datetime.now(UTC)
         if now < certificate.not_valid_before_utc:
             raise ServiceError(
-                f"{certificate_file}: not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC: "
-                "is this machine's clock right?"
+                f"{certificate_file}: not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC; "
+                "check this machine's clock"
             )
         expires = min(certificate.not_valid_after_utc, authority.not_valid_after_utc)
         if now > expires:
-            raise ServiceError(f"{certificate_file}: expired on {expires:%Y-%m-%d}; trirail keys renew makes a new one")
+            raise ServiceError(f"{certificate_file}: expired on {expires:%Y-%m-%d}; renew it with: trirail keys renew")
         return cls(
             folder,
             common_name(certificate),
@@ -90,75 +90,76 @@ class Credentials(NamedTuple):
     @classmethod
     def read_server(cls, folder: Path) -> Self:
         """Read the folder of a robot or router. Raises ServiceError as `read`, and for a user's."""
-        found = cls.read(folder)
-        if not found.serves:
+        credentials = cls.read(folder)
+        if not credentials.serves:
             raise ServiceError(
-                f"{folder / CERTIFICATE}: the certificate of user {found.name}, with which nobody serves others: "
+                f"{folder / CERTIFICATE}: the certificate of user {credentials.name}, with which nobody serves others: "
                 "trirail keys init or trirail keys robot makes one for a robot or router"
             )
-        return found
+        return credentials
 
     def warning(self, now: datetime | None = None) -> str:
-        """Say that it expires soon; "" where it does not."""
+        """Return a warning that the certificate expires soon; "" if it does not."""
         left = self.expires - (now or datetime.now(UTC))
-        if left > WARNED:
+        if left > EXPIRY_NOTICE:
             return ""
-        return f"the certificate in {self.folder} expires in {left.days} days; trirail keys renew makes a new one"
+        return f"certificate in {self.folder}: expires in {left.days} days; renew it with: trirail keys renew"
 
 
 class Admission(NamedTuple):
-    """Who serves, and who may do what: read once when a service starts, for every start of its gateway."""
+    """Credentials and roles of a service, read once at its start and used at each start of its gateway."""
 
     credentials: Credentials
     users: dict[str, Role]
-    """The role of each user who is not revoked."""
+    """Role of each user that is not revoked."""
 
     @classmethod
     def read(cls, folder: Path, users: Mapping[str, Role]) -> Self:
-        """Read the folder of a robot. Raises ServiceError as `Credentials.read_server` and `revoked`."""
+        """Return the credentials and roles of a robot's folder. Raises ServiceError as its two parts do."""
         return cls(Credentials.read_server(folder), with_role(users, folder))
 
 
 def check_private(key_file: Path) -> None:
-    """Raise ServiceError where others than its owner can read a private key, or, where root owns it, than its group."""
-    found = key_file.stat()
-    if found.st_mode & (0o037 if found.st_uid == 0 else 0o077):
+    """Raise ServiceError if a private key is readable by others than its owner, or than its group if root owns it."""
+    status = key_file.stat()
+    if status.st_mode & (0o037 if status.st_uid == 0 else 0o077):
         raise ServiceError(
-            f"{key_file}: its mode {stat.S_IMODE(found.st_mode):04o} lets others use this private key: "
-            f"chmod 600 {key_file}; if somebody may have read it, revoke it and make another"
+            f"{key_file}: mode {stat.S_IMODE(status.st_mode):04o} lets other users read this private key; run "
+            f"chmod 600 {key_file}, and revoke and replace the key if another user may have read it"
         )
 
 
 def revoked(folder: Path) -> frozenset[str]:
-    """Return the users whose certificates are no longer good, from the file of an authority's folder, one a line.
+    """Return the users whose certificates are revoked, from the list in an authority's folder, one per line.
 
-    Raises ServiceError for one that is there and cannot be read.
+    Raises ServiceError if the list exists but cannot be read.
     """
     file = folder / REVOKED
     return frozenset(_content(file).decode().split()) if file.exists() else frozenset()
 
 
 def with_role(users: Mapping[str, Role], folder: Path) -> dict[str, Role]:
-    """Return the role of each user who is not revoked in an authority's folder. Raises ServiceError as `revoked`."""
+    """Return the roles of the users that are not revoked. Raises ServiceError as `revoked`."""
     without = revoked(folder)
     return {user: role for user, role in users.items() if user not in without}
 
 
 def credentials_for(robot: str, locator: str, folder: Path | str | None = None) -> Credentials | None:
-    """Read what a client needs at a locator: its folder, by default ~/.config/trirail/<robot>; None where nothing is.
+    """Return the credentials that a client needs at a locator; None if it needs none.
 
-    Raises ServiceError for credentials that are no good, or that would not be used.
+    The default folder is ~/.config/trirail/<robot>. Raises ServiceError if the credentials are unusable, or if the
+    locator would not use them.
     """
     if reach(locator) is ReachableBy.CERTIFICATE:
         base = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
         return Credentials.read(Path(folder) if folder is not None else base / "trirail" / robot)
     if folder is not None:
-        raise ServiceError(f"{locator}: credentials are for tls/HOST:PORT; nothing else is encrypted")
+        raise ServiceError(f"{locator}: this protocol does not use credentials; connect to tls/HOST:PORT")
     return None
 
 
 def _memory_file(content: bytes) -> Path:
-    """Return the path of a new file in memory, there for as long as this process."""
+    """Return the path of a new file in memory, which exists until this process ends."""
     descriptor = os.memfd_create("credentials")
     os.write(descriptor, content)
     return Path(f"/proc/self/fd/{descriptor}")
@@ -169,5 +170,5 @@ def _content(file: Path) -> bytes:
         return file.read_bytes()
     except OSError as error:
         raise ServiceError(
-            f"{file}: {error.strerror}; trirail keys makes {AUTHORITY}, {CERTIFICATE} and {KEY}"
+            f"{file}: {error.strerror}; trirail keys creates {AUTHORITY}, {CERTIFICATE} and {KEY}"
         ) from error

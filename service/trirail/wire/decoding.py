@@ -1,8 +1,8 @@
-"""Decoders, one of each type and format: made when the module that needs them is imported, none later.
+"""Decoders, one for each type and format, created when the module that needs them is imported and never later.
 
-msgspec 0.22 puts what it knows of a struct on its class before that is complete, and runs Python until it is: a second
-thread that decodes or converts such a type meanwhile ends the interpreter with SIGSEGV
-(tools/reports/msgspec_first_decode.py). An encoder keeps nothing of a type.
+msgspec 0.22 attaches its type information to a struct's class before that information is complete, and runs Python code
+while it completes it: a second thread that decodes or converts such a type during that time crashes the interpreter
+with SIGSEGV (tools/reports/msgspec_first_decode.py). Encoders store nothing on the class.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Decoder = msgspec.json.Decoder[Any] | msgspec.msgpack.Decoder[Any]
 
 _MADE: dict[Any, tuple[msgspec.json.Decoder[Any], msgspec.msgpack.Decoder[Any]]] = {}
 _MAKING = threading.Lock()
-"""Two modules may be imported at once, and their types have others in common."""
+"""Guard for two modules that are imported concurrently and whose types share others."""
 
 
 def prepare(*kinds: Any) -> None:
-    """Make the decoders of types or unions, and of all that is in them."""
+    """Create the decoders of types or unions, and of all types in them."""
     with _MAKING:
         for kind in kinds:
             if kind not in _MADE:
@@ -33,7 +33,7 @@ def prepare(*kinds: Any) -> None:
 
 
 def decoder(kind: Any, *, packed: bool = False) -> Decoder:
-    """Return the decoder of a prepared type, for JSON or msgpack. Raises LookupError for another type."""
+    """Return the decoder of a prepared type, for JSON or msgpack. Raises LookupError if it is not prepared."""
     if kind not in _MADE:
         raise LookupError(f"{kind!r} is not prepared: its decoder would be made while other threads decode")
     return _MADE[kind][packed]
@@ -44,10 +44,10 @@ def decoded(content: bytes | str, kind: type[T]) -> T: ...
 @overload
 def decoded(content: bytes | str, kind: object) -> Any: ...
 def decoded(content: bytes | str, kind: object) -> Any:
-    """Return the value of a prepared type that JSON says.
+    """Return JSON decoded as a value of a prepared type.
 
-    Raises LookupError, and as msgspec.json.decode; msgspec.ValidationError also where an object has a key twice:
-    decoders take the last, others the first (RFC 8259, 4).
+    Raises LookupError, and the errors of msgspec.json.decode; also msgspec.ValidationError if an object contains a key
+    twice, because some decoders use the last value and others the first (RFC 8259, 4).
     """
     value = decoder(kind).decode(content)  # type: ignore[arg-type]  # JSON may be text
     _KEYS.decode(content if isinstance(content, str) else content.decode())
@@ -58,11 +58,11 @@ def _refuse_twice(pairs: list[tuple[str, object]]) -> None:
     if len({key for key, _ in pairs}) < len(pairs):
         (key, times), *_ = Counter(key for key, _ in pairs).most_common()
         often = "twice" if times == 2 else f"{times} times"
-        raise msgspec.ValidationError(f"{quoted(key)} stands {often}: once would be right")
+        raise msgspec.ValidationError(f"key {quoted(key)} is given {often}; give it once")
 
 
 _KEYS = json.JSONDecoder(object_pairs_hook=_refuse_twice, parse_int=len, parse_float=len)
-"""Looks at keys alone: no numbers are made. It takes as long as the decoder itself, 3 µs for a pose."""
+"""Decoder that checks keys only and does not parse numbers. It takes as long as msgspec's, 3 µs for a pose."""
 
 
 @overload
@@ -70,6 +70,6 @@ def converted(value: object, kind: type[T]) -> T: ...
 @overload
 def converted(value: object, kind: object) -> Any: ...
 def converted(value: object, kind: Any) -> Any:
-    """Return a value of a prepared type from what is built in. Raises LookupError, and as msgspec.convert."""
+    """Return built-in types converted to a prepared type. Raises LookupError, and the errors of msgspec.convert."""
     decoder(kind)
     return msgspec.convert(value, kind)

@@ -1,4 +1,4 @@
-"""What an endpoint of Zenoh lacks, and who reaches it: a machine's users, those of a socket's file, a whole network."""
+"""Validation of Zenoh endpoints, and their reach: this machine's users, those of a socket's file, or the network."""
 
 from __future__ import annotations
 
@@ -8,67 +8,67 @@ from enum import StrEnum
 from pathlib import Path
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
-"""Where a service is, if nothing else is said."""
-LIKE = "an endpoint is protocol/address, as tcp/127.0.0.1:7447"
+"""Endpoint of a service by default."""
+ENDPOINT_SYNTAX = "an endpoint is protocol/address, such as tcp/127.0.0.1:7447"
 _WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
 LAST_PORT = 65535
-_HOST = re.compile(
+_HOST_NAME = re.compile(
     r"(?=.{1,253}$)[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?)*"
 )
 _Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class ReachableBy(StrEnum):
-    """Who can open a session on an endpoint, by what he must have."""
+    """Users that can open a session on an endpoint."""
 
-    FILE = "who may write to the socket's file"
+    FILE = "users with write access to the socket's file"
     MACHINE = "every user of this machine"
-    CERTIFICATE = "who has a role, by his certificate,"
+    CERTIFICATE = "users with a certificate and a role"
     NETWORK = "everybody in the network"
 
 
 def fault_of(endpoint: str) -> str:
-    """Return what an endpoint lacks, and what one looks like, in words; "" where it lacks nothing."""
+    """Return what is wrong with an endpoint, and the expected form; "" if it is valid."""
     protocol, address = _parts(endpoint)
     if "/" not in endpoint or not protocol:
-        return f"the protocol is missing: {LIKE}"
+        return f"the protocol is missing: {ENDPOINT_SYNTAX}"
     if not address:
-        return f"the address is missing: {LIKE}"
+        return f"the address is missing: {ENDPOINT_SYNTAX}"
     if protocol not in _WITH_PORT:
         return ""
     host, colon, port = address.rpartition(":")
     if address.endswith("]") or not colon:
-        return f"the port is missing: {LIKE}"
+        return f"the port is missing: {ENDPOINT_SYNTAX}"
     if not host:
-        return f"the host is missing: {LIKE}"
+        return f"the host is missing: {ENDPOINT_SYNTAX}"
     if ":" in host and not (host.startswith("[") and host.endswith("]")):
-        return f"an IPv6 address is in brackets, and the port behind them, as {protocol}/[::1]:7447"
+        return f"an IPv6 address must be in brackets before the port, such as {protocol}/[::1]:7447"
     if not (port.isascii() and port.isdigit() and len(port) <= len(str(LAST_PORT)) and 1 <= int(port) <= LAST_PORT):
-        return f"its port must be 1 to {LAST_PORT}: {LIKE}"
+        return f"the port must be 1 to {LAST_PORT}: {ENDPOINT_SYNTAX}"
     return ""
 
 
 def tcp_address(endpoint: str) -> tuple[str, int] | None:
-    """Return host and port of an endpoint that has them and takes a port of TCP, None of any other."""
+    """Return host and port of an endpoint with a TCP port; None for any other."""
     protocol, address = _parts(endpoint)
     host, _, port = address.rpartition(":")
     return (host.strip("[]"), int(port)) if protocol in {"tcp", "tls", "ws"} else None
 
 
 def is_host(text: str) -> bool:
-    """Whether it is an IP address or may be a host name (RFC 1123, and with _), without port and protocol."""
+    """Whether a text is an IP address or a possible host name (RFC 1123, or with _), without port and protocol."""
     try:
         ipaddress.ip_address(text)
     except ValueError:
         *_, last = text.split(".")
-        return _HOST.fullmatch(text) is not None and not last.isdigit()
+        return _HOST_NAME.fullmatch(text) is not None and not last.isdigit()
     return True
 
 
 def leads_to(endpoint: str, reached: str) -> bool:
-    """Whether an endpoint that is dialled leads to one that was reached, of whose host the IP address is known.
+    """Whether a configured endpoint can be the connected one, whose host is given by IP address.
 
-    A host name may stand for any address.
+    A host name matches every address.
     """
     (protocol, address), (as_protocol, as_address) = _parts(endpoint), _parts(reached)
     if protocol != as_protocol or protocol not in _WITH_PORT:
@@ -82,7 +82,7 @@ def leads_to(endpoint: str, reached: str) -> bool:
 
 
 def same_port(one: tuple[str, int], other: tuple[str, int]) -> bool:
-    """Whether two hosts and ports cannot be listened on at once; of host names only those that are equal."""
+    """Whether two hosts and ports conflict, so that only one can listen; host names conflict only if equal."""
     if one[1] != other[1]:
         return False
     try:
@@ -93,12 +93,12 @@ def same_port(one: tuple[str, int], other: tuple[str, int]) -> bool:
 
 
 def _covers(every: _Address, other: _Address) -> bool:
-    """Whether one address stands for all of a machine's, the other among them; that of IPv6 also for those of IPv4."""
+    """Whether `every` is the wildcard address and includes the other; that of IPv6 includes IPv4 addresses."""
     return every.is_unspecified and every.version >= other.version
 
 
 def reach(endpoint: str) -> ReachableBy:
-    """Return who reaches an endpoint; the whole network where that is not sure, as for a host name."""
+    """Return the reach of an endpoint; the network if it is uncertain, such as for a host name."""
     protocol = endpoint.partition("/")[0]
     if protocol == "tls":
         return ReachableBy.CERTIFICATE
@@ -108,12 +108,12 @@ def reach(endpoint: str) -> ReachableBy:
 
 
 def endpoint_of(address: str, port: int) -> str:
-    """Return an IP address and a port as an endpoint of TCP."""
+    """Return the TCP endpoint of an IP address and a port."""
     return f"tcp/[{address}]:{port}" if ":" in address else f"tcp/{address}:{port}"
 
 
 def socket_file(endpoint: str) -> Path | None:
-    """Return the file of an endpoint that is a Unix socket, None of any other."""
+    """Return the file of a Unix-socket endpoint; None for any other."""
     protocol, address = _parts(endpoint)
     return Path(address) if protocol == "unixsock-stream" else None
 
@@ -131,6 +131,6 @@ def is_local(endpoint: str) -> bool:
 
 
 def _parts(endpoint: str) -> tuple[str, str]:
-    """The protocol and the address of `protocol/address?metadata#settings`."""
+    """Return protocol and address of `protocol/address?metadata#settings`."""
     protocol, _, rest = endpoint.partition("/")
     return protocol, rest.partition("#")[0].partition("?")[0]

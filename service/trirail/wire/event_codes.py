@@ -50,7 +50,7 @@ class EventCode(StrEnum):
     # Faults.
     FOLLOWING_ERROR = "following_error", "a slider lags too far behind", "slider", "value", "limit"
     ENABLE_TIMEOUT = "enable_timeout", "drives were not enabled in time", "drives", "timeout"
-    BAD_SETPOINT = "bad_setpoint", "the last check has refused a setpoint"
+    BAD_SETPOINT = "bad_setpoint", "the last gate has refused a setpoint"
     BAD_POSITION = "bad_position", "the robot cannot hold at the measured slider positions"
     DRIVE_FAULT = "drive_fault", "a drive or its bus reports a fault", "cause", "drive", "code"
     LOOP_DIED = "loop_died", "the loop's process has died"

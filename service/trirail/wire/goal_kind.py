@@ -1,4 +1,4 @@
-"""What goals of every kind have in common: what they may ask of their kind, and the fields that several have."""
+"""Base class of all goal kinds, and the fields that several kinds share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trirail.wire.sizes import MAX_NAME
 from trirail.wire.text import ID_RULE, is_id, quoted
 
 Identifier = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
-# Floors and ceilings: far beyond what a robot does, far from where numbers lose their digits.
+# The bounds are far beyond every robot's range, and far below magnitudes at which doubles lose precision.
 Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
 """x, y or a slider's position [m], phi [rad], or their velocities."""
 Acceleration = Annotated[float, Meta(ge=-1e6, le=1e6)]
@@ -28,22 +28,22 @@ OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
 FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 Tool = tuple[Coordinate, Coordinate] | FrameName
-"""A point of the platform in its own frame, whose origin is the centre [m], or the name of one in [frames.tool]."""
+"""A point in the platform's frame, whose origin is its centre [m], or the name of a point in [frames.tool]."""
 
 
 def check_fields(message: Struct) -> None:
-    """Refuse ids that cannot be shown, and numbers that are not finite, also in messages that were never decoded."""
+    """Raise ValueError for an unprintable id or a number that is not finite, also if the message was never decoded."""
     for name in message.__struct_fields__:
         value = getattr(message, name)
         if name == "id" and isinstance(value, str) and not is_id(value):
-            raise ValueError(f"id {quoted(value)!r} cannot be shown: {ID_RULE} are taken")
+            raise ValueError(f"id {quoted(value)!r} is not printable; use {ID_RULE}")
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float) and not math.isfinite(number):
-                raise ValueError(f"{name} is {number}: it must be a finite number")
+                raise ValueError(f"{name}: {number} is not a finite number")
 
 
 class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
-    """A goal's own limits for x, y [m] and phi [rad], in place of the platform's; none may be above them."""
+    """A goal's own limits for x, y [m] and phi [rad], at or below those of the platform."""
 
     velocity: OwnTriple | None = None
     """[m/s, m/s, rad/s]."""
@@ -56,8 +56,8 @@ class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
         check_fields(self)
 
 
-# Fields that goals of several kinds have. What they are for stands here alone: schemas, the command line and the table
-# of service/talking.md have it from here.
+# Fields that several kinds share. Schemas, command line and the table of service/talking.md take the descriptions from
+# here.
 OwnId = Annotated[
     Identifier | None,
     Meta(description="your name for the goal, used once; made by the service if absent"),
@@ -87,7 +87,7 @@ AxesFrame = Annotated[FrameName, Meta(description="axes of the move: base, platf
 
 
 def field_description(kind: type[Struct], name: str) -> str:
-    """Return what a field of a kind of goal is for. Raises LookupError where that does not stand in its type."""
+    """Return the description of a field of a goal kind. Raises LookupError if its type has none."""
     for field in structs.fields(kind):
         for meta in getattr(field.type, "__metadata__", ()):
             if field.name == name and isinstance(meta, Meta) and meta.description is not None:
@@ -96,38 +96,38 @@ def field_description(kind: type[Struct], name: str) -> str:
 
 
 class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
-    """What is asked of a goal, whatever its kind: a kind says so where it is not as here, by a field or a constant."""
+    """Properties of a goal of any kind, with defaults that a kind overrides by a field or a class constant."""
 
     follows: ClassVar[bool] = False
-    """Whether it waits for a goal with a `blend` before it, instead of preempting that."""
+    """Whether the goal waits for a preceding goal with a `blend`, instead of preempting it."""
     renewed: ClassVar[bool] = False
-    """Whether it lasts only while it is renewed, by goals of its own kind, id and user, each within its `timeout`."""
+    """Whether the goal lasts only while goals of its kind, id and user renew it, each within its `timeout`."""
     frequent: ClassVar[bool] = False
-    """Whether that is so often that the newest takes the place of one that waits, and one that is refused ends nothing
-    and is told of once."""
+    """Whether renewals are so frequent that the newest replaces a waiting one, and that a refused renewal ends nothing
+    and is reported only once."""
     waits_at_end: ClassVar[bool] = False
-    """Whether it goes on when its path has ended, for as long as it is renewed."""
+    """Whether the goal stays active at the end of its path for as long as it is renewed."""
     timed: ClassVar[bool] = False
-    """Whether what it says is so at a `time`: the wall clock's as it comes, the loop's where it is planned [s]."""
+    """Whether the goal refers to a `time`: wall-clock time when it arrives, loop time when it is planned [s]."""
     greatest_rate: ClassVar[float] = math.inf
-    """At which its motion runs at most, whatever the override: 1 for what has a time of its own."""
+    """Maximum rate of the motion at any override: 1 for goals with their own timing."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
     @property
     def id(self) -> str | None:
-        """The client's name for it."""
+        """The client's id of the goal."""
         return None
 
     @property
     def valid_for(self) -> float | None:
-        """Within which time it has to begin [s]."""
+        """Time within which the goal must start [s]."""
         return None
 
     @property
     def blend(self) -> float | None:
-        """How far from its end the next goal may begin [m]; None where that preempts it."""
+        """Distance from the end at which the next goal may start [m]; None if the next goal preempts this one."""
         return None
 
     @property
@@ -142,35 +142,35 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def settle(self) -> bool:
-        """Whether it is done only when the robot is measured to be in position."""
+        """Whether the goal is done only when the measured position has settled."""
         return not self.renewed
 
     @property
     def lengthy(self) -> bool:
-        """Whether goals of other users are planned before it, since its planning takes long."""
+        """Whether other users' goals are planned first, because planning this one takes long."""
         return False
 
     @property
     def timeout(self) -> float:
-        """After which time it ends unless it has been renewed [s]."""
+        """Time after which the goal ends unless it is renewed [s]."""
         return math.inf
 
     @property
     def time(self) -> float | None:
-        """When what it says is so [s]; None for when it comes."""
+        """Time to which the goal refers [s]; None for its arrival."""
         return None
 
     @property
     def target(self) -> Triple | None:
-        """The pose that it says a moving target has; None where it is after none."""
+        """Pose of the moving target; None if the goal follows none."""
         return None
 
     def at(self, time: float) -> Self:
-        """Return it with another time [s], where it is timed."""
-        raise NotImplementedError(f"{type(self).__name__} has no time: {time} s is none of it")
+        """Return a copy with another time [s], if the kind is timed."""
+        raise NotImplementedError(f"{type(self).__name__} has no time to replace by {time} s")
 
     def check_beginning(self) -> None:
-        """Raise RefusedError for what may renew such a goal, but begin none."""
+        """Raise RefusedError for a message that can renew such a goal, but not start one."""
 
 
 def import_all(package: ModuleType) -> None:

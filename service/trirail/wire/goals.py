@@ -37,15 +37,15 @@ import_all(kinds)
 KINDS: tuple[type[GoalKind], ...] = tuple(
     sorted(set(GoalKind.__subclasses__()) - {PackedTrajectory}, key=lambda kind: kind.__module__)
 )
-"""All that there are: a kind is whatever has a file in trirail.wire.kinds."""
+"""All goal kinds: each has a file in trirail.wire.kinds."""
 
 if TYPE_CHECKING:
     Goal = GoalKind
     LoopGoal = GoalKind
 else:
-    Goal = Union[KINDS]  # noqa: UP007 - of as many as there are
+    Goal = Union[KINDS]  # noqa: UP007 - from a tuple of types
     LoopGoal = Union[(*KINDS, PackedTrajectory)]
-"""A goal of any kind, as it is sent; and as gateway, loop, planner and recordings have it."""
+"""A goal of any kind, as clients send it; and as gateway, loop, planner and recordings represent it."""
 
 
 def kind_name(goal: GoalKind) -> str:

@@ -1,6 +1,6 @@
-"""Connections between the loop and the processes beside it: bounded by the kernel, never waited for by the loop.
+"""Connections between the loop and the other processes; the kernel bounds their buffers, and the loop never blocks.
 
-AF_UNIX sockets of type SEQPACKET keep packets whole and in order.
+AF_UNIX sockets of type SEQPACKET preserve packet boundaries and order.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from pathlib import Path
 from trirail.wire.sizes import MAX_PACKET, MAX_SHARED
 
 _BUFFER = 1 << 22
-"""Bytes the kernel may hold for a peer that is slow: seconds of records, where the rights allow it."""
+"""Bytes that the kernel may buffer for a slow peer: seconds of records, if the process may set it."""
 _DESCRIPTOR = array("i").itemsize
 
 
-class Closed(Exception):
-    """The other side has gone."""
+class LinkClosed(Exception):
+    """The peer has closed the connection."""
 
 
 class TooLarge(Exception):
-    """A packet that is larger than any goal or motion."""
+    """A packet exceeds MAX_SHARED."""
 
 
 class PacketLink:
-    """One side of a connection; neither sending nor receiving ever waits.
+    """One side of a connection; sending and receiving never block.
 
-    A packet above MAX_PACKET is a file in memory whose descriptor is sent: the kernel's limit for a socket's buffer,
-    net.core.wmem_max, is 208 kB as a rule.
+    A packet above MAX_PACKET is written to a file in memory and its descriptor is sent, because the kernel limits a
+    socket's buffer to net.core.wmem_max, usually 208 kB.
     """
 
     def __init__(self, connected: socket.socket) -> None:
@@ -44,13 +44,13 @@ class PacketLink:
         self._arrivals.register(connected, select.POLLIN)
 
     def fileno(self) -> int:
-        """For select and its like."""
+        """Return the file descriptor, for select and poll."""
         return self._socket.fileno()
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
-        """Send a packet; False where the peer is so far behind that the kernel takes no more.
+        """Send a packet; return False if the kernel's buffer is full because the peer is slow.
 
-        Raises Closed when the peer has gone, TooLarge above MAX_SHARED.
+        Raises LinkClosed if the peer has closed the connection, TooLarge above MAX_SHARED.
         """
         shared = len(packet) > MAX_PACKET
         file = _share(packet) if shared else None
@@ -64,45 +64,45 @@ class PacketLink:
         except BlockingIOError:
             return False
         except OSError as error:
-            raise Closed from error
+            raise LinkClosed from error
         finally:
             if file is not None:
                 os.close(file)
         return True
 
     def receive(self) -> bytes | None:
-        """Take the next packet, None if there is none. Raises Closed when the peer has gone."""
-        if not self._arrivals.poll(0):  # a third of what it takes to fail at receiving: most of the loop's cycles
+        """Return the next packet, or None. Raises LinkClosed if the peer has closed the connection."""
+        if not self._arrivals.poll(0):  # a third of the time of a failing recvmsg, and true in most cycles of the loop
             return None
         try:
             packet, beside, *_ = self._socket.recvmsg(MAX_PACKET, _DESCRIPTOR_SPACE, socket.MSG_CMSG_CLOEXEC)
         except BlockingIOError:
             return None
         except OSError as error:
-            raise Closed from error
+            raise LinkClosed from error
         if not packet:
-            raise Closed
+            raise LinkClosed
         return _read_shared(beside[0][2]) if beside else packet
 
     @property
     def ended(self) -> bool:
-        """Whether the peer has gone; what it has sent before may still be there."""
+        """Whether the peer has closed the connection; packets that it sent before may still be waiting."""
         return any(events & (select.POLLHUP | select.POLLERR) for _, events in self._arrivals.poll(0))
 
     def close(self) -> None:
-        """Let the peer see the end."""
+        """Close the connection."""
         self._socket.close()
 
 
 _DESCRIPTOR_SPACE = socket.CMSG_SPACE(_DESCRIPTOR)
 _SHARED = b"\0"
-"""Sent beside a descriptor: a packet without any byte is the end of a connection."""
+"""Byte sent with a descriptor, because an empty packet means the end of the connection."""
 
 
 def _share(packet: bytes | bytearray | memoryview) -> int | None:
-    """Return the descriptor of a file in memory with a packet in it; None where the system has no room for one."""
+    """Return the descriptor of a file in memory that contains a packet; None if the system cannot create it."""
     if len(packet) > MAX_SHARED:
-        raise TooLarge(f"a packet of {len(packet)} bytes: at most {MAX_SHARED} go between the processes")
+        raise TooLarge(f"packet: {len(packet)} bytes exceed the maximum between processes, {MAX_SHARED} bytes")
     with contextlib.suppress(OSError):
         file = os.memfd_create("packet")
         if os.write(file, packet) == len(packet):
@@ -112,16 +112,16 @@ def _share(packet: bytes | bytearray | memoryview) -> int | None:
 
 
 def _read_shared(descriptor: bytes) -> bytes:
-    """Return what is in the file of a descriptor that was received, and close it."""
+    """Return the content of the file of a received descriptor, and close it."""
     (file,) = array("i", descriptor)
     try:
-        return os.pread(file, os.fstat(file).st_size, 0)  # no larger: memory that is not written costs as much
+        return os.pread(file, os.fstat(file).st_size, 0)  # its exact size: a larger buffer would be cleared first
     finally:
         os.close(file)
 
 
 def connect(path: Path) -> PacketLink:
-    """Connect to a port of the loop. Raises OSError where nobody listens."""
+    """Return a connection to a port of the loop. Raises OSError if no process listens."""
     connecting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         connecting.connect(str(path))
@@ -132,7 +132,7 @@ def connect(path: Path) -> PacketLink:
 
 
 def listen(path: Path) -> socket.socket:
-    """Make the socket that a port listens on; a peer may connect from then on, before the loop turns."""
+    """Return the socket of a port; peers may connect from now on, before the loop runs."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listening.bind(str(path))
     listening.listen(1)
@@ -140,7 +140,7 @@ def listen(path: Path) -> socket.socket:
 
 
 class Port:
-    """The loop's side: listens, so that a restarted peer can come back; has one peer at most."""
+    """The loop's side: it keeps listening, so that a restarted peer can reconnect, and has at most one peer."""
 
     def __init__(self, listening: socket.socket) -> None:
         self._listening = listening
@@ -148,29 +148,29 @@ class Port:
         self._link: PacketLink | None = None
         self._lost = False
         self.dropped = 0
-        """Packets that the peer was too slow for, or that are too large."""
+        """Number of packets dropped because the peer was too slow, or the packet too large."""
 
     @property
     def connected(self) -> bool:
-        """Whether there is a peer."""
+        """Whether a peer is connected."""
         return self._link is not None
 
     @property
-    def calm(self) -> bool:
-        """Whether no peer has gone of whom nobody has asked yet."""
+    def no_peer_lost(self) -> bool:
+        """Whether `clear_lost` would return False."""
         return not self._lost
 
     @property
     def ended(self) -> bool:
-        """Whether the peer has gone, and that has not been found by receiving or sending yet."""
+        """Whether the peer has closed the connection and no call has noticed it yet."""
         return self._link is not None and self._link.ended
 
     def fileno(self) -> int:
-        """The peer's descriptor; -1 where there is none."""
+        """Return the peer's descriptor; -1 without a peer."""
         return self._link.fileno() if self._link is not None else -1
 
     def accept(self) -> bool:
-        """Take a peer that waits; True if one has just come."""
+        """Accept a waiting peer; return True if one has connected."""
         if self._link is not None:
             return False
         try:
@@ -181,19 +181,19 @@ class Port:
         return True
 
     def await_peer(self, seconds: float) -> bool:
-        """Wait for a peer, before the loop turns; whether one has come."""
+        """Wait for a peer, before the loop runs; return True if one has connected."""
         select.select([self._listening], [], [], seconds)
         return self.accept()
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
-        """Send if there is a peer that keeps up; what it is too slow for, or is too large, is dropped and counted."""
+        """Send a packet if a peer is connected; one that it cannot take is dropped and counted."""
         if self._link is None:
             return False
         try:
             sent = self._link.send(packet)
         except TooLarge:
             sent = False
-        except Closed:
+        except LinkClosed:
             self.hang_up()
             return False
         if not sent:
@@ -201,28 +201,28 @@ class Port:
         return sent
 
     def receive(self) -> bytes | None:
-        """Take the next packet; None if there is none, or no peer."""
+        """Return the next packet; None without a packet or a peer."""
         if self._link is None:
             return None
         try:
             return self._link.receive()
-        except Closed:
+        except LinkClosed:
             self.hang_up()
             return None
 
-    def take_lost(self) -> bool:
-        """Whether a peer has gone since this was last asked."""
+    def clear_lost(self) -> bool:
+        """Return True if the peer was lost since the last call."""
         lost, self._lost = self._lost, False
         return lost
 
     def hang_up(self) -> None:
-        """Let go of the peer, as if it had gone."""
+        """Drop the peer, as if it had closed the connection."""
         if self._link is not None:
             self._link.close()
             self._link = None
             self._lost = True
 
     def close(self) -> None:
-        """Let go of the peer and of the name."""
+        """Drop the peer and stop listening."""
         self.hang_up()
         self._listening.close()

@@ -1,4 +1,4 @@
-"""What a client tells of an alignment or a calibration while it runs: a message for each look, without pictures."""
+"""Progress of an alignment or calibration, which the client reports in one message per look, without pictures."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from trirail.wire.goal_kind import Coordinate, Coordinates, Identifier, check_fi
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.text import ID_RULE, is_id, quoted
 
-MOST_MARKS = 32
-"""Marks of one look; with names of full length that is 6 kB."""
+MAX_MARKS = 32
+"""Maximum number of marks in one look; with names of full length they take 6 kB."""
 Pixel = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Share = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Count = Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -32,87 +32,87 @@ LookEnd = Literal[
     "still",
     "moves",
 ]
-"""A trirail.alignment.procedure.AlignmentEnd; what else it can end with; a trirail.errors.AlignmentFault."""
-WELL = (None, "reached", "calibrated", "checked")
-"""What goes on, or has ended as it should."""
+"""A trirail.alignment.procedure.AlignmentEnd, another end, or a trirail.errors.AlignmentFault."""
+SUCCESSFUL_ENDS = (None, "reached", "calibrated", "checked")
+"""Ends that are not a failure; None is a look that continues."""
 
 
 class SeenMark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A mark that was found."""
+    """A mark that was found in a picture."""
 
     name: Identifier
     pixel: tuple[Pixel, Pixel]
-    """Where: u, v in its picture; the mean where several pictures were taken."""
+    """u, v in its picture; the mean if several pictures were taken."""
     to_go: tuple[Coordinate, Coordinate] | None = None
-    """From there to its target, x, y in the base frame [m]; None in a calibration."""
+    """Vector from the mark to its target, x, y in the base frame [m]; None in a calibration."""
 
     def __post_init__(self) -> None:
         check_fields(self)
         if not is_id(self.name):
-            raise ValueError(f"mark {quoted(self.name)!r} cannot be shown: {ID_RULE} are taken")
+            raise ValueError(f"mark {quoted(self.name)!r} is not printable; use {ID_RULE}")
 
 
 class LookError(Struct, frozen=True, forbid_unknown_fields=True):
-    """How a part lies away, as one look tells it."""
+    """Deviation of a part, measured by one look."""
 
     worst: Coordinate
-    """The greatest way of a mark by the motion that aligns the part [m]."""
+    """Longest distance that a mark travels in the motion that aligns the part [m]."""
     shift: tuple[Coordinate, Coordinate]
     """Remaining distance of the centre of the marks, x, y [m]."""
     turn: Coordinate
     """Remaining rotation of the part [rad]."""
     misfit: Coordinate
-    """The greatest distance of a mark from its target that no motion takes away [m]."""
+    """Greatest distance of a mark from its target after the best motion [m]."""
     distance: Share
-    """By how much the worst distance of two marks is wrong, as a share of it."""
+    """Greatest relative error of the distance between two marks."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
 class AlignmentLook(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A look, and what follows from it: a correction, the end, or the next move of a calibration."""
+    """A look and its consequence: a correction, the end, or the next move of a calibration."""
 
     id: Identifier
-    """Of the alignment; the ids of its goals begin with it."""
+    """Id of the alignment; the ids of its goals begin with it."""
     purpose: LookPurpose
     number: Count
-    """Of the look, from 1; with an end that came without a look, of the last one."""
-    marks: Annotated[tuple[SeenMark, ...], Meta(max_length=MOST_MARKS)] = ()
+    """Number of the look, from 1; if the end came without a look, number of the last one."""
+    marks: Annotated[tuple[SeenMark, ...], Meta(max_length=MAX_MARKS)] = ()
     error: LookError | None = None
     """None in a calibration."""
     pose: Coordinates | None = None
-    """Where the platform was measured then: x, y [m], phi [rad]."""
+    """Measured pose of the platform at the look: x, y [m], phi [rad]."""
     correction: Coordinates | None = None
-    """The motion of the marks' middle that follows: x, y [m], phi [rad]."""
+    """Motion of the marks' centre that follows: x, y [m], phi [rad]."""
     end: LookEnd | None = None
-    """Why it ends with this look."""
+    """Reason for which the alignment ends with this look."""
     words: Annotated[str, Meta(max_length=MAX_TEXT)] = ""
-    """With an end by an error what that says."""
+    """Message of the error, if it ends with one."""
     noise: Pixel | None = None
-    """With the end calibrated: the standard deviation of a mark's u or v from the residuals [pixel]."""
+    """Standard deviation of a mark's u or v, from the residuals, if it ends as calibrated [pixel]."""
     seconds: Duration = 0.0
-    """Since the first look, on the client's clock."""
+    """Time since the first look, on the client's clock [s]."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
 def in_words(look: AlignmentLook) -> str:
-    """Return a look as a line for people."""
-    said = f"{look.purpose} {look.id}, look {look.number}: {_marks(look)}"
+    """Return a line for people about a look."""
+    line = f"{look.purpose} {look.id}, look {look.number}: {_marks(look)}"
     if look.correction is not None:
         x, y, phi = look.correction
-        said += f"; corrects by x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {phi * 1e6:.1f} µrad"
+        line += f"; corrects by x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {phi * 1e6:.1f} µrad"
     if look.noise is not None:
-        said += f"; residual {look.noise:.3f} pixel"
+        line += f"; residual {look.noise:.3f} pixel"
     if look.end is not None:
-        said += f"; {look.end} after {look.seconds:.2f} s"
-    return said + (f": {look.words}" if look.words else "")
+        line += f"; {look.end} after {look.seconds:.2f} s"
+    return line + (f": {look.words}" if look.words else "")
 
 
-def look_text(look: AlignmentLook, words: str) -> EventText:
-    """Return the words of a look with their code."""
+def alignment_event_text(look: AlignmentLook, words: str) -> EventText:
+    """Return the text of a look with its event code."""
     if look.end is None:
         return coded(words, EventCode.ALIGNMENT_LOOK, id=look.id, purpose=look.purpose, number=look.number)
     return coded(words, EventCode.ALIGNMENT_ENDED, id=look.id, purpose=look.purpose, end=look.end, seconds=look.seconds)

@@ -1,7 +1,7 @@
-"""What clients and service say to each other over Zenoh beside goals: replies, events. SI units and radians.
+"""Replies and events over Zenoh, in SI units and radians.
 
-Commands are in trirail.wire.vocabulary; the state, and what is answered on …/info, in trirail.wire.state. JSON by
-default, msgpack where the encoding says so.
+Goals are in trirail.wire.goals, commands in trirail.wire.vocabulary, the state and the reply on …/info in
+trirail.wire.state. Messages are JSON by default, or msgpack if the encoding names it.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ Level = Literal["info", "warning", "error"]
 Outcome = Literal["done", "rejected", "preempted", "stopped", "expired", "faulted", "unsettled"]
 
 REMEMBERED_IDS = 10_000
-"""Goals whose ids may not be used again; older ones are forgotten."""
+"""Number of the last goals whose ids may not be used again."""
 
 
 class GoalReply(Struct, frozen=True):
-    """A goal was accepted; it ends in exactly one event."""
+    """Acceptance of a goal, which ends with exactly one event."""
 
     id: str
-    """The goal's own, or the one that was made for it."""
+    """Id of the goal, from the client or generated."""
     duration: float | None
-    """Expected time from now to the end of its path [s]; None while the override is zero: then it has no expected end,
-    and for what was told of a target before something newer took its place.
-    It is done when the robot has been in position for the dwell of [limits.in_position] after that."""
+    """Expected time from now to the end of the path [s]. None if the end is unknown: at override zero, and for a target
+    that a newer one has replaced. The goal is done when the robot has then been in position for the dwell of
+    [limits.in_position]."""
     slowed: float = 1.0
-    """How many times slower it is than was asked for, since a slider or the platform may not move so fast."""
+    """Factor by which the motion is slower than requested, to keep the limits of sliders and platform."""
     stops_first: bool = False
-    """The robot stops on its old path first: from its present motion it could not, or would be later."""
+    """Whether the robot first stops on its old path, because a direct transition is impossible or slower."""
     queued: bool = False
-    """It begins when the goals before it are reached."""
+    """Whether the goal starts after the goals before it."""
     lag: float | None = None
-    """Of a track: how far a point of the platform was at most from where the target had it, when this was taken up
-    [m]."""
+    """Greatest distance of a point of the platform from its place at the target, when this was accepted [m]; only for a
+    track."""
     marks: tuple[PlacedMark, ...] = ()
-    """Where each mark of the goal will switch first."""
+    """Place at which each mark of the goal will switch first."""
     accepted: Literal[True] = True
 
     def with_duration(self, duration: float) -> GoalReply:
-        """Return it with another duration [s], which may be infinite."""
+        """Return a copy with another duration [s], which may be infinite."""
         return structs.replace(self, duration=duration if math.isfinite(duration) else None)
 
 
@@ -55,125 +55,124 @@ class CommandReply(Struct, frozen=True):
     """A command was carried out."""
 
     command: str
-    """Its name."""
+    """Name of the command."""
     mode: str
-    """A trirail.wire.vocabulary.Mode: the robot's, when it had been carried out."""
+    """Mode of the robot after the command, a trirail.wire.vocabulary.Mode."""
     seq: int
-    """Of the first State that shows it."""
+    """Number of the first State that shows its effect."""
     ok: Literal[True] = True
 
 
 class RoleReply(Struct, frozen=True):
-    """What a user is to the robot, asked on …/role/<user>; answered to every certificate of the robot's authority."""
+    """Role of a user, in reply to …/role/<user>; every certificate of the robot's authority may query it."""
 
     user: str
-    """The name in the key."""
+    """Name in the key."""
     role: str | None
-    """A trirail.wire.vocabulary.Role, None for who has none; where nobody is asked for a certificate, maintainer."""
+    """A trirail.wire.vocabulary.Role; None for a user without one; maintainer if the service requires no certificates.
+    """
 
 
 class ErrorReply(Struct, frozen=True, omit_defaults=True):
-    """A goal or command was refused, and nothing moved because of it, or a command could not be carried out."""
+    """Refusal of a goal or command, which moved nothing, or failure of a command."""
 
     code: RefusalCode
-    """Why, for programs; a client takes a code that it does not know for "other"."""
+    """Reason for programs; a client treats an unknown code as "other"."""
     message: str
-    """Why, for people: one line that says what would be right."""
+    """Reason for people, in one line with the expected value or the next step."""
     slider: str | None = None
-    """A, B or C, where it is about one."""
+    """A, B or C, if the reason concerns one slider."""
     value: float | None = None
-    """What was asked, in SI units, where a limit forbids it."""
+    """Requested value, if it exceeds a limit, in SI units."""
     limit: float | None = None
-    """What is allowed, in SI units."""
+    """Allowed value, in SI units."""
 
 
 class Residual(Struct, frozen=True):
-    """Where the robot was to be, less where it was measured."""
+    """Target minus measured position."""
 
     sliders: Triple
-    """Of the sliders A, B, C [m]."""
+    """Residual of the sliders A, B, C [m]."""
     pose: Triple
-    """Of x, y [m] and phi [rad]."""
+    """Residual of x, y [m] and phi [rad]."""
 
 
 class FaultDetail(Struct, frozen=True, omit_defaults=True):
-    """What a fault is about, for programs."""
+    """Details of a fault, for programs."""
 
     cause: str
     """A trirail.wire.vocabulary.FaultCause, or a cause of trirail_drivers.interface.DriveFault: emcy, silent, bus, …"""
     drive: str = ""
-    """A, B or C, where it is about one."""
+    """A, B or C, if the fault concerns one drive."""
     code: int = 0
-    """The drive's own: EMCY or 603Fh error code, or an ODrive's error bits; 0 where there is none."""
+    """The drive's code: EMCY or 603Fh error code, or an ODrive's error bits; 0 if there is none."""
 
 
 class Notice(Struct, frozen=True, omit_defaults=True):
-    """Something to tell everyone, before it is numbered as an event."""
+    """Content of an event before it has a number and a time."""
 
     kind: Literal["goal", "mode", "fault", "refused", "pose", "lease", "alignment", "output", "input", "service"]
-    """What it is about: the end of a goal, a new mode, a fault, something refused, a named pose that was taught or
-    removed, a new holder of the lease, a look of an alignment, outputs that have switched, the edge of an input, the
-    service itself."""
+    """Subject: the end of a goal, a new mode, a fault, a refusal, a named pose that was taught or removed, a change of
+    the lease, a look of an alignment, outputs that have switched, the edge of an input, or the service itself."""
     level: Level
-    """How much it matters to people."""
+    """Importance to people."""
     message: str
     """One line for people."""
     mode: str | None = None
-    """The mode entered, with kind mode."""
+    """Mode entered, with kind mode."""
     id: str | None = None
-    """The goal's id, with kind goal: what has this field is a goal's end."""
+    """Id of the goal, with kind goal; an event with this field is the end of a goal."""
     outcome: Outcome | None = None
-    """How the goal ended, with kind goal."""
+    """Outcome of the goal, with kind goal."""
     reason: str | None = None
-    """Why it ended so, with kind goal; the message has it too."""
+    """Reason of the outcome, with kind goal; the message contains it too."""
     goal: str | None = None
-    """The id of the goal that set the robot in motion, with kind mode."""
+    """Id of the goal that set the robot in motion, with kind mode."""
     user: str | None = None
-    """Who sent the goal, or what was refused, has taught or removed the pose, or aligns; with kind lease who holds it
-    from now on, None for nobody."""
+    """User that sent the goal or the refused message, taught or removed the pose, or aligns; with kind lease the new
+    holder, None if there is none."""
     settle: float | None = None
-    """With outcome done: time from the end of the path until the robot was in position, to the first cycle of the dwell
-    [s]. None of a goal that was not to settle: a jog, one that was passed on the way to the next."""
+    """Time from the end of the path to the first cycle of the dwell in position, with outcome done [s]. None for a goal
+    that does not settle: a jog, or a goal that was passed on the way to the next."""
     residual: Residual | None = None
-    """How far it was from its target when it ended, with outcomes done and unsettled; None of a goal that was not to
-    settle."""
+    """Distance from the target at the end, with outcomes done and unsettled; None if the goal does not settle."""
     overshoot: Triple | None = None
-    """Likewise, how far each of the sliders A, B, C was beyond its target at most since the end of the path, in the
-    direction in which it was last commanded to move; of one that was not to move, to either side [m]."""
+    """Greatest distance of the sliders A, B, C beyond their targets since the end of the path, in the direction of the
+    last commanded motion, or to either side for a slider that did not move [m]; None as for `residual`."""
     fault: FaultDetail | None = None
-    """What it is about, with kind fault."""
+    """Details of the fault, with kind fault."""
     alignment: AlignmentLook | None = None
     """The look, with kind alignment."""
     code: RefusalCode | None = None
-    """Reason for programs, with kind refused and with a goal that was refused."""
+    """Reason for programs, with kind refused and at the end of a rejected goal."""
     slider: str | None = None
-    """A, B or C, with a code that is about one."""
+    """A, B or C, if the code concerns one slider."""
     value: float | None = None
-    """Requested value in SI units, with a code that is about a limit."""
+    """Requested value in SI units, if the code concerns a limit."""
     limit: float | None = None
     """Allowed value in SI units."""
     event_code: EventCode | None = None
-    """Content of the message for programs and translations; with kind mode and at a goal's end that of the reason.
-    None from a service older than these codes."""
+    """Content of the message for programs and translations; with kind mode and at the end of a goal, that of the
+    reason. None from a service older than these codes."""
     params: Params = {}
-    """Values in the message, by the names that the event code has; SI units and radians."""
+    """Values in the message, by the names that the event code defines; SI units and radians."""
     marks: tuple[Switch, ...] = ()
     """Switches on the path of a goal, with kind output, in the order in which they happened."""
 
     def event(self, seq: int, t: float, cycle: int, time: float) -> Event:
-        """Return it with its number and time."""
+        """Return the event with its number and time."""
         marks = tuple(structs.replace(switch, time=time - (t - switch.t)) for switch in self.marks)
         return Event(**structs.asdict(structs.replace(self, marks=marks)), seq=seq, t=t, cycle=cycle, time=time)
 
 
 class Event(Notice, frozen=True, omit_defaults=True, kw_only=True):
-    """Something that happened, in order, numbered without gaps by the loop."""
+    """An event; the loop numbers events without gaps, in order."""
 
     seq: int
-    """Numbered from 1 since the service's start."""
+    """Number since the service's start, from 1."""
     t: float
     """Nominal time since the loop's start [s]; the same as in records."""
     cycle: int
-    """Its cycle, as in records."""
+    """Cycle of the event, as in records."""
     time: float
     """Wall clock [s since 1970]."""

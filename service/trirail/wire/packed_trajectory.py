@@ -1,4 +1,4 @@
-"""A trajectory as the processes of the service have it: one row of numbers a point.
+"""Trajectories as the service's processes exchange them: one row of numbers per point.
 
 The loop must not decode thousands of points: 5,000 of them take 15 ms as structs, and 0.1 ms as bytes.
 """
@@ -18,17 +18,17 @@ from trirail.wire.marks import Mark, StopAt
 from trirail.wire.sizes import MAX_PART
 
 COLUMNS = 10
-"""t, x, y, phi; their velocity and acceleration, not a number where a point has none."""
+"""Columns t, x, y, phi, and their velocity and acceleration, NaN if a point has none."""
 ROW = COLUMNS * array("d").itemsize
 Row = tuple[float, Triple, Triple | None, Triple | None]
 _NONE = (math.nan,) * 3
 
 
 class PackedTrajectory(GoalKind, frozen=True, tag="packed trajectory"):
-    """A trajectory goal, with its points packed; the fields of the same names are those of TrajectoryGoal."""
+    """A trajectory goal with packed points; fields of the same name are as in TrajectoryGoal."""
 
     rows: bytes
-    """float64 of this machine's byte order, COLUMNS of them a point."""
+    """Points as float64 in this machine's byte order, COLUMNS numbers per point."""
     id: str | None = None
     stretch: bool = False
     settle: bool = True
@@ -39,23 +39,23 @@ class PackedTrajectory(GoalKind, frozen=True, tag="packed trajectory"):
     def __post_init__(self) -> None:
         check_fields(self)
         if len(self.rows) % ROW or len(self.rows) < 2 * ROW:
-            raise ValueError(f"{len(self.rows)} bytes of points, each of {ROW}")
+            raise ValueError(f"rows: {len(self.rows)} bytes are not two or more points of {ROW} bytes")
 
     @property
     def lengthy(self) -> bool:
-        """Whether it has more points than a message holds."""
+        """Whether it has more points than fit into one message."""
         return len(self.rows) > MAX_PART * ROW
 
     @property
     def points(self) -> Iterator[Row]:
-        """The points: time, pose, velocity and acceleration."""
+        """Yield the points: time, pose, velocity and acceleration."""
         values = array("d", self.rows).tolist()
         for at in range(0, len(values), COLUMNS):
             t, x, y, phi, *derivatives = values[at : at + COLUMNS]
             yield t, (x, y, phi), _triple(derivatives[:3]), _triple(derivatives[3:])
 
     def unpacked(self) -> TrajectoryGoal:
-        """Return it as a client has it."""
+        """Return the equivalent goal as a client sends it."""
         points = tuple(TrajectoryPoint(t, *pose, *derivatives) for t, pose, *derivatives in self.points)
         return TrajectoryGoal(
             points, self.id, self.stretch, self.settle, self.valid_for, marks=self.marks, stop_at=self.stop_at
@@ -73,9 +73,9 @@ def packed(goal: TrajectoryGoal) -> PackedTrajectory:
 
 
 def joined(parts: Sequence[PackedTrajectory]) -> PackedTrajectory:
-    """Return a trajectory from its parts in their order, whose options are those of the first.
+    """Return a trajectory from its parts in order, with the options of the first part.
 
-    Raises ValueError where times do not rise from part to part.
+    Raises ValueError if the times do not increase from part to part.
     """
     goal = structs.replace(parts[0], rows=b"".join(part.rows for part in parts))
     check_times(array("d", goal.rows)[::COLUMNS])

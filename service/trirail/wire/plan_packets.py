@@ -1,7 +1,7 @@
-"""What the loop asks the planner, and what the planner answers: all that a plan depends on, and all that comes of it.
+"""Requests of the loop to the planner and the planner's answers, which contain all inputs and results of a plan.
 
-Numbers that become motion are packed as they are in memory, so that a plan is the same to the last bit wherever it is
-made, sent, or read from a recording.
+Numbers of the motion are packed as they are in memory, so that a plan is the same to the last bit wherever it is
+computed, sent, or read from a recording.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from trirail.wire.messages import GoalReply
 
 
 class PackedPath(Struct, frozen=True, array_like=True):
-    """A path in time: float64 of this machine's byte order, as trirail.motion.paths has them."""
+    """A path over time: float64 in this machine's byte order, in the layout of trirail.motion.paths."""
 
     knots: bytes
     pieces: bytes
@@ -25,78 +25,77 @@ class PackedPath(Struct, frozen=True, array_like=True):
 
 
 class PackedRun(Struct, frozen=True, array_like=True):
-    """A path, and the law by which its time runs."""
+    """A path and its time law."""
 
     path: PackedPath
     law: PackedPath
     target: float
-    """The rate that the law leads to."""
+    """Final rate of the law."""
     time: float = 0.0
-    """Time since the law began [s]."""
+    """Time since the start of the law [s]."""
     seams: tuple[float, ...] = ()
-    """Where on the path one goal ends and the next one begins, as times along it [s]."""
+    """Times along the path at which one goal ends and the next begins [s]."""
 
 
 class PlanRequest(Struct, frozen=True):
-    """Loop to planner: a goal, and the motion from which it is to be reached."""
+    """Loop to planner: a goal and the motion from which it starts."""
 
     number: int
-    """By which the answer is known."""
+    """Number by which the loop assigns the answer."""
     version: int
-    """Of the motion under way."""
+    """Version of the present motion."""
     revision: int
-    """Of the robot's geometry and limits: a planner with others must not answer."""
+    """Revision of the robot's geometry and limits; a planner with another one must not answer."""
     cycle: int
-    """Of the schedule, now."""
+    """Present cycle of the schedule."""
     lead: int
-    """In how many cycles the new motion is to begin; it has no meaning where the robot stands."""
+    """Number of cycles until the new motion starts; ignored at rest."""
     rate: float
-    """At which the goal's motion is to run."""
+    """Rate of the goal's motion."""
     commanded: tuple[Triple, Triple, Triple]
-    """The platform's pose, velocity and acceleration now."""
+    """Commanded pose, velocity and acceleration of the platform."""
     runs: tuple[PackedRun, ...]
-    """The motion under way, and what follows it."""
+    """The present motion and those queued after it."""
     goal: LoopGoal
-    """As trirail.motion.goal_planner.meant has it: its tools are points, its poses those of the base frame, its times
-    the loop's."""
+    """Goal as resolved by trirail.motion.goal_planner: tools as points, poses in the base frame, times of the loop."""
     blend: float | None = None
-    """How far from the end of the last run this goal may follow it [m]; None where it preempts the motion."""
+    """Distance from the end of the last run at which this goal may follow it [m]; None if it preempts the motion."""
 
 
 class Planned(Struct, frozen=True, tag=True):
-    """Planner to loop: a motion that preempts the one under way."""
+    """Planner to loop: a motion that preempts the present one."""
 
     number: int
     version: int
     first: int | None
-    """The cycle in whose commanded state it begins; None where the robot stands, and it may begin at any time."""
+    """Cycle in whose commanded state the motion starts; None at rest, when it may start at any time."""
     run: PackedRun
     reply: GoalReply
     """Reply to the goal's sender, to which the loop adds the goal's id; duration None at override zero."""
     stop: PackedPath | None = None
-    """The law of that stop; None where the law that the motion under way has is the one to stand by."""
+    """Time law of the preceding stop; None if the present motion keeps its law."""
     bound: str | None = None
-    """The limit before which a jog comes to rest, or beyond which a track's target is."""
+    """Limit before which a jog stops, or which a track's target exceeds."""
     switches: bytes = b""
     """Planned switches of outputs, of trirail.motion.marks.SWITCH; their times count from the start of the path."""
 
 
 class Extended(Struct, frozen=True, tag=True):
-    """Planner to loop: a path that follows the last one under way."""
+    """Planner to loop: a path that follows the last queued one."""
 
     number: int
     version: int
     s: float
-    """From which time along that path [s]."""
+    """Time along the last path at which the new one starts [s]."""
     path: PackedPath
     reply: GoalReply
-    """As in Planned; the loop adds the duration as well."""
+    """Reply as in Planned; the loop adds the duration as well."""
     switches: bytes = b""
-    """As in Planned."""
+    """Planned switches as in Planned."""
 
 
 class NotPlanned(Struct, frozen=True, tag=True):
-    """Planner to loop: why no motion leads there."""
+    """Planner to loop: the refusal of a goal that has no motion."""
 
     number: int
     version: int
@@ -107,7 +106,7 @@ class NotPlanned(Struct, frozen=True, tag=True):
     limit: float | None = None
 
     def error(self) -> RefusedError:
-        """Return it as what is raised."""
+        """Return the refusal as an exception."""
         return RefusedError(self.code, self.message, slider=self.slider, value=self.value, limit=self.limit)
 
 
@@ -115,7 +114,7 @@ PlanAnswer = Planned | Extended | NotPlanned
 
 
 class Overtaken(BaseException):
-    """Planning ends without an answer: something newer has been asked. No Exception, since those become answers."""
+    """Planning was cancelled by a newer request. Not an Exception, because those become answers."""
 
 
 prepare(PlanRequest, PlanAnswer)

@@ -1,6 +1,7 @@
-"""A service that is starting, seen by clients on its own machine before it listens: by a name that its kernel keeps.
+"""Announcement of a service that is starting, visible to clients on its machine before it listens.
 
-The name is an abstract one of AF_UNIX (unix(7)): in no file system, seen by every user, gone with its process.
+It is an abstract AF_UNIX name (unix(7)), which is in no file system, is visible to every user, and ends with its
+process.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ from trirail.wire.endpoints import fault_of, is_local, socket_file, tcp_address
 
 
 class Starting:
-    """Says that what will listen on some endpoints is starting, until it is up or its process ends."""
+    """Announces a service that will listen on some endpoints, until it is up or its process ends."""
 
     def __init__(self, endpoints: Iterable[str]) -> None:
         self._opened = [socket.socket(socket.AF_UNIX) for _ in endpoints]
         for opened, endpoint in zip(self._opened, endpoints, strict=True):
-            with suppress(OSError):  # another one is starting there
+            with suppress(OSError):  # another service is starting on this endpoint
                 opened.bind(_name(endpoint))
                 opened.listen(1)
 
     def up(self) -> None:
-        """Say it no longer; also where a process that was begun meanwhile has the sockets as well."""
+        """Withdraw the announcement, also if a child process has inherited the sockets."""
         for opened in self._opened:
             with suppress(OSError):
                 opened.shutdown(socket.SHUT_RDWR)
@@ -33,14 +34,14 @@ class Starting:
 
 
 def is_starting(endpoint: str) -> bool:
-    """Whether a service is starting on this machine that will listen there."""
+    """Whether a service that will listen on an endpoint is starting on this machine."""
     if fault_of(endpoint) or not is_local(endpoint):
         return False
     with socket.socket(socket.AF_UNIX) as opened:
         opened.setblocking(False)
         try:
             opened.connect(_name(endpoint))
-        except BlockingIOError:  # others have asked as well, and nobody reads it
+        except BlockingIOError:  # the backlog is full of other clients: the name exists
             return True
         except OSError:
             return False
@@ -48,7 +49,7 @@ def is_starting(endpoint: str) -> bool:
 
 
 def _name(endpoint: str) -> bytes:
-    """Return the name for an endpoint: that of its port or file, since one address may stand for others."""
+    """Return the abstract name for an endpoint, from port or file alone, because a wildcard address includes others."""
     address, file = tcp_address(endpoint), socket_file(endpoint)
     where = f"port {address[1]}" if address is not None else f"file {file}" if file is not None else endpoint
     return b"\0trirail-starting-" + hashlib.sha256(where.encode()).hexdigest().encode()

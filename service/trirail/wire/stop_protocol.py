@@ -1,6 +1,7 @@
-"""The door for stops: where it is beside an endpoint of Zenoh's, and what is said there, a line of JSON each way.
+"""The stop port: a TCP or Unix socket beside each Zenoh endpoint, with one line of JSON in each direction.
 
-What others do on an endpoint of Zenoh's keeps no stop out here: its handshakes and sessions have no part in this.
+Other clients cannot delay a stop here by occupying the Zenoh endpoint, because this port uses neither its handshakes
+nor its sessions.
 """
 
 from __future__ import annotations
@@ -17,29 +18,29 @@ from trirail.wire.endpoints import LAST_PORT, ReachableBy, reach, socket_file, t
 from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.vocabulary import Command
 
-STOPS = frozenset(name for name in Command if name.stops and name.everybodys)
-"""What is taken there: what brings the robot to rest, whoever has the lease."""
+STOPS = frozenset(name for name in Command if name.stops and name.ignores_lease)
+"""Commands that the stop port accepts: those that stop the robot and ignore the lease."""
 MAX_LINE = 4096
-"""A request or an answer [bytes]."""
-FARTHER = 1000
-"""Its port is so many more than that of the endpoint, or less where there are none: the next may be another robot's."""
+"""Maximum size of a request or an answer [bytes]."""
+PORT_OFFSET = 1000
+"""Difference to the endpoint's port, subtracted if the sum is too large; the next port may belong to another robot."""
 SUFFIX = ".stop"
-"""Of the socket's file, behind that of Zenoh's."""
+"""Suffix of the socket's file, appended to that of Zenoh's."""
 
 
 class StopRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """A stop, as its copy over Zenoh has it."""
+    """A stop; the client also sends a copy over Zenoh."""
 
     key: str
-    """That of the query: trirail/<robot>/cmd/<user>/<name>."""
+    """Key of the query: trirail/<robot>/cmd/<user>/<name>."""
     id: str = ""
-    """The same in every copy: the stop is carried out once, and each copy is answered."""
+    """Id that all copies share: the stop is executed once, and each copy gets a reply."""
     content: str = ""
-    """The query's payload, JSON."""
+    """Payload of the query, as JSON."""
 
 
 class StopAnswer(Struct, frozen=True, omit_defaults=True):
-    """What was made of it: one of the two."""
+    """Answer to a stop, with one of the two fields."""
 
     reply: CommandReply | None = None
     error: ErrorReply | None = None
@@ -49,7 +50,7 @@ prepare(StopRequest, StopAnswer)
 
 
 class StopAddress(NamedTuple):
-    """Where the door is."""
+    """Address of a stop port."""
 
     where: tuple[str, int] | str
     """Host and port, or the file of a Unix socket."""
@@ -61,9 +62,9 @@ class StopAddress(NamedTuple):
 
 
 def stop_address(endpoint: str) -> StopAddress | None:
-    """Return where the door is that belongs to an endpoint: a port FARTHER, or the file beside a socket's.
+    """Return the stop port of an endpoint: its port plus PORT_OFFSET, or its socket's file with SUFFIX.
 
-    None where there is none: of protocols but tcp, tls and unixsock-stream.
+    None for protocols other than tcp, tls and unixsock-stream.
     """
     if (file := socket_file(endpoint)) is not None:
         return StopAddress(f"{file}{SUFFIX}", secured=False)
@@ -71,23 +72,26 @@ def stop_address(endpoint: str) -> StopAddress | None:
     if address is None or endpoint.startswith("ws/"):
         return None
     host, port = address
-    door = port + FARTHER if port + FARTHER <= LAST_PORT else port - FARTHER
+    door = port + PORT_OFFSET if port + PORT_OFFSET <= LAST_PORT else port - PORT_OFFSET
     return StopAddress((host, door), secured=reach(endpoint) is ReachableBy.CERTIFICATE)
 
 
 def command_of(request: StopRequest, robot: str) -> tuple[str, Command]:
-    """Return who asks a robot for what. Raises RefusedError for what is no stop of it."""
+    """Return user and command of a request. Raises RefusedError if it is not a stop for this robot."""
     user, name = boundary.names(request.key, f"trirail/{robot}/cmd", ("user", "command"))
     if name not in STOPS:
-        raise RefusedError(RefusalCode.UNKNOWN_COMMAND, f"only {', '.join(sorted(STOPS))} are taken here")
+        raise RefusedError(
+            RefusalCode.UNKNOWN_COMMAND,
+            f"the stop port accepts only {', '.join(sorted(STOPS))}; send others over Zenoh",
+        )
     return user, Command(name)
 
 
 def encode(message: StopRequest | StopAnswer) -> bytes:
-    """Return a message as a line."""
+    """Return the line of a message."""
     return msgspec.json.encode(message) + b"\n"
 
 
 def answer_with(content: CommandReply | ErrorReply) -> bytes:
-    """Return a reply or an error as an answer's line."""
+    """Return the line of an answer with a reply or an error."""
     return encode(StopAnswer(error=content) if isinstance(content, ErrorReply) else StopAnswer(reply=content))

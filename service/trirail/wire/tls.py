@@ -1,4 +1,4 @@
-"""TLS beside Zenoh's own: both sides show a certificate, and each believes only its authority."""
+"""TLS of the stop port: both sides authenticate with a certificate, and each trusts only its own authority."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from trirail.wire.credentials import Credentials
 
 
 def server(credentials: Credentials) -> ssl.SSLContext:
-    """Return the context of who is connected to."""
+    """Return the context of a server, which requires a client certificate."""
     authority, certificate, key = credentials.files
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(authority))
     context.verify_mode = ssl.CERT_REQUIRED
@@ -18,7 +18,7 @@ def server(credentials: Credentials) -> ssl.SSLContext:
 
 
 def client(credentials: Credentials) -> ssl.SSLContext:
-    """Return the context of who connects: the host's name or address must be in the other's certificate."""
+    """Return the context of a client; the server's certificate must contain its host name or address."""
     authority, certificate, key = credentials.files
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.load_verify_locations(authority)
@@ -27,7 +27,7 @@ def client(credentials: Credentials) -> ssl.SSLContext:
 
 
 def peer(connection: ssl.SSLSocket) -> str:
-    """Return in whose name the certificate is that was shown; "" without one, or where it has no one name."""
+    """Return the common name of the peer's certificate; "" without one, or if it has none or several."""
     subject: Any = (connection.getpeercert() or {}).get("subject", ())
     names = [value for part in subject for key, value in part if key == "commonName"]
     return names[0] if len(names) == 1 else ""

@@ -1,4 +1,4 @@
-"""Quantities as people write them: 5mm, -0.2in, 350um, 1.5deg, 5arcsec, 20mm/s. Bare numbers are SI.
+"""Parsing of quantities such as 5mm, -0.2in, 350um, 1.5deg, 5arcsec and 20mm/s. Bare numbers are in SI units.
 
 Units are decimal numbers, so that 5mm is the same number as 0.005.
 """
@@ -14,17 +14,17 @@ from typing import Final, NamedTuple
 from trirail.wire.text import NUMBER, comma_hint, quoted
 
 _DEGREE: Final = Decimal("0.0174532925199432957692369076848861271344")
-"""π / 180, to more digits than a float has."""
+"""π / 180 with more digits than a float."""
 _WRITTEN: Final = re.compile(rf"\s*({NUMBER})\s*(.*?)\s*")
 
 
 class Dimension(NamedTuple):
-    """What a quantity is of."""
+    """Physical dimension of a quantity."""
 
     name: str
-    """With its article, for people."""
+    """Name with its article, for people."""
     units: Mapping[str, Decimal]
-    """Every unit by its symbol, in SI; a bare number has the first one."""
+    """Units by symbol, in SI; a bare number has the first one."""
     examples: str
 
 
@@ -83,13 +83,13 @@ DIMENSIONS: Final = (
     PERCENTAGE,
 )
 SIZES: Final = {unit: size for dimension in DIMENSIONS for unit, size in dimension.units.items()}
-"""Every unit in SI."""
+"""Value of every unit in SI."""
 
 
 def quantity(text: str, dimension: Dimension, bare: str | None = None) -> float:
-    """Return what a number with a unit is in SI, a percentage in %; one without has the unit `bare`, SI if absent.
+    """Return a quantity in SI, a percentage in %; a bare number has the unit `bare`, or SI.
 
-    Raises ValueError with what would be right. It is rounded once: 5mm is the float 0.005.
+    The result is rounded once, so that 5mm is the float 0.005. Raises ValueError with the expected form.
     """
     match = _WRITTEN.fullmatch(text)
     unit = (match[2] or bare or next(iter(dimension.units))) if match else ""
@@ -97,9 +97,9 @@ def quantity(text: str, dimension: Dimension, bare: str | None = None) -> float:
     if match is None or size is None or not math.isfinite(float(match[1])):
         alone = bare or next(iter(dimension.units))
         units = ", ".join(name for name in dimension.units if "μ" not in name and "^" not in name)
-        hint = ": no space stands before a unit" if text.strip() in dimension.units else comma_hint(text)
+        hint = "; write no space before the unit" if text.strip() in dimension.units else comma_hint(text)
         raise ValueError(
             f"{quoted(text.strip())!r} is not {dimension.name} such as {dimension.examples}; "
-            f"units are {units}, a bare number is in {alone}{hint}"
+            f"units are {units}; a bare number is in {alone}{hint}"
         )
     return float(Decimal(match[1]) * size)

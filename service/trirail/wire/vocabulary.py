@@ -1,4 +1,4 @@
-"""The words that processes and clients share: what the robot can be doing, and what it can be told."""
+"""Names that processes and clients share: modes, causes of faults, roles and commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trirail.wire.marks import OutputName
 
 
 class Mode(StrEnum):
-    """What the robot is doing."""
+    """Operating mode of the robot."""
 
     DISABLED = "disabled"
     ENABLING = "enabling"
@@ -24,111 +24,113 @@ class Mode(StrEnum):
 
 
 MODES = tuple(Mode)
-"""In the order in which records number them."""
+"""Modes in the order in which records number them."""
 
 
 class FaultCause(StrEnum):
-    """Why the robot is in fault where no drive has told it: drives have causes of their own, see DriveFault."""
+    """Cause of a fault that no drive reports; DriveFault has the causes of drives."""
 
     FOLLOWING_ERROR = "following_error"
-    """A slider is farther from its setpoint than [limits.slider] following_error."""
+    """The following error of a slider exceeds [limits.slider] following_error."""
     LIMIT = "limit"
     """The last gate has refused a setpoint."""
     ENABLE = "enable"
-    """The drives took too long to power up."""
+    """The drives were not enabled in time."""
     PLACE = "place"
-    """Where the sliders are belongs to no pose, or is none that may be held."""
+    """The slider positions correspond to no pose, or to one that the robot may not hold."""
     QUICK_STOP = "quick_stop"
-    """Somebody sent quick_stop."""
+    """A user sent quick_stop."""
     LOOP = "loop"
-    """The loop has died or was frozen."""
+    """The loop has died or hung."""
     INTERNAL = "internal"
-    """An error of the program's own."""
+    """An internal error of the program."""
 
 
 LeasePolicy = Literal["optional", "required"]
-"""Whether the robot can be moved while nobody holds the lease."""
+"""Whether the robot can be moved without the lease."""
 
 
 class Role(StrEnum):
-    """What a user is to a robot; each may what those before it may."""
+    """Role of a user; each role has the permissions of those before it."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
     MAINTAINER = "maintainer"
 
     def includes(self, other: Role) -> bool:
-        """Whether it may all that another role may."""
+        """Whether it has all permissions of another role."""
         roles = tuple(Role)
         return roles.index(self) >= roles.index(other)
 
 
 class CommandContent(Struct, frozen=True, forbid_unknown_fields=True):
-    """What a command carries."""
+    """Content of a command."""
 
     words: ClassVar[str] = "no content"
-    """What it takes, for people."""
+    """Expected content, for people."""
     optional: ClassVar[bool] = True
-    """Whether it may come without, as if with nothing but what is absent of it."""
+    """Whether the content may be absent; then all fields have their defaults."""
 
 
 LOWEST_OVERRIDE = 1.0
-"""Least share of full speed at which motions run, but for 0, at which they stand [%]."""
+"""Lowest override apart from 0, at which the robot stands [%]."""
 
 
 class Override(CommandContent, frozen=True):
-    """The content of the command override: the share of full speed at which motions run."""
+    """Content of the command override."""
 
     words = '{"percent": 0, or 1 to 200}'
     optional = False
 
     percent: Annotated[float, Meta(ge=0.0, le=200.0)]
-    """0, at which motions stand, or 1 to 200 % of full speed, within the limits."""
+    """Speed override, 0 or 1 to 200 % of full speed; the limits still apply, and at 0 the robot stands."""
 
     def __post_init__(self) -> None:
         check_fields(self)
         if 0.0 < self.percent < LOWEST_OVERRIDE:
-            raise ValueError(f"percent is {self.percent}: 0, or {LOWEST_OVERRIDE:g} to 200 are taken")
+            raise ValueError(
+                f"percent: {self.percent} is below the lowest override; send 0, or {LOWEST_OVERRIDE:g} to 200"
+            )
 
 
 class Stop(CommandContent, frozen=True):
-    """The content, if any, of the command stop: which goal is to be stopped, wherever it is, and no other."""
+    """Optional content of the command stop: the only goal to stop, whether it runs or waits."""
 
     words = 'nothing, or {"goal": id}'
 
     goal: Identifier | None = None
-    """Its id; none for the robot as a whole."""
+    """Id of the goal; without it, the robot and all goals stop."""
 
 
 SHORTEST_LEASE, LONGEST_LEASE = 0.1, 10.0
-"""Time-outs of a lease [s]."""
+"""Range of a lease's time-out [s]."""
 LeaseTimeout = Annotated[float, Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)]
 
 
 class AcquireLease(CommandContent, frozen=True):
-    """The content, if any, of the command acquire. The same one again, within its timeout, is a sign of life."""
+    """Optional content of the command acquire. Sending it again within its timeout renews the lease."""
 
     words = 'nothing, or {"id": id, "timeout": seconds, "force": true}'
 
     id: Identifier | None = None
-    """A new one for every lease, the same in every sign of life: a lease that has ended does not come back by one.
-    Without it, each one asks anew."""
+    """Id of the lease: new for every lease and the same in its renewals, so that a late renewal cannot revive a lease
+    that has ended. Without it, each message is a new request."""
     timeout: LeaseTimeout = 1.0
-    """Real time after which a lease without a sign of life ends, with a controlled stop [s]."""
+    """Time without a renewal after which the lease ends, with a controlled stop [s]."""
     force: bool = False
-    """Take it over from who holds it, by a role of [control] `takeover`."""
+    """Take the lease over from its holder; requires the role of [control] `takeover`."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
 class ReleaseLease(CommandContent, frozen=True):
-    """The content, if any, of the command release: which lease is given back."""
+    """Optional content of the command release."""
 
     words = 'nothing, or {"id": id}'
 
     id: Identifier | None = None
-    """As in its acquire; without it the user's own, whichever that is."""
+    """Id of the lease, as in its acquire; without it, the user's present lease."""
 
 
 class SetOutput(CommandContent, frozen=True):
@@ -143,76 +145,76 @@ class SetOutput(CommandContent, frozen=True):
 
 
 class NoContent(CommandContent, frozen=True):
-    """The content of the other commands."""
+    """Empty content of the other commands."""
 
 
 class _CommandRow(NamedTuple):
-    """A command's row in the table below."""
+    """Row of the table of commands below."""
 
     name: str
     help: str
     role: Role
     content: type[CommandContent] = NoContent
     stops: bool = False
-    everybodys: bool = False
+    ignores_lease: bool = False
 
 
 class Command(StrEnum):
-    """What the robot can be told beside goals: the name on the wire, one line of help, and what follows from it.
+    """Commands: name on the wire, help, and properties.
 
-    What it does is its row in trirail.control.commands.EFFECTS. Gateway, access rules, schemas, clients and command
-    line follow from this table.
+    The effects are in trirail.control.commands.EFFECTS. Gateway, access rules, schemas, clients and command line are
+    derived from this table.
     """
 
     help: str
-    """What it does, in one line for people."""
+    """Effect, in one line for people."""
     role: Role
-    """The least that may send it."""
+    """Lowest role that may send it."""
     content: type[CommandContent]
-    """What it carries."""
+    """Type of its content."""
     stops: bool
-    """Whether it brings motion to rest: it overtakes whatever waits, and goals sent before it do not begin."""
-    everybodys: bool
-    """Whether it is everybody's while somebody holds the lease; else the holder's alone."""
+    """Whether it stops the robot: it overtakes all waiting messages, and goals sent before it do not start."""
+    ignores_lease: bool
+    """Whether every user may send it while another user holds the lease."""
 
-    ENABLE = _CommandRow("enable", "Power the drives up and hold.", Role.OPERATOR)
-    DISABLE = _CommandRow("disable", "Stop and take power off the drives.", Role.OPERATOR, stops=True, everybodys=True)
-    STOP = _CommandRow("stop", "Stop the robot within its limits.", Role.VIEWER, Stop, stops=True, everybodys=True)
+    ENABLE = _CommandRow("enable", "Enable the drives and hold the position.", Role.OPERATOR)
+    DISABLE = _CommandRow("disable", "Stop, then disable the drives.", Role.OPERATOR, stops=True, ignores_lease=True)
+    STOP = _CommandRow("stop", "Stop the robot within its limits.", Role.VIEWER, Stop, stops=True, ignores_lease=True)
     QUICK_STOP = _CommandRow(
         "quick_stop",
-        "Stop every drive as fast as it can: in fault until a reset.",
+        "Stop every drive by its own ramp; the robot is then in fault.",
         Role.OPERATOR,
         stops=True,
-        everybodys=True,
+        ignores_lease=True,
     )
-    RESET = _CommandRow("reset", "Clear a fault whose cause is gone; power stays off.", Role.MAINTAINER)
+    RESET = _CommandRow("reset", "Clear a fault whose cause is gone; the drives stay disabled.", Role.MAINTAINER)
     HOME = _CommandRow(
         "home",
-        "Find where sliders without absolute encoders are, slowly.",
+        "Home the sliders without absolute encoders.",
         Role.MAINTAINER,
     )
     PAUSE = _CommandRow("pause", "Stop on the path and keep the goal.", Role.OPERATOR, stops=True)
-    RESUME = _CommandRow("resume", "Go on with a paused goal.", Role.OPERATOR)
+    RESUME = _CommandRow("resume", "Continue a paused goal.", Role.OPERATOR)
     OVERRIDE = _CommandRow(
         "override",
-        "Let motions run at a share of full speed, 0 or 1 to 200 %.",
+        "Set the speed override (0, or 1 to 200 %).",
         Role.OPERATOR,
         Override,
     )
     SET_OUTPUT = _CommandRow("set_output", "Set a digital output of a drive.", Role.OPERATOR, SetOutput)
     ACQUIRE = _CommandRow(
         "acquire",
-        "Take the lease, or keep it: only its holder moves the robot; everybody may stop and disable it.",
+        "Acquire or renew the lease: only its holder can move the robot; every user can stop and disable it.",
         Role.OPERATOR,
         AcquireLease,
-        everybodys=True,
+        ignores_lease=True,
     )
     RELEASE = _CommandRow(
         "release",
-        "Give the lease back; what its holder has under way stops.",
+        "Release the lease; the holder's motion stops.",
         Role.OPERATOR,
         ReleaseLease,
-        everybodys=True,
+        ignores_lease=True,
     )
 
     def __new__(
@@ -222,16 +224,16 @@ class Command(StrEnum):
         role: Role = Role.MAINTAINER,
         content: type[CommandContent] = NoContent,
         stops: bool = False,
-        everybodys: bool = False,
+        ignores_lease: bool = False,
     ) -> Self:
-        """Make a member of its row; with a name alone, as for Command("stop"), the enumeration looks it up."""
+        """Create a member from its row; with a name alone, such as Command("stop"), the enumeration looks it up."""
         member = str.__new__(cls, name)
         member._value_ = name
         member.help, member.role, member.content = help, role, content
-        member.stops, member.everybodys = stops, everybodys
+        member.stops, member.ignores_lease = stops, ignores_lease
         return member
 
     @property
     def accepts(self) -> Any:
-        """The type of what it may come with, as it is decoded."""
+        """Type as which its content is decoded."""
         return self.content | None if self.content.optional else self.content

@@ -1,4 +1,4 @@
-"""Zenoh sessions as both sides open them: no discovery, bounded queues, nothing beyond the addresses given."""
+"""Zenoh sessions of service and clients: no discovery, bounded queues, and only the configured addresses."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ import zenoh
 
 from trirail.errors import ServiceError
 from trirail.wire.credentials import Credentials
-from trirail.wire.dialling import why_not
+from trirail.wire.dialling import connection_problem
 from trirail.wire.endpoints import DEFAULT_LOCATOR, leads_to
 from trirail.wire.sizes import MAX_TRANSPORT
 from trirail.wire.starting import is_starting
 
 SESSIONS = 512
-"""Clients that may be connected to a service at once; a router is one."""
-GIVEN_UP_AFTER = 2.0
-"""Whoever takes nothing that must not be dropped, an answer or past events, is disconnected after so long [s]."""
+"""Maximum number of clients connected to a service; a router counts as one."""
+SEND_TIMEOUT_S = 2.0
+"""Time after which a client is disconnected if it does not accept a message that must not be dropped, such as a reply
+or a past event [s]."""
 BATCH_SIZE = 8192
-"""Size of the buffers in which a service sends to its clients and receives from them; a larger message is sent in
-fragments [bytes]. Zenoh agrees on the smaller size of both sides."""
+"""Size of a service's send and receive buffers; a larger message is sent in fragments [bytes]. Zenoh negotiates the
+smaller size of both sides."""
 
-_ALWAYS = {
+_COMMON_SETTINGS = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
-    "transport/shared_memory/enabled": False,  # the memory of strangers; and the size below is for what is sent
+    "transport/shared_memory/enabled": False,  # the maximum size below would not apply to it
     "transport/link/rx/max_message_size": MAX_TRANSPORT,
 }
 
@@ -44,16 +45,16 @@ def open_service(
     access_control: Mapping[str, Any] | None = None,
     connect: Sequence[str] = (),
 ) -> zenoh.Session:
-    """Open the service's session: a peer that listens on the given locators and nowhere else.
+    """Return the service's session: a peer that listens on the given locators only.
 
-    With credentials it asks every client for a certificate of the same authority; `access_control`, that section of
-    Zenoh's configuration, is what each may do. It dials the routers of `connect`, and again whenever they are gone.
+    With credentials, every client needs a certificate of the same authority; `access_control` is that section of
+    Zenoh's configuration. The session connects to the routers of `connect`, and reconnects when a connection is lost.
     """
     settings = {"mode": "peer", **serving(listen, credentials, access_control, connect)}
     return _open(
         settings,
         f"cannot listen on {', '.join(listen)}",
-        lambda: "; another service may hold it: end that, or set zenoh.listen to another address",
+        lambda: "; end the other service that may use it, or set zenoh.listen to another address",
     )
 
 
@@ -64,12 +65,12 @@ def router(
     connect: Sequence[str],
     thinned: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Return a router's configuration file, of Zenoh's own program zenohd.
+    """Return the configuration of a router, for Zenoh's own program zenohd.
 
-    Of the keys in `thinned` no more leaves for each client than so often a second: its newest is dropped, so that this
-    is for states alone. Zenoh keeps one time for a rule, hence a rule for each key.
+    `thinned` has the maximum rate per client of some keys [Hz]. Zenoh drops the messages in between, including the
+    newest, so use it for states only. Zenoh keeps one timer per rule, hence one rule per key.
     """
-    settings = _ALWAYS | {
+    settings = _COMMON_SETTINGS | {
         "mode": "router",
         **serving(listen, credentials, access_control, connect, len(thinned) + SESSIONS),
         "downsampling": [
@@ -99,34 +100,34 @@ def serving(
     connect: Sequence[str],
     sessions: int = SESSIONS,
 ) -> dict[str, Any]:
-    """Return the settings of who serves others, by their paths in Zenoh's configuration."""
+    """Return the settings of a service or router, by their paths in Zenoh's configuration."""
     return {
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        # Begin without a router that is not there, and try again and again: with 0 in place of -1 it is tried once.
+        # Start without a router that is absent, and keep trying: 0 instead of -1 would try only once.
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
-        # Connections on which nothing comes must not keep others out.
-        # A message that waits keeps the whole buffer in which it arrived: with the default of 65,535 bytes, 2,600 small
-        # ones of one user held 180 MB.
+        # A waiting message occupies the whole buffer in which it arrived: with the default of 65,535 bytes, 2,600 small
+        # messages of one user held 180 MB.
         "transport/link/tx/batch_size": BATCH_SIZE,
         "transport/link/rx/buffer_size": BATCH_SIZE,
+        # Connections that never open a session must not keep others out: hence many, and a short time-out.
         "transport/unicast/accept_pending": 1000,
         "transport/unicast/accept_timeout": 3000,
         "transport/unicast/max_sessions": sessions,
         "timestamping/enabled": True,  # advanced publishers order their history by it
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(GIVEN_UP_AFTER * 1e6),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(SEND_TIMEOUT_S * 1e6),
         "transport/link/tx/queue/size/data_high": 16,
-        "transport/link/tx/queue/size/real_time": 16,  # answers come in bursts
+        "transport/link/tx/queue/size/real_time": 16,  # replies are sent in bursts
         **_tls(credentials),
         **({"access_control": access_control} if access_control is not None else {}),
     }
 
 
 def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.Session:
-    """Open a client's session to a service or router, with credentials where that asks for them."""
+    """Return a client's session to a service or router, with credentials if it requires them."""
     return _open(
         {
             "mode": "client",
@@ -138,39 +139,39 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
             **_tls(credentials),
         },
         f"no service at {locator}",
-        lambda: _why_nobody(locator, credentials),
+        lambda: _connection_advice(locator, credentials),
     )
 
 
-def _why_nobody(locator: str, credentials: Credentials | None) -> str:
-    """Say why no session opens at a locator, and what to do; a second look, for Zenoh does not tell."""
+def _connection_advice(locator: str, credentials: Credentials | None) -> str:
+    """Return why no session opens at a locator, and the next step; diagnosed here, because Zenoh does not report it."""
     if is_starting(locator):
-        return " yet: it is starting; try again when it says that it is up"
-    refused = "" if credentials is None else ", or these certificates are refused"
-    silent = f"who listens there does not answer, or has as many clients as it may{refused}"
-    why = why_not(locator, credentials) or silent
+        return " yet: the service is starting; try again when it reports that it is up"
+    refused = "" if credentials is None else ", or rejects these certificates"
+    silent = f"the program that listens there does not answer, or has the maximum number of clients{refused}"
+    why = connection_problem(locator, credentials) or silent
     start = "start one with: trirail run"
     if locator != DEFAULT_LOCATOR:
-        start = "start what is to answer there, trirail run or zenohd"
+        start = "start trirail run or zenohd there"
     folder = " and its authority's folder with --tls" if credentials is not None else ""
     return f": {why}; {start}, or name another address with --connect{folder} (in Python connect=)"
 
 
 def linked(opened: zenoh.Session, endpoints: Sequence[str], router: str | None) -> set[str]:
-    """Return to which endpoints there is a link now; with the name of `router` only where its certificate has that."""
+    """Return the endpoints with a connection; with `router`, only those whose certificate has that common name."""
     links = opened.info.links()
     reached = [str(link.dst) for link in links if router is None or link.auth_identifier == router]
     return {endpoint for endpoint in endpoints if any(leads_to(endpoint, other) for other in reached)}
 
 
 def close(opened: zenoh.Session) -> None:
-    """Close a session; one that is stuck is left to the end of the process."""
+    """Close a session; one that hangs is left open until the process ends."""
     with contextlib.suppress(zenoh.ZError):
         opened.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 
 
 def _tls(credentials: Credentials | None) -> dict[str, Any]:
-    """Both sides show a certificate, each believes only its authority, and neither outlives the other's."""
+    """Return settings for mutual authentication by one authority; connections end when a certificate expires."""
     if credentials is None:
         return {}
     authority, certificate, key_file = map(str, credentials.files)
@@ -189,13 +190,13 @@ def _tls(credentials: Credentials | None) -> dict[str, Any]:
 
 
 def _open(settings: dict[str, Any], failure: str, explain: Callable[[], str]) -> zenoh.Session:
-    zenoh.init_log_from_env_or("off")  # what zenoh would print is in the error below
+    zenoh.init_log_from_env_or("off")  # the error below contains the message that zenoh would print
     config = zenoh.Config()
     try:
-        for name, value in (_ALWAYS | settings).items():
+        for name, value in (_COMMON_SETTINGS | settings).items():
             config.insert_json5(name, json.dumps(value))
     except zenoh.ZError as error:
-        raise ServiceError(f"{failure}: a locator is protocol/address, tcp/192.168.1.7:7447 for one") from error
+        raise ServiceError(f"{failure}: a locator is protocol/address, such as tcp/192.168.1.7:7447") from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

@@ -34,6 +34,6 @@ export function barriers(robot, state, choice) {
   };
   bars.follow = bars.goal ?? (choice.file ? [`bar.file_${choice.file}`] : null);
   for (const name of [...Object.keys(bars)])
-    if (!robot.everybodys.includes(name) && !["takeover", "teach", "forget"].includes(name)) bars[name] = leased ?? bars[name];
+    if (!robot.ignores_lease.includes(name) && !["takeover", "teach", "forget"].includes(name)) bars[name] = leased ?? bars[name];
   return bars;
 }

@@ -1,1 +1,1 @@
-"""The kinds of goals, a file for each: what it says, its checks, and what follows from its kind. All are read in."""
+"""The kinds of goals, a file for each, with its fields, checks and properties. All are read in."""

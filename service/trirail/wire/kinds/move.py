@@ -1,4 +1,4 @@
-"""By so much, from where the robot is or will be."""
+"""Moves relative to the robot's pose."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ from trirail.wire.marks import Marks, StopAtEdge
 
 
 class MoveGoal(GoalKind, frozen=True, tag="move", rename={"origin": "from"}):
-    """Move the platform by so much: a pose goal, relative to where its tool is."""
+    """Move the platform relative to the pose of its tool."""
 
     follows = True
 
     x: Coordinate
-    """How far its tool, or its centre, is to go along x of `frame` [m]."""
+    """Displacement of the tool, or of the platform's centre, along x of `frame` [m]."""
     y: Coordinate
     """Along y [m]."""
     phi: Coordinate
-    """By what angle the platform is to turn about that point, counterclockwise [rad]."""
+    """Rotation of the platform about that point, counterclockwise [rad]."""
     frame: AxesFrame = "base"
     tool: ToolPoint = None
     origin: Literal["commanded", "measured"] = "commanded"
-    """From which pose: "commanded" is where the goals before it lead, and where the robot is commanded to be without
-    one or in a jog, so that moves add up whenever they come; "measured" is where it is measured to be when they have
-    been planned."""
+    """Start of the move: "commanded" is the end of the preceding goals, or the commanded pose without one or in a jog,
+    so that moves add up at any rate; "measured" is the measured pose when the preceding goals have been planned."""
     id: OwnId = None
     speed: Speed = 1.0
     valid_for: ValidFor = None

@@ -1,4 +1,4 @@
-"""To a pose that has a name."""
+"""Moves to a named pose."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from trirail.wire.marks import Marks, StopAtEdge
 
 
 class NamedGoal(GoalKind, frozen=True, tag="named"):
-    """Move the platform to a pose that has a name: a pose goal, of the pose of that name when it comes in."""
+    """Move the platform to a named pose: a pose goal with the pose that has this name when the message arrives."""
 
     name: PoseName
-    """One of those that are answered on …/poses."""
+    """Name of a pose in the reply on …/poses."""
     id: OwnId = None
     speed: Speed = 1.0
     valid_for: ValidFor = None

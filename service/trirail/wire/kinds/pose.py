@@ -1,4 +1,4 @@
-"""To a pose."""
+"""Moves to a pose."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class PoseGoal(GoalKind, frozen=True, tag="pose"):
     follows = True
 
     x: Coordinate
-    """Of the platform's centre, or of its `tool`, in the base frame or in `frame` [m]."""
+    """x of the platform's centre, or of its `tool`, in `frame` [m]."""
     y: Coordinate
-    """Likewise [m]."""
+    """y of that point in `frame` [m]."""
     phi: Coordinate
-    """The platform's angle in that frame, counterclockwise [rad]."""
+    """Angle of the platform in `frame`, counterclockwise [rad]."""
     id: OwnId = None
     speed: Speed = 1.0
     valid_for: ValidFor = None
@@ -40,6 +40,6 @@ class PoseGoal(GoalKind, frozen=True, tag="pose"):
 
 
 def pose_in_place_of(goal: GoalKind, x: float, y: float, phi: float, tool: Tool | None = None) -> PoseGoal:
-    """Return the pose that a goal means which says it in other words; all that they have in common is the same."""
+    """Return the pose goal that is equivalent to a goal in other terms, with the fields that both have."""
     same = {name: getattr(goal, name) for name in ("id", "speed", "valid_for", "limits", "blend", "marks", "stop_at")}
     return PoseGoal(x, y, phi, tool=tool, **same)

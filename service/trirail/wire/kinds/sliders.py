@@ -1,4 +1,4 @@
-"""To positions of the sliders."""
+"""Moves to slider positions."""
 
 from __future__ import annotations
 

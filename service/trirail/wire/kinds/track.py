@@ -1,4 +1,4 @@
-"""After a moving target."""
+"""Tracking of a moving target."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from trirail.wire.goal_kind import Clock, Coordinate, Coordinates, GoalKind, Own
 
 
 class TrackGoal(GoalKind, frozen=True, tag="track"):
-    """Follow a moving target, renewed 10 to 200 times a second, until `timeout` passes without a fresh one of its id.
+    """Follow a moving target, renewed 10 to 200 times a second, until `timeout` passes without a renewal of its id.
 
-    Between two messages the target is taken to go on with its velocity. What is too fast is followed as fast as the
-    limits allow; where the target is out of reach the platform waits at the border. Who does not renew it in time has
-    the robot brake on its path.
+    Between two messages the target is extrapolated with its velocity. The platform follows a target that is too fast at
+    its limits, and waits at the border of the workspace for one that is out of reach. Without a renewal in time, the
+    robot brakes on its path.
     """
 
     renewed = frequent = waits_at_end = timed = True
     greatest_rate = 1.0
 
     x: Coordinate
-    """Where the target is at `time`: there the platform's centre is to be, in the base frame [m]."""
+    """x of the target for the platform's centre at `time`, in the base frame [m]."""
     y: Coordinate
-    """Likewise [m]."""
+    """y of that target [m]."""
     phi: Coordinate
-    """The angle that the platform is to have then, counterclockwise [rad]."""
+    """Angle of the target for the platform at `time`, counterclockwise [rad]."""
     velocity: Coordinates = (0.0, 0.0, 0.0)
-    """Of x, y and phi then [m/s, m/s, rad/s]."""
+    """Velocity of x, y and phi at `time` [m/s, m/s, rad/s]."""
     time: Clock | None = None
-    """When that is so, by the wall clock of the service's machine [s since 1970]: clocks of two machines must agree to
-    a millisecond or so. At most half a second ago or ahead; without it, when the message comes."""
+    """Time of the target's pose, by the wall clock of the service's machine [s since 1970]; at most half a second in
+    the past or future; the time of arrival if absent. The clocks of two machines must agree to about a millisecond."""
     id: OwnId = None
     timeout: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.25
     """Real time, at every override, after which a track that is not renewed brakes [s]."""
@@ -39,9 +39,9 @@ class TrackGoal(GoalKind, frozen=True, tag="track"):
 
     @property
     def target(self) -> Triple:
-        """Where the target is said to be."""
+        """Pose of the target."""
         return self.x, self.y, self.phi
 
     def at(self, time: float) -> Self:
-        """Return it with another time [s]."""
+        """Return a copy with another time [s]."""
         return structs.replace(self, time=time)

@@ -1,4 +1,4 @@
-"""Along timed points."""
+"""Trajectories of timed points."""
 
 from __future__ import annotations
 
@@ -21,37 +21,40 @@ from trirail.wire.marks import Marks, StopAtEdge
 from trirail.wire.sizes import MAX_PART, MAX_POINTS
 
 SHORTEST_PIECE = 1e-4
-"""Least time between two points of a trajectory [s]: below, its derivatives lose their digits."""
-
-
-LONGEST = 86_400.0
-"""Most that a trajectory lasts [s]."""
+"""Minimum time between two points of a trajectory [s]; below it the derivatives lose precision."""
+MAX_DURATION_S = 86_400.0
+"""Maximum duration of a trajectory [s]."""
 Time = Annotated[float, Meta(ge=-1e10, le=1e10)]
-"""By any clock [s]."""
+"""Time of any clock [s]."""
+
+Stretch = Annotated[
+    bool,
+    Meta(description="slow down a trajectory that exceeds a limit of a slider or the platform, instead of refusing it"),
+]
 
 
 class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the platform is at a time [s]: x, y [m], phi [rad]; how fast and how accelerated, where given."""
+    """Pose of the platform at a time, with optional velocity and acceleration."""
 
     t: Time
-    """[s]; it counts from the first point, whatever that has: zero, or seconds since 1970."""
+    """Time relative to that of the first point, which is arbitrary, such as zero or seconds since 1970 [s]."""
     x: Coordinate
-    """Of the platform's centre, in the base frame [m]."""
+    """x of the platform's centre in the base frame [m]."""
     y: Coordinate
-    """Likewise [m]."""
+    """y of the platform's centre in the base frame [m]."""
     phi: Coordinate
-    """The platform's angle in the base frame, counterclockwise [rad]."""
+    """Angle of the platform in the base frame, counterclockwise [rad]."""
     velocity: Coordinates | None = None
-    """Of x, y and phi [m/s, m/s, rad/s]; where it is not given, that between the neighbours, zero at both ends."""
+    """Velocity of x, y and phi [m/s, m/s, rad/s]; by default the mean between the neighbours, and zero at both ends."""
     acceleration: tuple[Acceleration, Acceleration, Acceleration] | None = None
-    """Of x, y and phi [m/s², m/s², rad/s²]; where it is not given, as the velocity."""
+    """Acceleration of x, y and phi [m/s², m/s², rad/s²]; the default is derived as for the velocity."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
 class TrajectoryPart(Struct, frozen=True, forbid_unknown_fields=True):
-    """Number of a message of a trajectory that is sent in several."""
+    """Number of one message of a trajectory that is sent in parts."""
 
     number: Annotated[int, Meta(ge=1, le=MAX_POINTS // 2)]
     """Counted from 1."""
@@ -60,44 +63,45 @@ class TrajectoryPart(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if self.number > self.of:
-            raise ValueError(f"part: number is {self.number} of {self.of}")
+            raise ValueError(f"part: number {self.number} exceeds the number of parts, {self.of}")
 
 
 class TrajectoryGoal(GoalKind, frozen=True, tag="trajectory"):
-    """Follow timed points, quintic between them, from where the robot stands."""
+    """Follow timed points, joined by quintic polynomials, from the robot's pose."""
 
     points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=MAX_PART)]
-    """By rising time; the first is where the robot stands, the last at rest."""
+    """Points in order of time; the first is the robot's pose, the last is at rest."""
     id: OwnId = None
-    stretch: bool = False
-    """Slow a trajectory that is too fast for a slider or the platform, instead of refusing it."""
+    stretch: Stretch = False
     settle: bool = True
-    """Whether it is done only when the robot is measured to be in position, as any other goal; else when its path has
-    ended."""
+    """Whether the goal is done when the robot is measured to be in position, as for other goals; otherwise at the end
+    of its path."""
     valid_for: ValidFor = None
     part: TrajectoryPart | None = None
-    """Number of this message if the points are sent in several, each with the same `id` and options. Each is answered
-    as the whole goal is."""
+    """Number of this message if the points are sent in parts, each with the same `id` and options. Each part receives
+    the reply to the whole goal."""
     marks: Marks = ()
     stop_at: StopAtEdge = None
 
     def __post_init__(self) -> None:
         check_fields(self)
         if self.part is not None and self.id is None:
-            raise ValueError("id: the parts of a trajectory need the same one")
+            raise ValueError("id is missing; all parts of a trajectory need the same id")
         check_times([point.t for point in self.points])
 
     @property
     def lengthy(self) -> bool:
-        """Whether it has more points than a message holds."""
+        """Whether it has more points than fit into one message."""
         return len(self.points) > MAX_PART
 
 
 def check_times(times: Sequence[float]) -> None:
-    """Raise ValueError where times of points [s] do not rise, or last too long."""
-    lasts = times[-1] - times[0] if times else 0.0
-    if lasts > LONGEST:
-        raise ValueError(f"points: they last {lasts:g} s, a trajectory {LONGEST:g} s at most; are times in seconds?")
+    """Raise ValueError if the times of points [s] do not increase, or if the duration is too long."""
+    duration = times[-1] - times[0] if times else 0.0
+    if duration > MAX_DURATION_S:
+        raise ValueError(
+            f"points: they last {duration:g} s, a trajectory {MAX_DURATION_S:g} s at most; are times in seconds?"
+        )
     for before, after in itertools.pairwise(times):
         if not after - before > 0.999 * SHORTEST_PIECE:  # not a matter of the last digit
             raise ValueError(
@@ -106,7 +110,7 @@ def check_times(times: Sequence[float]) -> None:
 
 
 def parts(goal: TrajectoryGoal) -> list[TrajectoryGoal]:
-    """Return a trajectory as it is sent: itself where one message holds it, else in parts of about the same size."""
+    """Return a trajectory as a list of messages: itself if it fits into one, otherwise parts of about equal size."""
     points = goal.points
     number = -(-len(points) // MAX_PART)
     if number < 2:

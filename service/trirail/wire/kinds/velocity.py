@@ -1,4 +1,4 @@
-"""At a velocity, for as long as that is renewed."""
+"""Jogs: motion at a velocity for as long as it is renewed."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from trirail.wire.goal_kind import Coordinate, GoalKind, OwnId, ToolPoint, Valid
 
 
 class VelocityGoal(GoalKind, frozen=True, tag="velocity"):
-    """Jog: move at a velocity [m/s, rad/s] until `timeout` passes without a fresh one of the same id."""
+    """Jog: move at a velocity [m/s, rad/s] until `timeout` passes without a renewal of the same id."""
 
     renewed = True
 
     x: Coordinate
     """Velocity of the platform's centre, or of its `tool`, along x of the base frame [m/s]."""
     y: Coordinate
-    """Along y [m/s]."""
+    """Velocity of that point along y [m/s]."""
     phi: Coordinate
-    """Rate of the platform's angle, counterclockwise, about that point [rad/s]."""
+    """Angular velocity of the platform about that point, counterclockwise [rad/s]."""
     id: OwnId = None
     timeout: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.1
-    """Real time, at every override, after which a jog that is not renewed brakes [s]."""
+    """Time after which the robot brakes unless the jog is renewed; independent of the override [s]."""
     valid_for: ValidFor = None
     tool: ToolPoint = None
 
     def check_beginning(self) -> None:
-        """Raise RefusedError for a jog that would begin at rest."""
+        """Raise RefusedError for a jog with zero velocity."""
         if not any((self.x, self.y, self.phi)):
-            text = "a jog of no velocity moves nothing: give it one along x, y or phi"
+            text = "jog: the velocity is zero; give a velocity in x, y or phi"
             raise RefusedError(RefusalCode.NO_VELOCITY, text)

@@ -1,0 +1,104 @@
+"""Plan of poses whose looks determine a stage best: optimal by the information matrix, one pose after the other.
+
+The information of looks is A = sum J' J, with J the derivatives of the pixels by the unknowns in standard deviations.
+The mean variance of a mark's computed pixel over the travel is trace(Q A^-1), Q the mean of J' J over all candidates:
+the I-optimal (or V-optimal) design (Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, 10.6). It does not
+depend on the frames, as pixels do not, and is what an alignment anywhere in the travel needs. Greedy: each next pose is
+the candidate that lowers the mean variance most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from trirail.alignment.images import Pair, project_points
+from trirail.alignment.rigid_motion import Floats
+from trirail.alignment.stage_model import StageLook, StageModel, StageState, carry
+
+FIELD_MARGIN = 0.03
+"""Share of a picture at each border that no planned mark enters: the first estimate does not know the lens yet."""
+WEAK_PRIOR = 1e-6
+"""Information of each unknown before the first look, as a share of the greatest of all candidates."""
+
+
+class Candidate(NamedTuple):
+    """A pose that the stage reaches, and the marks that the cameras see there."""
+
+    look: StageLook
+    jacobian: Floats
+    """Derivatives of the marks' pixels by the unknowns, (2 marks, size)."""
+
+
+def find_candidates(
+    model: StageModel,
+    unknowns: Floats,
+    poses: Floats,
+    sliders: Floats,
+    fields: Mapping[str, Pair],
+) -> list[Candidate]:
+    """Return the poses at which a mark is in its picture; `fields` is the size of each view's picture [pixel]."""
+    state = model.state(unknowns)
+    shown = {name: _projected(model, state, name, poses) for name in state.places}
+    sizes = {name: np.array(fields[model.view_of[name]]) for name in shown}
+    inside = {
+        name: np.all((at > FIELD_MARGIN * sizes[name]) & (at < (1.0 - FIELD_MARGIN) * sizes[name]), axis=1)
+        for name, at in shown.items()
+    }
+    looks = []
+    for number, (pose, reading) in enumerate(zip(poses.tolist(), sliders.tolist(), strict=True)):
+        marks = {name: _pair(at[number]) for name, at in shown.items() if bool(np.take(inside[name], number))}
+        if marks:
+            looks.append(StageLook(tuple(reading), tuple(pose), marks))
+    if not looks:
+        return []
+    jacobians = np.split(model.jacobian(unknowns, looks), np.cumsum([len(look.marks) for look in looks])[:-1])
+    return [Candidate(look, J.reshape(-1, model.size)) for look, J in zip(looks, jacobians, strict=True)]
+
+
+def _projected(model: StageModel, state: StageState, name: str, poses: Floats) -> Floats:
+    """Return the pixels of a mark at poses, (N, 2)."""
+    at, _ = carry(poses, np.array(state.places[name]))
+    return np.asarray(project_points(state.views[model.view_of[name]], at))
+
+
+def _pair(values: Floats) -> Pair:
+    return float(values[0]), float(values[1])
+
+
+def choose_poses(
+    model: StageModel,
+    unknowns: Floats,
+    earlier: Sequence[StageLook],
+    candidates: Sequence[Candidate],
+    count: int,
+    noise: float,
+) -> list[StageLook]:
+    """Return `count` candidates, each the one that lowers the mean variance over all candidates most."""
+    every = np.concatenate([each.jacobian for each in candidates])
+    scales = np.maximum(np.linalg.norm(every, axis=0), 1e-300)
+    jacobians = [each.jacobian / scales / noise for each in candidates]
+    Q = sum(J.T @ J for J in jacobians) / len(jacobians)
+    A = WEAK_PRIOR * len(candidates) / noise**2 * np.eye(model.size)
+    A[: model.legs, : model.legs] += np.diag(1.0 / scales[: model.legs] ** 2)
+    if earlier:
+        J = model.jacobian(unknowns, earlier).reshape(-1, model.size) / scales / noise
+        A += J.T @ J
+    covariance = np.linalg.inv(A)
+    chosen = []
+    for _ in range(count):
+        best, most = 0, -1.0
+        spread = covariance @ Q @ covariance
+        for number, J in enumerate(jacobians):
+            core = np.eye(len(J)) + J @ covariance @ J.T
+            gain = float(np.trace(np.linalg.solve(core, J @ spread @ J.T)))
+            if gain > most:
+                best, most = number, gain
+        chosen.append(candidates[best].look)
+        J = jacobians[best]
+        P = covariance @ J.T
+        covariance = covariance - P @ np.linalg.solve(np.eye(len(J)) + J @ P, P.T)
+        covariance = (covariance + covariance.T) / 2.0
+    return chosen

@@ -1,0 +1,158 @@
+"""Robust fit of a stage model to looks: outliers are left out, undetermined combinations stay as configured.
+
+The residuals are weighed by their own noise, estimated from their median. A first fit with a soft loss (soft l1,
+Triggs et al. 2000, Bundle Adjustment, 4.3) finds the outliers; the last one is least squares without them. In both the
+drawings count as one more observation of each correction, with the doubts of trirail.alignment.stage_model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trirail.alignment.rigid_motion import Floats
+from trirail.alignment.stage_model import StageLook, StageModel, list_marks
+from trirail.errors import AlignmentError, AlignmentFault, KinematicsError
+
+OUTLIER_DEVIATIONS = 6.0
+"""Distance of a mark from its computed pixel, in standard deviations, from which it is an outlier."""
+MIN_NOISE_PX = 0.01
+MAX_OUTLIER_SHARE = 0.3
+TOLERANCE = 1e-12
+MAX_EVALUATIONS = 100
+MAX_ROUNDS = 6
+RAYLEIGH_MEDIAN = 1.1774
+"""Median distance in the plane, in standard deviations of one coordinate."""
+
+
+class StageFit(NamedTuple):
+    """Unknowns of a stage model fitted to looks."""
+
+    unknowns: Floats
+    covariance: Floats
+    """Covariance of the unknowns, (size, size); zero for combinations that stay as configured."""
+    determined: Floats
+    """Orthonormal basis of the leg unknowns that the looks determine, (legs, K)."""
+    noise: float
+    """Standard deviation of a mark's u or v, from the residuals [pixel]."""
+    residuals: Floats
+    """Seen less computed pixels, (n, 2), in the order of list_marks."""
+    used: NDArray[np.bool]
+    """True for those that are no outliers, (n,)."""
+
+
+def fit_stage(
+    model: StageModel, looks: Sequence[StageLook], start: Floats | None = None, *, fixed_legs: bool = False
+) -> StageFit:
+    """Return the fit of a model to looks, from the configured stage or from other unknowns; legs may stay `fixed_legs`.
+
+    Raises AlignmentError if the looks are too few, or do not belong to the moves.
+    """
+    marks = list_marks(looks)
+    unknowns = model.initial() if start is None else start
+    used = np.ones(len(marks), bool)
+    if 2 * len(marks) <= model.size - model.legs:
+        raise AlignmentError(
+            AlignmentFault.MOVES, f"{len(marks)} marks seen over {len(looks)} looks are too few: add looks or marks"
+        )
+    if fixed_legs:  # the configured legs are to explain what the true ones do: nothing is an outlier
+        free = np.eye(model.size)[:, model.legs :]
+        return _result(model, looks, _minimise(model, looks, unknowns, used, free, 1.0, robust=False), used, free)
+    unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, robust=True)
+    for _ in range(MAX_ROUNDS):
+        away = np.linalg.norm(model.residuals(unknowns, looks), axis=1)
+        noise = max(float(np.median(away[used])) / RAYLEIGH_MEDIAN, MIN_NOISE_PX)
+        now = away <= OUTLIER_DEVIATIONS * noise
+        if now.mean() < 1.0 - MAX_OUTLIER_SHARE:
+            raise AlignmentError(
+                AlignmentFault.STILL,
+                f"{len(now) - int(now.sum())} of {len(now)} marks are far from where any stage would put them; check "
+                "that each look takes a new picture, and the names of the marks",
+            )
+        basis = _determined(model, model.jacobian(unknowns, looks)[now] / noise)
+        unknowns[: model.legs] = basis[: model.legs] @ (basis[: model.legs].T @ unknowns[: model.legs])
+        settled, used = bool(np.array_equal(now, used)), now
+        unknowns = _minimise(model, looks, unknowns, used, basis, noise, robust=False)
+        if settled:
+            break
+    return _result(model, looks, unknowns, used, basis)
+
+
+def _result(
+    model: StageModel, looks: Sequence[StageLook], unknowns: Floats, used: NDArray[np.bool], basis: Floats
+) -> StageFit:
+    residuals = model.residuals(unknowns, looks)
+    jacobian = model.jacobian(unknowns, looks)[used].reshape(-1, model.size) @ basis
+    legs = model.legs
+    freedom = max(2 * int(used.sum()) - basis.shape[1], 1)
+    noise = float(np.sqrt((residuals[used] ** 2).sum() / freedom))
+    information = np.concatenate([jacobian, noise * np.eye(legs, model.size) @ basis])  # with the drawings
+    scales = np.maximum(np.linalg.norm(information, axis=0), 1e-300)
+    inverse = np.linalg.pinv(information / scales)
+    covariance = basis @ ((inverse @ inverse.T) / np.outer(scales, scales)) @ basis.T * noise**2
+    return StageFit(unknowns, covariance, basis[:legs, : basis.shape[1] - (model.size - legs)], noise, residuals, used)
+
+
+def leg_information(model: StageModel, jacobian: Floats) -> Floats:
+    """Return the information of looks about the legs, with cameras and marks unknown: rows (., legs).
+
+    `jacobian` is that of the pixels in standard deviations, (n, 2, size).
+    """
+    rows = jacobian.reshape(-1, model.size)
+    legs, others = rows[:, : model.legs], rows[:, model.legs :]
+    others = others / np.maximum(np.linalg.norm(others, axis=0), 1e-300)
+    q, _ = np.linalg.qr(others)
+    return np.asarray(legs - q @ (q.T @ legs))
+
+
+def _determined(model: StageModel, jacobian: Floats) -> Floats:
+    """Return a basis (size, K) of the unknowns that the looks determine better than drawings do."""
+    _, values, directions = np.linalg.svd(leg_information(model, jacobian), full_matrices=False)
+    known = directions[values > 1.0].T
+    basis = np.zeros((model.size, known.shape[1] + model.size - model.legs))
+    basis[: model.legs, : known.shape[1]] = known
+    basis[model.legs :, known.shape[1] :] = np.eye(model.size - model.legs)
+    return basis
+
+
+def _minimise(
+    model: StageModel,
+    looks: Sequence[StageLook],
+    unknowns: Floats,
+    used: NDArray[np.bool],
+    basis: Floats,
+    noise: float,
+    *,
+    robust: bool,
+) -> Floats:
+    from scipy.optimize import least_squares  # type: ignore[import-untyped]
+
+    # Drawings count as one more observation of each correction: otherwise few looks would explain their noise by legs.
+    prior = np.eye(model.legs, model.size) @ basis
+
+    def residuals(step: Floats) -> Floats:
+        try:
+            seen = model.residuals(unknowns + basis @ step, looks)[used].ravel() / noise
+        except KinematicsError:
+            return np.full(2 * int(used.sum()) + len(prior), np.inf)  # too far: the solver takes a part of the step
+        return np.concatenate([seen, unknowns[: model.legs] + prior @ step])
+
+    def jacobian(step: Floats) -> Floats:
+        rows = model.jacobian(unknowns + basis @ step, looks)[used].reshape(-1, model.size) @ basis / noise
+        return np.concatenate([-rows, prior])
+
+    solution = least_squares(
+        residuals,
+        np.zeros(basis.shape[1]),
+        jacobian,
+        loss="soft_l1" if robust else "linear",
+        x_scale="jac",
+        ftol=TOLERANCE if not robust else 1e-8,
+        xtol=TOLERANCE if not robust else 1e-8,
+        gtol=None,
+        max_nfev=MAX_EVALUATIONS,
+    )
+    return np.asarray(unknowns + basis @ solution.x)

@@ -1,0 +1,229 @@
+"""`trirail align geometry`: the stage's own geometry by its cameras, as a new configuration that a person asks for."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+from cyclopts import Parameter
+
+from trirail.cli import alignment_lines, notation, terminal
+from trirail.cli.mark_source import MarkSource
+from trirail.cli.options import HERE, Flag, Service
+from trirail.errors import ConfigError
+
+if TYPE_CHECKING:
+    from trirail.alignment.camera_calibration import Marks
+    from trirail.alignment.geometry_calibration import GeometryCalibration
+    from trirail.client.client import Robot
+    from trirail.config import Config
+    from trirail.config.as_built import AsBuilt
+
+PROGRAM = MarkSource()
+
+
+class _Written(NamedTuple):
+    """Files that were written; None for those that nobody wanted."""
+
+    config: Path | None = None
+    cameras: Path | None = None
+    old_cameras: Path | None = None
+    map: Path | None = None
+
+
+def geometry(
+    config: Path,
+    /,
+    *,
+    field: Annotated[tuple[int, int], Parameter(negative="")],
+    out: Path | None = None,
+    calibration: Path = Path("camera.json"),
+    poses: int = 30,
+    one_camera: Annotated[bool, Flag] = False,
+    lens: Literal["affine", "perspective", "radial"] = "radial",
+    approach: notation.PoseWay = notation.AT_REST,
+    yes: Annotated[bool, Flag] = False,
+    source: MarkSource = PROGRAM,
+    service: Service = HERE,
+) -> int:
+    """Find the stage's own rails, pivots, scales and cameras by moves over its whole travel, and propose them.
+
+    The robot is enabled, and the marks of a part in the pictures. Nothing is written without a yes; CONFIG is never
+    changed. The new configuration takes effect when the service is started with it.
+
+    Parameters
+    ----------
+    config
+        Configuration with which the service runs.
+    field
+        Size of the pictures: COLUMNS ROWS in pixels. Poses are planned so that marks stay in them.
+    out
+        Configuration to write; one with a free name beside CONFIG if absent.
+    calibration
+        Calibration of the cameras to write, for `trirail align run`; an existing file is kept as FILE.old.
+    poses
+        How many looks to take, 12 or more.
+    one_camera
+        The program's marks are all seen by one camera; else each has a camera of its own.
+    lens
+        What the pictures are like.
+    approach
+        How far beyond each pose to go first, X Y PHI [m, rad], so that backlash is always on the same side.
+    yes
+        Write without a question.
+    """
+    from trirail.alignment.procedure import observe_mean
+    from trirail.client.alignment import drive
+    from trirail.client.stage_geometry import geometry_task
+    from trirail.config import load
+
+    settings = load(config)
+    if out is not None and out.exists():
+        raise ConfigError(f"{out} exists already; name another file with --out")
+    way = approach[0], approach[1], notation.radians(approach[2], False)
+    with source.open_source() as (look, known), service.open() as robot:
+        _check_same(settings, config, robot)
+        views = dict.fromkeys(look(), "camera") if one_camera else known
+        task = geometry_task(robot.info(), field, views, lens, poses, source.looks, way if any(way) else None)
+        from trirail.alignment.geometry_calibration import calibrate_geometry
+
+        wishes = calibrate_geometry(task)
+        shown = wishes if service.json else alignment_lines.print_looks(wishes, poses)
+        result = drive(robot, look, shown, source.speed, source.wait)
+        targets = drive(robot, look, observe_mean(source.looks), source.speed, source.wait).marks
+        taught = sorted(name for name, pose in robot.poses().items() if pose.taught)
+    if not service.json:
+        alignment_lines.show_geometry(result, settings.geometry.labels)
+    asks = not yes and not service.json
+    usable, written = _usable_map(result, settings, quiet=service.json), _Written()
+    if yes or (asks and _answers_yes("Write a new configuration with these values?")):
+        if asks and usable is not None and not _answers_yes("Write the map too, as [correction] map?"):
+            usable = None
+        written = _write(result, config, settings, out, calibration, targets, usable)
+    remarks = _remarks(settings, taught)
+    if service.json:
+        files = {name: None if path is None else str(path) for name, path in written._asdict().items()}
+        terminal.json(_content(result) | {"made_before": remarks, "written": files})
+    elif written.config is None:
+        terminal.print_line("nothing is written")
+    else:
+        _report(written, config, remarks)
+    return 0
+
+
+def _check_same(settings: Config, path: Path, robot: Robot) -> None:
+    """Refuse a file that is not the service's. Raises ConfigError."""
+    from trirail import config
+    from trirail.client.stage_geometry import geometry_id
+    from trirail.config.as_built import geometry_of
+
+    if settings.robot.name != robot.name:
+        raise ConfigError(f"{path} is of robot {settings.robot.name}, not of {robot.name}: name it with --robot")
+    if geometry_of(config.geometry(settings.geometry)) != geometry_id(robot.info()):
+        raise ConfigError(f"{path}: its [geometry] is not that with which the service runs; name the service's file")
+
+
+def _usable_map(result: GeometryCalibration, settings: Config, *, quiet: bool) -> AsBuilt | None:
+    """Return the map of the remaining errors if it helps and the limits allow it; say its effect unless `quiet`."""
+    from trirail import config
+    from trirail.config import as_built
+
+    if result.map is None or not result.map.helps:
+        return None
+    before, after = result.map.before, result.map.after
+    made = as_built.measured_today(result.map.correction, result.geometry)
+    words = (
+        f"A map of the remaining errors lowers them at held-out looks from {before[0] * 1e6:.2f} to "
+        f"{after[0] * 1e6:.2f} µm, and from {before[1] * 1e6:.2f} to {after[1] * 1e6:.2f} µrad"
+    )
+    try:
+        config.check_as_built(made, result.geometry, settings.limits)
+        usable = True
+    except ConfigError as error:
+        usable, words = False, f"{words}, but it is refused: {error}"
+    if not quiet:
+        terminal.print_line(words)
+    return made if usable else None
+
+
+def _answers_yes(question: str) -> bool:
+    """Ask at the terminal, or the lines of a script; the end of the input is a no."""
+    terminal.out.print(f"{terminal.plain(question)} \\[y/N] ", end="")
+    try:
+        return input().strip().lower() in ("y", "yes")
+    except EOFError:
+        terminal.print_line("")
+        return False
+
+
+def _write(
+    result: GeometryCalibration,
+    path: Path,
+    settings: Config,
+    out: Path | None,
+    cameras: Path,
+    targets: Marks,
+    errors: AsBuilt | None,
+) -> _Written:
+    """Write the configuration, the cameras' calibration, and the map. Raises ConfigError, FileError."""
+    from trirail.client import calibration_file
+    from trirail.commissioning import config_edit
+    from trirail.config import as_built
+
+    written = out or config_edit.find_free_path(path, "calibrated")
+    map_path = written.with_name(f"{written.stem}-map.toml") if errors is not None else None
+    text = path.read_text(encoding="utf-8")
+    text = config_edit.edit_geometry(text, result.geometry, result.scales, map_path.name if map_path else None)
+    if settings.can.interface == "simulated" and settings.can.simulated.built is None:
+        text = config_edit.add_simulated_build(text, settings.drives)
+    if written.parent.resolve() != path.parent.resolve():
+        text = config_edit.resolve_eds_paths(text, path.parent)
+    if map_path is not None and errors is not None:
+        config_edit.write_new_file(map_path, as_built.format_map(errors))
+    config_edit.write_new_file(written, text)
+    old = calibration_file.keep_old(cameras)
+    geometry_id = as_built.geometry_of(result.geometry)
+    calibration_file.write(cameras, settings.robot.name, result.cameras, targets, geometry=geometry_id)
+    return _Written(written, cameras, old, map_path)
+
+
+def _remarks(settings: Config, taught: list[str]) -> list[str]:
+    """Return the list of data that was made with the old geometry."""
+    remarks = []
+    if taught:
+        remarks.append(f"taught poses {', '.join(taught)}: flagged until each is taught again")
+    if settings.correction.map is not None:
+        remarks.append(f"correction.map {settings.correction.map}: left out; make it again")
+    remarks.append("other camera calibrations: flagged until an alignment confirms them, or they are made again")
+    return remarks
+
+
+def _report(written: _Written, path: Path, remarks: list[str]) -> None:
+    terminal.print_line(f"written to {written.config}; {path} is unchanged. Cameras and targets: {written.cameras}")
+    if written.old_cameras is not None:
+        terminal.print_line(f"previous file saved as {written.old_cameras}")
+    if written.map is not None:
+        terminal.print_line(f"map: {written.map}")
+    terminal.print_line(f"It takes effect when the service is started again: trirail run {written.config}")
+    terminal.print_line("Made with the geometry before:")
+    for remark in remarks:
+        terminal.print_line(f"  {remark}")
+
+
+def _content(result: GeometryCalibration) -> dict[str, object]:
+    """Return a calibration for programs; an infinite deviation is null."""
+    residual_map = None
+    if result.map is not None:
+        residual_map = {"before": result.map.before, "after": result.map.after, "helps": result.map.helps}
+    return {
+        "parameters": result.parameters,
+        "deviations": {name: value if math.isfinite(value) else None for name, value in result.deviations.items()},
+        "undetermined": result.undetermined,
+        "residual": result.residual._asdict(),
+        "noise": result.noise,
+        "picture_noise": result.picture_noise,
+        "outliers": [each._asdict() for each in result.outliers],
+        "looks": len(result.looks),
+        "map": residual_map,
+    }

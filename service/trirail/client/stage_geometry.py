@@ -1,0 +1,49 @@
+"""Geometry of a stage by its own cameras, for a connection to its service."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from trirail_drivers.interface import Triple
+
+from trirail.alignment.images import Lens, Pair
+from trirail.config import as_built, room
+from trirail.errors import TrirailError
+from trirail.telemetry.shown_robot import ShownRobot
+from trirail.wire.state import Info
+
+if TYPE_CHECKING:
+    from trirail.alignment.geometry_calibration import GeometryTask
+
+INSTALL = "pip install 'trirail[analysis]'"
+
+
+def geometry_id(info: Info) -> str:
+    """Return the checksum of a service's [geometry], as correction maps have it."""
+    return as_built.geometry_of(ShownRobot.of_info(info).geometry)
+
+
+def geometry_task(
+    info: Info,
+    field: Pair,
+    views: Mapping[str, str] | None,
+    lens: Lens,
+    poses: int,
+    looks: int,
+    approach: Triple | None,
+) -> GeometryTask:
+    """Return the task for the stage of a service. Raises RefusedError, or TrirailError without SciPy."""
+    if "scipy" in sys.modules and sys.modules["scipy"] is None:
+        del sys.modules["scipy"]  # kept out of services, where numba would import it (processes.compiling)
+    try:
+        from trirail.alignment.geometry_calibration import GeometryTask
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] != "scipy":
+            raise
+        raise TrirailError(f"the fit needs SciPy, which is not installed: {INSTALL}") from error
+    robot = ShownRobot.of_info(info)
+    task = GeometryTask(robot.geometry, room(robot.limits), field, views, lens, poses, looks, approach)
+    task.check()
+    return task

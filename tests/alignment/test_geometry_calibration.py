@@ -1,0 +1,279 @@
+"""The stage's own geometry by its cameras: exact looks give exact corrections, and what looks cannot tell is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from alignment.cameras import FIELD, BuiltStage, wide_camera
+from hypothesis import example, given
+from hypothesis import strategies as st
+from trirail.alignment.camera_calibration import to_base_frame
+from trirail.alignment.geometry_calibration import (
+    GeometryCalibration,
+    GeometryTask,
+    calibrate_geometry,
+    plan,
+    start_model,
+)
+from trirail.alignment.images import Lens, Pair, project_points
+from trirail.alignment.pose_plan import choose_poses, find_candidates
+from trirail.alignment.procedure import AlignmentTask, align
+from trirail.alignment.rigid_motion import Floats
+from trirail.alignment.stage_model import StageLook, StageModel
+from trirail.client.stage_as_built import built_otherwise
+from trirail.config import SIM, geometry, load, room
+from trirail.errors import AlignmentError, AlignmentFault, RefusedError
+from trirail.kinematics.correction import Correction
+from trirail.kinematics.geometry import Geometry, travels
+from trirail.kinematics.robot import forward, inverse
+from trirail_drivers.interface import Triple
+
+SEEDS = st.integers(0, 2**32 - 1)
+STAGES = {name: load(SIM.with_name(f"{name}.toml")) for name in ("uvw", "uvw-ppr", "xxy")}
+PART: dict[str, Pair] = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
+LENSES: tuple[Lens, ...] = ("affine", "perspective", "radial")
+names = st.sampled_from(sorted(STAGES))
+
+
+def stage(
+    name: str, seed: int, noise: float = 0.0, part: Mapping[str, Pair] = PART, lens: Lens = "radial"
+) -> tuple[BuiltStage, GeometryTask]:
+    """Return a stage that is built otherwise, and the task to calibrate it."""
+    rng = np.random.default_rng(seed)
+    robot, limits = geometry(STAGES[name].geometry), room(STAGES[name].limits)
+    built = built_otherwise(robot, rng, 50e-6, 1e-4)
+    views = {mark: wide_camera(rng, at, lens) for mark, at in part.items()}
+    made = BuiltStage(robot, built, rng.uniform(-2e-4, 2e-4, 3).tolist(), views, part, rng, noise)
+    return made, GeometryTask(robot, limits, FIELD, lens=lens, looks=1)
+
+
+def unseen(task: GeometryTask, count: int, seed: int = 1) -> Floats:
+    """Return poses anywhere in the travel, (count, 3)."""
+    rng = np.random.default_rng(seed)
+    poses = 0.95 * rng.uniform(task.room.low, task.room.high, (40 * count, 3))
+    reached: Floats = poses[task.room.holds(travels(task.start, poses))][:count]
+    return reached
+
+
+def misses(made: BuiltStage, found: GeometryCalibration, poses: Floats) -> Floats:
+    """Return how far marks are from where the calibration computes them, for poses by the configuration [pixel]."""
+    distances = []
+    for pose in poses:
+        x, y, phi = pose.tolist()
+        made.pose = (x, y, phi)
+        sliders = inverse(made.configured, pose).position * (1.0 + np.array(found.scales))
+        computed = forward(found.geometry, sliders)
+        for name, seen in made.look().items():
+            fit = found.cameras.marks[name]
+            at = project_points(found.cameras.views[fit.view], to_base_frame(fit.place, computed.tolist())[None])[0]
+            distances.append(float(np.linalg.norm(at - seen)))
+    return np.array(distances)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(name=names, seed=SEEDS)
+def test_derivatives_are_those_of_the_pixels(name: str, seed: int, lens: Lens) -> None:
+    made, task = stage(name, seed, lens=lens)
+    rng = np.random.default_rng(seed)
+    poses = unseen(task, 4, seed)
+    looks = []
+    for pose in poses:
+        a, b, c = inverse(task.start, pose).position.tolist()
+        x, y, phi = pose.tolist()
+        looks.append(StageLook((a, b, c), (x, y, phi), dict.fromkeys(PART, (0.0, 0.0))))
+    model = StageModel(task.start, poses, made.views, PART, {mark: mark for mark in PART})
+    unknowns = model.initial()
+    unknowns[: model.legs] += 0.1 * rng.standard_normal(model.legs)
+    jacobian = model.jacobian(unknowns, looks)
+    for number in range(model.size):
+        step = np.zeros(model.size)
+        step[number] = 1e-3 / max(float(np.abs(jacobian[..., number]).max()), 1e-9)
+        change = model.residuals(unknowns - step, looks) - model.residuals(unknowns + step, looks)
+        assert change / 2e-3 == pytest.approx(jacobian[..., number] * step[number] / 1e-3, abs=2e-4)
+
+
+@pytest.mark.parametrize("name", sorted(STAGES))
+def test_exact_looks_tell_every_mark_in_the_whole_travel(name: str) -> None:
+    made, task = stage(name, 7)
+    found = made.drive(calibrate_geometry(task))
+    assert len(found.looks) == 30
+    assert found.outliers == ()
+    assert misses(made, found, unseen(task, 20)).max() < 0.05
+
+
+@pytest.mark.parametrize("name", ["uvw", "uvw-ppr"])
+def test_one_correction_anywhere_in_the_travel(name: str) -> None:
+    made, task = stage(name, 3, noise=0.02)
+    found = made.drive(calibrate_geometry(task))
+    begin, end = unseen(task, 2, 5).tolist()
+    made.configured, made.scales = found.geometry, (1.0 + made.scales) / (1.0 + np.array(found.scales)) - 1.0
+    made.pose = (end[0], end[1], end[2])
+    targets, aim = made.look(), made.true_pose
+    made.pose = (begin[0], begin[1], begin[2])
+    result = made.drive(align(AlignmentTask(found.cameras, targets, tolerance=2e-6)))
+    assert (result.reached, len(result.corrections)) == (True, 1)
+    assert made.true_pose == pytest.approx(aim, abs=2e-6)
+
+
+@given(seed=SEEDS, name=names)
+@example(seed=0, name="uvw")
+def test_lost_swapped_and_wrong_marks_are_named_and_change_nothing(seed: int, name: str) -> None:
+    made, task = stage(name, seed, noise=0.05)
+    look, count = made.look, 0
+
+    def damaged() -> dict[str, Pair]:
+        nonlocal count
+        count += 1
+        seen = look()
+        if count in (3, 14) and len(seen) == 2:
+            return {"left": seen["right"], "right": seen["left"]}
+        if count in (9, 20):
+            return {name: pixel for name, pixel in seen.items() if name != "left"}
+        if count == 17 and "right" in seen:
+            return seen | {"right": (seen["right"][0] + 3.0, seen["right"][1])}
+        return seen
+
+    made.look = damaged  # type: ignore[method-assign]
+    found = made.drive(calibrate_geometry(task))
+    made.look = look  # type: ignore[method-assign]
+    swapped = {(each.look, each.mark, each.swapped_with) for each in found.outliers if each.swapped_with}
+    assert swapped >= {(3, "left", "right"), (3, "right", "left")}
+    assert {each.look for each in found.outliers} >= {3, 14}
+    assert {each.look for each in found.outliers} <= {3, 14, 17}
+    assert found.noise < 0.1
+    assert misses(made, found, unseen(task, 10)).max() < 1.5
+
+
+def test_what_no_look_tells_is_named_and_stays_as_configured() -> None:
+    """The rail's angle of a leg whose cross slide is square to it, and its encoder's scale, have the same effect."""
+    made, task = stage("uvw-ppr", 2, noise=0.05)
+    found = made.drive(calibrate_geometry(task))
+    assert {f"{leg} rail_angle" for leg in "ABC"} <= set(found.undetermined)
+    assert all(math.isinf(found.deviations[name]) for name in found.undetermined)
+    assert found.parameters["A rail_angle"] == pytest.approx(0.0, abs=1e-9)
+    told = [name for name, value in found.deviations.items() if math.isfinite(value)]
+    assert told
+
+
+def test_one_camera_tells_less_than_two_and_says_so() -> None:
+    made, task = stage("uvw", 4, noise=0.05)
+    alone, _ = stage("uvw", 4, noise=0.05, part={"left": PART["left"]})
+    two = made.drive(calibrate_geometry(task)).undetermined
+    one = alone.drive(calibrate_geometry(task)).undetermined
+    assert len(one) > len(two)
+
+
+def test_the_fewest_looks_of_one_mark_still_end_with_what_they_determine() -> None:
+    made, task = stage("uvw", 4, noise=0.05, part={"left": PART["left"]})
+    found = made.drive(calibrate_geometry(task._replace(poses=12)))
+    assert len(found.looks) == 12
+    assert len(found.undetermined) > 6
+    assert all(math.isfinite(found.deviations[name]) for name in found.deviations.keys() - set(found.undetermined))
+
+
+def test_standard_deviations_are_the_scatter_of_repeated_calibrations() -> None:
+    corrections, deviations = [], []
+    for repeat in range(12):
+        made, task = stage("uvw", 3, noise=0.05)
+        made.reseed(repeat)
+        found = made.drive(calibrate_geometry(task))
+        corrections.append(list(found.parameters.values()))
+        deviations.append(list(found.deviations.values()))
+    expected = np.median(deviations, axis=0)
+    told = np.isfinite(expected) & (expected > 1e-12)
+    ratios = np.std(corrections, axis=0, ddof=1)[told] / expected[told]
+    assert 0.7 < math.sqrt(float(np.mean(ratios**2))) < 1.2
+
+
+def test_the_frame_and_the_length_are_those_of_the_configuration() -> None:
+    """A stage that stands elsewhere, or all of whose encoders count too little, shows the same pictures."""
+    made, task = stage("uvw", 5)
+    made.built, made.scales = task.start, np.full(3, 3e-4)
+    found = made.drive(calibrate_geometry(task))
+    assert sum(found.scales) == pytest.approx(0.0, abs=1e-12)
+    assert max(abs(value) for value in found.parameters.values()) > 1e-6  # 300 ppm of 60 mm, in the legs
+
+    made, task = stage("uvw", 5)
+    made.built, made.scales = _elsewhere(task.start), np.zeros(3)
+    found = made.drive(calibrate_geometry(task))
+    assert max(abs(value) for value in found.parameters.values()) < 1e-6
+
+
+def _elsewhere(robot: Geometry) -> Geometry:
+    legs = [dataclasses.replace(leg, anchor=(leg.anchor[0] + 2e-4, leg.anchor[1] - 1e-4)) for leg in robot.legs]
+    return dataclasses.replace(robot, legs=tuple(legs))
+
+
+def test_planned_poses_tell_more_than_random_ones_and_keep_marks_in_the_pictures() -> None:
+    made, task = stage("uvw", 6, noise=0.05)
+    found = made.drive(calibrate_geometry(task))
+    first = found.looks[:7]
+    model, unknowns, noise = start_model(task, first)
+    planned = plan(task, model, unknowns, first, noise)
+    assert len(planned) == 23
+    assert all(set(look.marks) == set(found.looks[7 + n].marks) == set(PART) for n, look in enumerate(planned))
+    poses = unseen(task, 200)
+    sliders = inverse(task.start, poses).position
+    candidates = find_candidates(model, unknowns, poses, sliders, dict.fromkeys(PART, FIELD))
+    random = [each.look for each in candidates[:23]]
+
+    def variance(looks: list[StageLook]) -> float:
+        rows = model.jacobian(unknowns, [*first, *looks]).reshape(-1, model.size) / noise
+        scales = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)  # the lens is straight at first: no centre yet
+        inverse_information = np.linalg.inv((rows / scales).T @ (rows / scales) + 1e-9 * np.eye(model.size))
+        every = np.concatenate([each.jacobian for each in candidates]) / scales
+        return float(np.einsum("ij,jk,ik->i", every, inverse_information, every).mean())
+
+    assert variance(planned) < 0.8 * variance(random)
+    assert choose_poses(model, unknowns, first, candidates, 0, noise) == []
+
+
+def test_a_map_is_offered_for_errors_that_no_geometry_explains_where_it_helps_at_looks_that_it_does_not_know() -> None:
+    made, task = stage("uvw", 8, noise=0.05)
+    assert made.drive(calibrate_geometry(task)).map is None
+    nodes = np.random.default_rng(8).uniform(-1.0, 1.0, (5, 5, 5, 3)) * (3e-5, 3e-5, 0.0)
+    low, high = (-0.012, -0.012, -0.1), (0.012, 0.012, 0.1)
+    made.built = dataclasses.replace(made.built, correction=Correction(low, high, nodes))
+    bent = made.drive(calibrate_geometry(task._replace(poses=60)))
+    assert bent.is_systematic
+    assert bent.map is not None
+    assert bent.map.helps
+    assert bent.map.after[0] < 0.6 * bent.map.before[0]
+    few = made.drive(calibrate_geometry(task._replace(poses=20)))
+    assert few.is_systematic
+    assert few.map is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"field": (0.0, 100.0)}, "size of the pictures"),
+        ({"poses": 5}, "poses is 5"),
+        ({"looks": 0}, "looks is 0"),
+        ({"lens": "fish"}, "lens is 'fish'"),
+        ({"approach": (1.0,)}, "approach"),
+    ],
+)
+def test_impossible_arguments_are_refused_before_a_move(change: dict[str, object], words: str) -> None:
+    made, task = stage("uvw", 1)
+    with pytest.raises(RefusedError, match=words):
+        made.drive(calibrate_geometry(task._replace(**change)))  # type: ignore[arg-type]
+    assert made.motions == 0
+
+
+def test_marks_that_do_not_move_and_a_field_without_marks_are_refused() -> None:
+    made, task = stage("uvw", 1)
+    pose: Triple = (0.0, 0.0, 0.0)
+    seen = made.look()
+    made.look = lambda: seen  # type: ignore[method-assign]
+    with pytest.raises(AlignmentError) as still:
+        made.drive(calibrate_geometry(task))
+    assert still.value.fault is AlignmentFault.STILL
+    made, task = stage("uvw", 1)
+    assert made.pose == pose
+    with pytest.raises(AlignmentError, match="check the field"):
+        made.drive(calibrate_geometry(task._replace(field=(50.0, 50.0))))
