@@ -303,8 +303,10 @@ def test_a_drive_that_refuses_its_outputs_later_is_a_fault(rig: Rig) -> None:
 # ---------------------------------------------------------------------- recovery
 
 
+@pytest.mark.parametrize("wanted", [LAMP, VALVE])
 @pytest.mark.parametrize("mapped", [True, False])
-def test_a_drive_that_lost_its_supply_gets_its_outputs_again(rig: Rig, mapped: bool) -> None:
+def test_a_drive_that_lost_its_supply_gets_its_outputs_again(rig: Rig, mapped: bool, wanted: int) -> None:
+    """The safe value, as the control wants with a fault; or that of an output which may stay on."""
     if not mapped:
         unmappable(rig)
     ready(rig)
@@ -314,19 +316,20 @@ def test_a_drive_that_lost_its_supply_gets_its_outputs_again(rig: Rig, mapped: b
     assert a.pins.bits == VALVE
     a.restart(rig.clock.now)
     assert a.pins.bits == 0
-    rig.drives.set_outputs((LAMP, 0, 0))  # what the control does with a fault
+    rig.drives.set_outputs((wanted, 0, 0))
     for _ in range(8000):
         if rig.cycle().unready == (None, None, None):
             break
     assert rig.drives.path_outputs[0] is mapped
     rig.cycles(5)
     assert a.objects[0x60FE, 2].value == VALVE | LAMP
-    assert a.pins.bits == LAMP
+    assert a.pins.bits == wanted
+    assert LAMP in [change.bits for change in list(a.pins.history)[-2:]], "safe as long as it was set up"
     rig.drives.reset()
     rig.cycles(5)
-    rig.drives.set_outputs((VALVE, 0, 0))
+    rig.drives.set_outputs((VALVE | LAMP, 0, 0))
     rig.cycles(5)
-    assert a.pins.bits == VALVE
+    assert a.pins.bits == VALVE | LAMP
 
 
 # ---------------------------------------------------------------------- drives that others made

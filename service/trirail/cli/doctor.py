@@ -250,7 +250,12 @@ def _link(config: Config, machine: Machine) -> list[Check]:
     outputs = sum(bool(each.outputs) for each in config.drive_io)
     traffic = PROTOCOLS[config.drives.protocol].traffic.with_outputs(outputs)
     queue = _queue(name, link.get("txqlen"), traffic.most_sent)
-    return [_bitrate(name, bitrate, data, up), _state(name, data, up), queue, *_coalescing(name, machine.coalescing, up)]
+    return [
+        _bitrate(name, bitrate, data, up),
+        _state(name, data, up),
+        queue,
+        *_coalescing(name, machine.coalescing, up),
+    ]
 
 
 def _traffic(config: Config, passed: BusTraffic | None) -> list[Check]:
