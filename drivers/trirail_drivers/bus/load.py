@@ -6,14 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from trirail_drivers.bus.frames import frame_bits
 from trirail_drivers.errors import BusError
 
 HIGH_LOAD: Final = 0.8
 """Worst-case share of the bus above which people are warned, since acyclic frames have to wait."""
-
-OUTPUTS_BYTES: Final = 4
-"""Length of a frame of digital outputs [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,10 +22,12 @@ class Traffic:
     """Bits per second that do not depend on the cycle, as a function of the heartbeat period [s]."""
     most_sent: int
     """Largest number of frames that the service sends in one cycle."""
+    output_bits: int = 0
+    """Bits of a frame of digital outputs."""
 
     def with_outputs(self, drives: int) -> Traffic:
-        """Return the traffic with the digital outputs of so many drives, which may change in every cycle."""
-        bits = drives * frame_bits(OUTPUTS_BYTES)
+        """Return the traffic if this number of drives has digital outputs, which may change in every cycle."""
+        bits = drives * self.output_bits
         return replace(self, cycle_bits=self.cycle_bits + bits, most_sent=self.most_sent + drives)
 
     def bus_load(self, rate_hz: float, bitrate: int, heartbeat: float) -> float:

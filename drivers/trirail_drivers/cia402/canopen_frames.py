@@ -149,6 +149,7 @@ TRAFFIC: Final = Traffic(
     cycle_bits=frame_bits(0) + 3 * frame_bits(SETPOINT.size) + 3 * frame_bits(POSITION.size),
     background=_background,
     most_sent=11,
+    output_bits=frame_bits(OUTPUTS.size),
 )
 """One cycle: SYNC, three setpoints, three positions. At most the service sends SYNC, a heartbeat, three setpoints, and
 three controlwords both before and after them."""

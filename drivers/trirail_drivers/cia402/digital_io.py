@@ -27,9 +27,9 @@ async def configure_outputs(drive: Differences, io: DigitalIo) -> int:
     remote = drive.remote
     if not await remote.has(*OUTPUTS):
         drive.lack(OUTPUTS, "it has no such object")
-    found = await remote.peek(*OUTPUTS)
+    current = await remote.peek(*OUTPUTS)
     has_mask = await remote.has(*MASK)
-    kept = 0 if has_mask else (found or 0) & ~io.outputs
+    kept = 0 if has_mask else (current or 0) & ~io.outputs
     # The value first: with the new mask it takes effect.
     await _write(drive, OUTPUTS, kept | io.safe, io.outputs, "safe values")
     if has_mask:

@@ -204,4 +204,5 @@ def traffic(exchanges: Iterable[Exchange]) -> Traffic:
         cycle_bits=cycle,
         background=lambda heartbeat: status + polls + lives / heartbeat,
         most_sent=11 + sum(exchange.guarded + exchange.polled for exchange in exchanges),
+        output_bits=canopen_frames.TRAFFIC.output_bits,
     ).with_outputs(sum(exchange.outputs is not None for exchange in exchanges))

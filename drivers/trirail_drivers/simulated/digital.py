@@ -14,7 +14,7 @@ BOUNCE_TIME_S: Final = 0.005
 """Time for which a bouncing input bounces after an edge."""
 BOUNCE_PERIOD_S: Final = 0.0007
 """Time after which it changes meanwhile."""
-_WIDTH: Final = 0xFFFF_FFFF
+_ALL_BITS: Final = 0xFFFF_FFFF
 
 
 class OutputChange(NamedTuple):
@@ -30,7 +30,7 @@ class OutputChange(NamedTuple):
     """Position of the drive's axis at the change [counts]."""
 
 
-class Moment(NamedTuple):
+class AxisSample(NamedTuple):
     """Present state of the drive, for a change of its outputs."""
 
     time: float
@@ -45,11 +45,11 @@ class DigitalPins:
     allows every bit. Values come by SDO or by an RPDO, which takes effect at the SYNC.
     """
 
-    def __init__(self, objects: Dictionary, moment: Callable[[], Moment]) -> None:
-        """`moment` returns the present state of the drive."""
-        self._moment = moment
+    def __init__(self, objects: Dictionary, sample: Callable[[], AxisSample]) -> None:
+        """`sample` returns the present state of the drive."""
+        self._sample = sample
         self._values = objects.internal(0x60FE, 1)
-        self._mask = objects.internal(0x60FE, 2, 0 if (0x60FE, 2) in objects else _WIDTH)
+        self._mask = objects.internal(0x60FE, 2, 0 if (0x60FE, 2) in objects else _ALL_BITS)
         self._inputs = objects.internal(0x60FD, 0)
         self.bits = 0
         """Present state of the outputs, as bits of 60FEh."""
@@ -92,5 +92,5 @@ class DigitalPins:
         bits = (wanted & ~self._stuck) | (self.bits & self._stuck)
         if bits != self.bits:
             self.bits = bits
-            moment = self._moment()
-            self.history.append(OutputChange(moment.time, moment.sync, bits, moment.position))
+            sample = self._sample()
+            self.history.append(OutputChange(sample.time, sample.sync, bits, sample.position))

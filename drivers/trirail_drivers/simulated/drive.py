@@ -9,7 +9,7 @@ from typing import Final
 from trirail_drivers.interface import PowerState
 from trirail_drivers.simulated.device import Device, Nmt
 from trirail_drivers.simulated.dictionary import ObjectEntry
-from trirail_drivers.simulated.digital import DigitalPins, Moment
+from trirail_drivers.simulated.digital import AxisSample, DigitalPins
 from trirail_drivers.simulated.factor_group import Mechanics
 from trirail_drivers.simulated.homing import HomingMode
 from trirail_drivers.simulated.power import FAULT_RESET, STATUS, commanded
@@ -73,7 +73,7 @@ class SimulatedDrive(Device):
         self._profile = Profile(self.objects, mechanics, self._mode_changed)
         self.syncs = 0
         """Number of SYNCs received since power-on."""
-        self.pins = DigitalPins(self.objects, lambda: Moment(self._now, self.syncs, self.servo.position))
+        self.pins = DigitalPins(self.objects, lambda: AxisSample(self._now, self.syncs, self.servo.position))
         self.objects.on_write(0x6040, self._control)
         self.objects.on_write(0x607A, self._setpoint_written)
         self.objects.on_write(0x60C1, self._setpoint_written)

@@ -253,8 +253,8 @@ class _RecordedDrives:
         inputs: list[Any] = list(map(tuple, records["inputs"].tolist()))
         states: list[Any] = [tuple(map(PowerState, state)) for state in records["drive_state"].tolist()]
         self._feedback = [
-            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now, inputs=given)
-            for position, state, age, follows, homed, now, given in zip(
+            Feedback(tuple(position), state, None, age=age, follows=follows, homed=homed, homing=now, inputs=words)
+            for position, state, age, follows, homed, now, words in zip(
                 positions, states, *flags, homing, inputs, strict=True
             )
         ]
