@@ -69,9 +69,7 @@ def digital_rules(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) ->
     for name, output in outputs.items():
         yield Rule(f"outputs.{name}.bit", (), partial(_check_bit, f"outputs.{name}", output.bit, "60FEh", _RESERVED))
     for name, each in inputs.items():
-        yield Rule(
-            f"inputs.{name}.bit", (), partial(_check_bit, f"inputs.{name}", each.bit, "60FDh", _RESERVED_INPUTS)
-        )
+        yield Rule(f"inputs.{name}.bit", (), partial(_check_bit, f"inputs.{name}", each.bit, "60FDh", _RESERVED_INPUTS))
     for name, output in outputs.items():
         yield Rule(f"outputs.{name}.bit", ("outputs",), partial(_check_single, name, output, outputs))
     for name in inputs:
