@@ -336,7 +336,7 @@ class Outputs:
         """Cycle behind which switches are reported."""
         return self._reported + self.report_after
 
-    def take_log(self, logged: int, report_due: int) -> None:
+    def update_log(self, logged: int, report_due: int) -> None:
         """Continue from compiled cycles, with the rows of the log and the cycle behind which they are reported."""
         self.logged, self._reported = logged, report_due - self.report_after
 

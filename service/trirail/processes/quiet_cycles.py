@@ -121,7 +121,7 @@ class QuietCycles:
         watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
-        control.outputs.take_log(left["logged"], left["report_due"])
+        control.outputs.update_log(left["logged"], left["report_due"])
         decides = bool(left["called"]) and reached in (Reached.WRITTEN, Reached.DONE)
         called = decides or reached is Reached.CALLED
         self._decided = self._decided or called or once
