@@ -41,6 +41,7 @@ def table(section: str, name: str, **keys: Any) -> str:
         ),
         ([table("inputs", "part", drive="D", bit=16)], r"^inputs.part.drive = 'D': expected one of 'A', 'B', 'C'"),
         ([VALVE, VALVE.replace("valve", "lamp")], r"^outputs.lamp.bit = 16: .* drive A is output valve already; use"),
+        ([PART, PART.replace("part", "door")], r"^inputs.door.bit = 16: .* drive B is input part already; use another"),
         ([VALVE, PART.replace("part", "valve")], r"^inputs.valve: an output is called valve already; use another"),
         ([table("outputs", "valve", drive="A", bit=16, delay=0.2)], r"^outputs.valve.delay = 0.2: .*0.1"),
         ([table("outputs", "valve", drive="A", bit=16, delay=-0.001)], r"^outputs.valve.delay = -0.001: .*0"),
@@ -71,13 +72,13 @@ PINS = st.dictionaries(
 
 
 @given(PINS)
-def test_bits_are_the_makers_and_each_has_one_output(pins: dict[str, tuple[bool, str, int, bool]]) -> None:
+def test_bits_are_the_makers_and_each_has_one_name(pins: dict[str, tuple[bool, str, int, bool]]) -> None:
     """Whatever is accepted is the driver's in full, and whatever is refused breaks a rule."""
     sections = [
         table("outputs", name, drive=drive, bit=bit, safe=safe) if out else table("inputs", name, drive=drive, bit=bit)
         for name, (out, drive, bit, safe) in pins.items()
     ]
-    places = [(drive, bit) for out, drive, bit, _ in pins.values() if out]
+    places = [(out, drive, bit) for out, drive, bit, _ in pins.values()]
     allowed = all(bit >= 16 for _, _, bit, _ in pins.values()) and len(set(places)) == len(places)
     if not allowed:
         with pytest.raises(ConfigError):

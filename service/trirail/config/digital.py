@@ -70,8 +70,10 @@ def digital_rules(outputs: Mapping[str, Output], inputs: Mapping[str, Input]) ->
         yield Rule(f"outputs.{name}.bit", (), partial(_check_bit, f"outputs.{name}", output.bit, "60FEh", _RESERVED))
     for name, each in inputs.items():
         yield Rule(f"inputs.{name}.bit", (), partial(_check_bit, f"inputs.{name}", each.bit, "60FDh", _RESERVED_INPUTS))
-    for name, output in outputs.items():
-        yield Rule(f"outputs.{name}.bit", ("outputs",), partial(_check_single, name, output, outputs))
+    for name in outputs:
+        yield Rule(f"outputs.{name}.bit", ("outputs",), partial(_check_single, "output", name, outputs))
+    for name in inputs:
+        yield Rule(f"inputs.{name}.bit", ("inputs",), partial(_check_single, "input", name, inputs))
     for name in inputs:
         yield Rule(f"inputs.{name}", (), partial(_check_name, name, outputs))
 
@@ -84,12 +86,13 @@ def _check_bit(key: str, bit: int, index: str, reserved: Mapping[int, str]) -> N
         )
 
 
-def _check_single(name: str, output: Output, outputs: Mapping[str, Output]) -> None:
-    """Refuse an output that is another name for an earlier one."""
-    for other, each in itertools.takewhile(lambda item: item[0] != name, outputs.items()):
-        if (each.drive, each.bit) == (output.drive, output.bit):
+def _check_single(kind: str, name: str, pins: Mapping[str, Output | Input]) -> None:
+    """Refuse an output or input that is another name for an earlier one of its kind."""
+    pin = pins[name]
+    for other, each in itertools.takewhile(lambda item: item[0] != name, pins.items()):
+        if (each.drive, each.bit) == (pin.drive, pin.bit):
             raise ConfigError(
-                f"outputs.{name}.bit = {output.bit}: bit {output.bit} of drive {output.drive} is output {other} "
+                f"{kind}s.{name}.bit = {pin.bit}: bit {pin.bit} of drive {pin.drive} is {kind} {other} "
                 "already; use another bit, or one of the two names"
             )
 
