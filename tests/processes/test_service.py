@@ -342,7 +342,7 @@ def test_the_commands(service: Service) -> None:
         (b'{"kind": "pose", "x": 0, "y": "0", "phi": 0}', "malformed", "got str"),
         (b"\xff\xfe", "malformed", "not a goal"),
         (b"", "malformed", "not a goal"),
-        (b" " * 300_000, "too_large", "at most 262144"),
+        (b" " * 300_000, "too_large", "exceed the maximum of 262144"),
     ],
 )
 def test_bad_goals(shared: tuple[Service, Robot, zenoh.Session], payload: bytes, code: str, said: str) -> None:
