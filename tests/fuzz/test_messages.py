@@ -248,7 +248,7 @@ def test_a_packet_of_any_size_arrives_whole_or_is_refused_by_its_sender(tmp_path
     port = Port(links.listen(tmp_path / "port"))
     link = links.connect(tmp_path / "port")
     port.accept()
-    with pytest.raises(TooLarge, match=f"at most {MAX_SHARED}"):
+    with pytest.raises(TooLarge, match=f"exceed the maximum between processes, {MAX_SHARED}"):
         link.send(bytes(MAX_SHARED + 1))
     assert not port.send(bytes(MAX_SHARED + 1))
     assert port.dropped == 1

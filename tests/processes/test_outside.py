@@ -238,6 +238,7 @@ def test_an_override_that_is_none_is_refused_in_a_line(shared: tuple[Service, Ro
 # ---------------------------------------------------------------------- each is answered once
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("clients", [1, 8])
 def test_every_goal_of_many_threads_is_answered_once(
     shared: tuple[Service, Robot, zenoh.Session], clients: int

@@ -67,7 +67,7 @@ class Service:
             "max_overruns = 100 ": "max_overruns = 5000 ",  # a shared machine stalls now and then, all of it or a part
             "missed_syncs = 150": "missed_syncs = 2000",
             "missed_positions = 100 ": "missed_positions = 1000 ",
-            "heartbeat = 0.1": "heartbeat = 1.0",
+            "heartbeat = 0.1": "heartbeat = 1.0\nsdo_timeout = 5.0",
             "gateway_timeout = 0.3": "gateway_timeout = 1.0",
             "\nfollowing_error = 0.004": "\nfollowing_error = 0.3",
             "\nfollowing_error = 0.005": "\nfollowing_error = 0.4",
@@ -342,7 +342,7 @@ def test_the_commands(service: Service) -> None:
         (b'{"kind": "pose", "x": 0, "y": "0", "phi": 0}', "malformed", "got str"),
         (b"\xff\xfe", "malformed", "not a goal"),
         (b"", "malformed", "not a goal"),
-        (b" " * 300_000, "too_large", "at most 262144"),
+        (b" " * 300_000, "too_large", "exceed the maximum of 262144"),
     ],
 )
 def test_bad_goals(shared: tuple[Service, Robot, zenoh.Session], payload: bytes, code: str, said: str) -> None:

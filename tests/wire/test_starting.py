@@ -55,7 +55,7 @@ def test_a_client_says_so_and_one_that_was_killed_is_starting_no_more() -> None:
     with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()
-        with pytest.raises(ServiceError, match="it is starting"):
+        with pytest.raises(ServiceError, match="the service is starting"):
             Robot("demo", endpoint)
         process.send_signal(signal.SIGKILL)
     with pytest.raises(ServiceError, match="connection refused"):

@@ -1,4 +1,4 @@
-"""Judges what cycles took that only exchange the frames: at which rates this machine can hold a loop at all."""
+"""Judgement of cycles that only exchange frames: the rates at which this machine can run a loop."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
 from trirail.wire.state import Percentiles
 
 MAX_PERIOD_SHARE = 0.5
-"""Of a period, after which 999 of 1000 bare cycles are to be over: the rest is for the service's own arithmetic."""
+"""Share of a period within which 999 of 1000 bare cycles must end; the rest is for the service's own arithmetic."""
 RATES = (100, 250, 500, 1000, 2000)
-"""Rates that are looked at beside the configured one [Hz]."""
+"""Rates that are judged besides the configured one [Hz]."""
 
 
 class HeldRate(Struct, frozen=True):
-    """What came of the cycles, for programs; times in microseconds."""
+    """Result of the measurement for programs; times in microseconds."""
 
     rate_hz: int
     cycles: int
     lateness_us: Percentiles
-    """How late they began, ticks missed before them included."""
+    """Lateness of the cycles, including the ticks missed before them."""
     cycle_us: Percentiles
-    """From SYNC to the setpoints."""
+    """Time from SYNC to the setpoints."""
     over_us: Percentiles
-    """From the deadline until they were over: the sum of both, cycle by cycle."""
+    """Time from the deadline to the end of the cycle: the sum of both for each cycle."""
     missed: int
-    """Ticks."""
+    """Missed ticks."""
     missed_in_a_row: int
     answers_missing: int
-    """Positions that did not come, of three a cycle."""
+    """Positions that were not received, of three per cycle."""
     up_to_hz: int | None
-    """The highest rate that would be held; None where none is."""
+    """Highest rate that the machine can run; None if it can run none."""
 
 
 def compute_held_rate(cycles: Cycles) -> HeldRate:
-    """What is to be said of cycles."""
+    """Compute percentiles and the highest possible rate from measured cycles."""
     over, rate = compute_percentiles(cycles.lateness + cycles.work), 1_000_000_000 // cycles.period
     missed = [int(each) for each in cycles.missed]
     held = [each for each in {*RATES, rate} if over.p999 <= MAX_PERIOD_SHARE * 1e6 / each]
@@ -54,7 +54,7 @@ def compute_held_rate(cycles: Cycles) -> HeldRate:
 
 
 def cycle(cycles: Cycles | str, config: Config) -> Check:
-    """Whether the configured period is held, as the machine is now."""
+    """Check whether the machine keeps the configured period."""
     if isinstance(cycles, str):
         if cycles:
             return Check("cycle", "warning", f"not measured: {cycles}", "end that service, ask again")

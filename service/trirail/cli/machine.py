@@ -1,4 +1,4 @@
-"""What is read of a machine: trirail.cli.probes reads it, trirail.cli.doctor judges it."""
+"""Properties of the machine for `trirail doctor`: read by trirail.cli.probes, judged by trirail.cli.doctor."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from trirail.processes.session_guard import Guard
 
 
 class BusTraffic(Struct, frozen=True):
-    """What the kernel counted on a network interface."""
+    """Counters of a network interface over an interval."""
 
     seconds: float
-    """For how long [s]."""
+    """Length of the interval [s]."""
     frames: int
-    """Sent and received, whoever listens."""
+    """Frames sent and received by all programs."""
     data: int
-    """Bytes in them."""
+    """Payload of those frames [bytes]."""
 
 
 class ReceiveCoalescing(Struct, frozen=True):
-    """After how many frames, or how long, a network interface hands over what it has received: ethtool -c."""
+    """Receive coalescing of a network interface: `ethtool -c`."""
 
     frames: int
-    """1, or 0 where the driver counts none: each as it comes."""
+    """Frames after which an interrupt is raised; 1, or 0 if the driver does not count them, is immediately."""
     microseconds: int
-    """0 for no waiting [µs]."""
+    """Time after which an interrupt is raised [µs]; 0 is immediately."""
 
 
 class Machine(Struct, frozen=True):
-    """What was read of the machine; None where it does not say."""
+    """Properties of the machine; None for unknown ones."""
 
     release: str
     preempt_rt: bool
@@ -41,27 +41,27 @@ class Machine(Struct, frozen=True):
     """Real-time rights that the loop would lack, each with its remedy: trirail.processes.realtime.acquire."""
     clock_source: str | None
     resolution: float
-    """Of the monotonic clock [s]."""
+    """Resolution of the monotonic clock [s]."""
     cpu: int
-    """The processor that the loop would stay on."""
+    """Number of the processor to which the loop would be pinned."""
     governors: dict[int, str]
-    """How each processor's frequency is governed, of those that have any scaling."""
+    """Frequency governor of each processor that has frequency scaling."""
     isolated: tuple[int, ...]
     link: dict[str, Any] | None
-    """The CAN interface as `ip -details -json link` has it."""
+    """Properties of the CAN interface, from `ip -details -json link`."""
     cycles: Cycles | str
-    """What cycles took that only exchange the frames, or why none were measured; "" where nobody asked for it."""
+    """Timing of cycles that only exchange frames, or the reason why it was not measured; "" if not requested."""
     traffic: BusTraffic | None = None
-    """What passed on the CAN interface meanwhile."""
+    """Traffic on the CAN interface during the measurement."""
     coalescing: ReceiveCoalescing | None = None
-    """How the CAN interface hands frames over; None where its driver does not say."""
+    """Receive coalescing of the CAN interface; None if its driver does not report it."""
     adapter: str = ""
-    """What python-can's interface would lack, with the remedy; "" for nothing."""
+    """Package that python-can's interface needs and that is missing, with the remedy; "" if nothing is missing."""
     guard: Guard | str | None = None
-    """Who may do what over the network, or why its certificates cannot be used."""
+    """Access rules over the network, or the reason why the certificates cannot be used."""
     routers: tuple[tuple[str, str], ...] = ()
-    """Each endpoint of zenoh.connect with why it cannot be reached, "" where it can."""
+    """Endpoints of zenoh.connect, each with the reason why it cannot be reached, or ""."""
     issued: tuple[IssuedCertificate, ...] | None = None
-    """The certificates of the authority whose folder is that of [zenoh.tls]; None where it is elsewhere."""
+    """Certificates issued by the authority in the folder of [zenoh.tls]; None if the authority is elsewhere."""
     limited_ports: tuple[int, ...] | None = None
-    """Ports at which the firewall limits the connections of one address; None where it cannot be read."""
+    """Ports at which the firewall limits connections per address; None if its rules cannot be read."""

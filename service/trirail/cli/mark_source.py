@@ -32,16 +32,16 @@ LINE = dict[str, tuple[float, float]]
 prepare(LINE)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PICTURE_TIMEOUT_S, WRITE_TIMEOUT_S, POLL_S = 30.0, 1.0, 0.02
-"""How long a line or newer pictures are waited for, how long one may take to be written, how often it is looked [s]."""
+"""Longest wait for a line or a newer picture, longest time to write a picture, and polling interval [s]."""
 EXIT_TIMEOUT_S = 5.0
-"""How long a program may take to end when it is told to [s]."""
+"""Longest time until a program exits after SIGTERM [s]."""
 INSTALL = "pip install 'trirail[vision]'"
 BUFFERED_S, MAX_BUFFERED = 0.002, 16
-"""A picture that comes sooner was waiting [s]; so many may wait."""
+"""Time below which a picture came from the driver's buffer [s], and the maximum number of buffered pictures."""
 
 
 class MarkWindow(NamedTuple):
-    """Where in which picture a mark is [pixel]; anywhere without a width."""
+    """Part of a picture in which a mark is searched [pixel]; the whole picture if the width is 0."""
 
     picture: str
     u: int = 0
@@ -54,18 +54,18 @@ NO_WINDOWS: Mapping[str, MarkWindow] = {}
 
 
 class Source(NamedTuple):
-    """What tells of marks, and which of them one camera shows that stands still: the name of its view by the mark's."""
+    """Function that returns the marks, and the view of each mark: marks of one fixed camera share a view."""
 
     look: Look
     views: Mapping[str, str] | None = None
-    """None where nobody knows, or each mark has a camera of its own."""
+    """Names of views by those of marks; None if unknown, or if each mark has its own camera."""
 
 
 @contextlib.contextmanager
 def program(command: str) -> Iterator[Source]:
     """Run a program that prints a line of JSON, {"mark": [u, v], …} [pixel], for each line that it reads.
 
-    Raises TrirailError where it cannot be run, ends, or prints something else, or nothing within NEWER_WITHIN seconds.
+    Raises TrirailError if it cannot be run, exits, prints anything else, or prints nothing within PICTURE_TIMEOUT_S.
     """
     try:
         # In a group of its own: Ctrl-C is for this program, which ends that one.
@@ -77,7 +77,7 @@ def program(command: str) -> Iterator[Source]:
         raise TrirailError(f"cannot run {command!r}: {error}; it is to print one line of JSON for each look") from error
 
     def find_marks() -> Marks:
-        with contextlib.suppress(BrokenPipeError):  # it has ended, and may have said something before
+        with contextlib.suppress(BrokenPipeError):  # it has exited; its last line may still be in the pipe
             stdin.write("look\n")
             stdin.flush()
         if not select.select([stdout], [], [], PICTURE_TIMEOUT_S)[0]:
@@ -104,7 +104,7 @@ def program(command: str) -> Iterator[Source]:
         process.kill()
         process.wait()
         for pipe in (stdin, stdout):
-            with contextlib.suppress(OSError):  # what was still in it goes nowhere
+            with contextlib.suppress(OSError):  # unsent data is of no use any more
                 pipe.close()
 
 
@@ -116,12 +116,12 @@ def folder(
     windows: Mapping[str, MarkWindow] = NO_WINDOWS,
     family: CodeFamily | None = None,
 ) -> Iterator[Source]:
-    """Find marks in the newest pictures of a folder: of each mark the picture named after it, as left.png.
+    """Find marks in the newest pictures of a folder, such as mark left in left.png.
 
-    With `windows` each of their marks is found there instead, with a `family` the codes in any picture, named by their
-    numbers. What takes the pictures replaces them: each look but the first waits until all have been written anew since
-    it was asked for, as the one from before may show the robot in motion. Raises TrirailError, also where none comes
-    within NEWER_WITHIN seconds.
+    With `windows`, each mark is searched in its window instead; with a `family`, the codes in all pictures are found
+    and named by their numbers. The pictures are overwritten by another program: each look except the first waits until
+    all of them have been written again, since older ones may show the robot in motion. Raises TrirailError, also if
+    that takes longer than PICTURE_TIMEOUT_S.
     """
     cv2 = _opencv()
     if not path.is_dir():
@@ -169,7 +169,7 @@ def folder(
 
 
 class Codes:
-    """Codes of the pictures of a look, named by their numbers; each may be in one picture only."""
+    """Codes in the pictures of one look, named by their numbers; a code must not be in two pictures."""
 
     def __init__(self, family: CodeFamily) -> None:
         self._family = family
@@ -177,7 +177,7 @@ class Codes:
         self.views: dict[str, str] = {}
 
     def add(self, picture: str, grey: Any) -> None:
-        """Take a picture. Raises TrirailError where a code is in an earlier one too."""
+        """Find the codes in a picture. Raises TrirailError if one of them was in an earlier picture."""
         from trirail.alignment.coded_marks import find_codes
 
         for code in find_codes(grey, self._family):
@@ -198,9 +198,8 @@ def cameras(
 ) -> Iterator[Source]:
     """Open cameras through OpenCV, {mark: device}, a number or an address, and find a mark in a picture of each.
 
-    With a `family` a camera shows any number of codes, named by their numbers, and its own name is of its view.
-
-    Marks of one device are found in one picture, each in its window. Raises TrirailError.
+    With a `family`, any number of codes is found in each picture and named by their numbers. The marks of one device
+    are found in one picture, each in its window. Raises TrirailError.
     """
     cv2 = _opencv()
     shown = Counter(devices.values())
@@ -242,10 +241,10 @@ def cameras(
 
 
 def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.monotonic) -> Any:
-    """Return a picture whose exposure has begun after the call; of a film the next but one. None where none comes.
+    """Return a picture whose exposure started after the call, of a film the second next; None if there is none.
 
-    A camera's driver keeps pictures that nobody has read: it hands one of those out at once, and a new one when that
-    comes. The first new one may have been begun before.
+    A camera's driver buffers unread pictures and returns them without delay. The first picture that is not from the
+    buffer may have been started before the call.
     """
     film = capture.get(frame_count) > 0
     for _ in range(0 if film else MAX_BUFFERED):
@@ -259,7 +258,7 @@ def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.mon
 
 
 def _written(file: Path) -> int:
-    """Return when a file was last written [ns]; 0 where it is not there."""
+    """Return the time of the last write to a file [ns]; 0 if it does not exist."""
     try:
         return file.stat().st_mtime_ns
     except OSError:
@@ -315,7 +314,7 @@ class MarkSource:
 
     @contextlib.contextmanager
     def open_source(self) -> Iterator[Source]:
-        """Open it. Raises TrirailError."""
+        """Open the source of the marks. Raises TrirailError."""
         from trirail.alignment.shapes import MarkShape
 
         selected = [self.program is not None, self.pictures is not None, bool(self.camera)]

@@ -42,7 +42,7 @@ TOOL: Final = "--tool"
 
 
 def written(value: float, unit: str, digits: int, width: int = 0) -> str:
-    """Write a value, given in SI, in a unit: so many digits after the point, the number in a column of a `width`."""
+    """Write an SI value in a unit, with `digits` decimals, in a column of a `width`."""
     space = "" if unit == "°" else " "
     return f"{number(value / float(SIZES[unit]), digits):>{width}}{space}{unit}"
 
@@ -59,7 +59,7 @@ def pose(values: Sequence[float], width: int = 0) -> str:
 
 
 def correction(told: CorrectionInfo, labels: Labels) -> str:
-    """Write what as-built errors are corrected by on a line."""
+    """Describe the correction of as-built errors on one line."""
     words = []
     if told.file:
         x, y, phi = told.greatest
@@ -72,10 +72,10 @@ def correction(told: CorrectionInfo, labels: Labels) -> str:
 
 
 def numbers(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line as they are to be parsed.
+    """Return the words of a command line, prepared for parsing.
 
-    A negative number with a unit, -5mm, is taken for no option: none begins with a digit. What follows --tool is one
-    word, a name or U,V: the two lengths of a point are joined. Behind -- all words are taken as they are.
+    A negative number with a unit, such as -5mm, is no option: none begins with a digit. The two lengths of a point
+    after --tool are joined to one word, U,V. Words after -- stay as they are.
     """
     end = words.index("--") if "--" in words else len(words)
     read: list[str] = []
@@ -185,9 +185,9 @@ def _three(along: Dimension, turning: Dimension) -> Parameter:
 Length = Annotated[float, _one(lambda text: quantity(text, LENGTH))]
 """A length of the command line [m]."""
 Velocity = Annotated[float, _one(lambda text: quantity(text, VELOCITY))]
-"""Likewise [m/s]."""
+"""A velocity of the command line [m/s]."""
 AngularVelocity = Annotated[float, _one(lambda text: quantity(text, ANGULAR_VELOCITY))]
-"""Likewise [rad/s]."""
+"""An angular velocity of the command line [rad/s]."""
 Distance = Annotated[float, _one(lambda text: positive(text, LENGTH))]
 """A length that is not negative [m]."""
 Time = Annotated[float, _one(lambda text: positive(text, TIME))]
@@ -205,11 +205,11 @@ Angles = Annotated[
 ]
 """Angles, as many as there are."""
 PoseWay = Annotated[tuple[float, float, str], _three(LENGTH, ANGLE)]
-"""Of x, y [m] and φ."""
+"""A displacement in x, y [m] and φ."""
 PoseVelocity = Annotated[tuple[float, float, str], _three(VELOCITY, ANGULAR_VELOCITY)]
-"""Of x, y [m/s] and φ."""
+"""A velocity in x, y [m/s] and φ."""
 PoseAcceleration = Annotated[tuple[float, float, str], _three(ACCELERATION, ANGULAR_ACCELERATION)]
-"""Of x, y [m/s²] and φ."""
+"""An acceleration in x, y [m/s²] and φ."""
 
 
 OF_THREE: Final = ("goto", "move", "sliders", "jog", "ik", "fk")

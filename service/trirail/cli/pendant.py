@@ -1,4 +1,4 @@
-"""`trirail jog` without arguments: a pendant in the terminal, that moves the robot while a key is held."""
+"""`trirail jog` without arguments: a pendant in the terminal that moves the robot while a key is held."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ _KEY = re.compile(r"\x1b[\[O](?P<parameters>[0-9;]*)(?P<final>[@-~])|(?P<escape>
 
 
 def keys(typed: bytes) -> Iterator[str]:
-    """Yield the keys in what was read: up, down, left, right, escape, or a character in lower case, with = for +.
+    """Yield the keys in the input: up, down, left, right, escape, or a character in lower case; = counts as +.
 
-    Other keys' sequences are skipped as a whole: none of their characters is taken for a key.
+    The escape sequences of other keys are skipped as a whole.
     """
     for match in _KEY.finditer(typed.decode("utf-8", errors="ignore")):
         if match["final"]:
@@ -52,21 +52,21 @@ def keys(typed: bytes) -> Iterator[str]:
 
 
 KEY_TIMEOUT_S = 0.15
-"""A key that has not come again for so long is let go [s]: a terminal tells of no key's end, and repeats one that is
-held every 30 to 50 ms, but for the pause before the first repeat."""
+"""Time without a repeat after which a key counts as released [s]. A terminal does not report releases; it repeats a
+held key every 30 to 50 ms, after a pause before the first repeat."""
 REDRAW_S = 0.1
-"""The numbers are drawn so often [s]."""
+"""Interval of redrawing [s]."""
 STALL_S = 0.5
-"""After standing still for so long the program does not know what was pressed meanwhile [s]."""
+"""Pause of this program after which the buffered keys are discarded as stale [s]."""
 STATE_TIMEOUT_S = 1.0
-"""After so long without a state the service is taken for silent [s]."""
+"""Time without a state after which the service counts as silent [s]."""
 AXES = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "a": (0, 0, 1), "d": (0, 0, -1)}
 """Directions along x, y and φ."""
 HELP = "← → x   ↑ ↓ y   a d φ   + − speed   Space stop   q leave"
 
 
 class Pendant:
-    """What keys mean: a jog of a tool while one is held, a speed, a stop. `top` is the platform's greatest velocity."""
+    """Effects of keys: jog a tool while one is held, choose the speed, stop. `top` is the platform's velocity limit."""
 
     def __init__(self, robot: Robot, top: Velocity, tool: Tool | None = None) -> None:
         self._robot = robot
@@ -76,18 +76,18 @@ class Pendant:
         self._until = -math.inf
         self._choice = USUAL
         self.said = HELP
-        """One line for the operator: what the robot said last."""
+        """Last message for the operator, one line."""
         self.over = False
-        """Whether the operator wants to leave."""
+        """Whether the operator has pressed the key to leave."""
 
     @property
     def speed(self) -> Velocity:
-        """The velocity of a jog along each axis [m/s, m/s, rad/s]."""
+        """Velocity of a jog along each axis [m/s, m/s, rad/s]."""
         x, y, phi = (SPEEDS[self._choice] * top for top in self._top)
         return x, y, phi
 
     def press(self, key: str, now: float) -> None:
-        """Take in a key, pressed or repeated by the terminal, at a time of the monotonic clock."""
+        """Handle a key, pressed or repeated by the terminal, at a time of the monotonic clock."""
         if key in AXES:
             self.hold(AXES[key], now)
             return
@@ -100,24 +100,24 @@ class Pendant:
             self.over = True
 
     def hold(self, direction: Sequence[float], now: float) -> None:
-        """Take in that the hand wants to go along x, y and φ, each by a share of the speed, -1 to 1."""
+        """Jog along x, y and φ, each at a share of the speed, -1 to 1, until KEY_TIMEOUT_S has elapsed."""
         x, y, phi = (share * speed for share, speed in zip(direction, self.speed, strict=True))
         self._until = now + KEY_TIMEOUT_S
         self._jog.hold((x, y, phi), self._tool)
 
     def tick(self, now: float) -> None:
-        """Let go of a key that has not come again."""
+        """Release a key that was not repeated in time."""
         if now > self._until:
             self.release_key()
 
     def release_key(self) -> None:
-        """Let go of the key that is held, if one is."""
+        """Release the held key, if there is one."""
         if self._until > -math.inf:
             self._until = -math.inf
             self._jog.release()
 
     def close(self) -> None:
-        """Let go, for good."""
+        """Release the held key, and accept no others."""
         self._jog.close()
 
     def _stop(self) -> None:
@@ -132,7 +132,7 @@ class Pendant:
 
 
 class _StateReader:
-    """The newest state, heard by a thread of its own until the context ends; None where the service is silent."""
+    """Thread that reads the newest state until the context ends; `state` is None while the service is silent."""
 
     def __init__(self, robot: Robot) -> None:
         self.state: State | None = None
@@ -158,10 +158,10 @@ class _StateReader:
 
 
 def run(robot: Robot, tool: Tool | None = None) -> int:
-    """Serve the operator at the terminal until they leave or the terminal is gone; return the exit code.
+    """Serve the operator at the terminal until they leave or the terminal closes; return the exit code.
 
-    What moves is a tool, the platform's centre where there is none. Raises ServiceError where standard input is no
-    terminal, or nobody answers.
+    Keys move the `tool`, or the platform's centre without one. Raises ServiceError if standard input is not a terminal
+    or the service does not answer.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
@@ -172,7 +172,7 @@ def run(robot: Robot, tool: Tool | None = None) -> int:
             with Live(console=terminal.out, auto_refresh=False, transient=True) as live, _raw(pendant):
                 _serve(pendant, newest, live)
         except (KeyboardInterrupt, _TerminalClosed, OSError):
-            pass  # an OSError is that of a terminal that is gone
+            pass  # OSError: the terminal has closed
         finally:
             pendant.close()
     return 0
@@ -184,7 +184,7 @@ def _serve(pendant: Pendant, newest: _StateReader, live: Live) -> None:
     while not pendant.over:
         ready, _, _ = select.select([descriptor], [], [], KEY_TIMEOUT_S / 5.0)
         now = time.monotonic()
-        if now - last > STALL_S:  # stopped and continued: what waits in the terminal is from before
+        if now - last > STALL_S:  # stopped and continued: the buffered keys are stale
             pendant.release_key()
             termios.tcflush(descriptor, termios.TCIFLUSH)
         elif descriptor in ready:
@@ -215,12 +215,12 @@ def _shown(pendant: Pendant, state: State | None) -> Text:
 
 
 class _TerminalClosed(Exception):
-    """The terminal is gone, or the program is told to end."""
+    """The terminal has closed, or the program was asked to exit."""
 
 
 @contextmanager
 def _raw(pendant: Pendant) -> Iterator[None]:
-    """Have keys as they are pressed, and not shown; let go and restore the terminal when suspended, and at the end."""
+    """Read keys without buffer and echo; release the key and restore the terminal when suspended and at the end."""
     descriptor = sys.stdin.fileno()
     before = termios.tcgetattr(descriptor)
 
@@ -231,7 +231,7 @@ def _raw(pendant: Pendant) -> Iterator[None]:
         pendant.release_key()
         termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
         signal.signal(number, signal.SIG_DFL)
-        os.kill(os.getpid(), number)  # here it stands until it is continued
+        os.kill(os.getpid(), number)  # stops here until SIGCONT
         signal.signal(number, suspended)
         tty.setcbreak(descriptor, termios.TCSAFLUSH)
 
@@ -246,4 +246,4 @@ def _raw(pendant: Pendant) -> Iterator[None]:
         try:
             termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
         except termios.error:
-            return  # a terminal that is gone needs nothing
+            return  # a closed terminal needs no restoring

@@ -328,7 +328,7 @@ def output(name: str, value: Literal["on", "off"], /, *, service: Service = HERE
 
 
 WAKE_INTERVAL_S = 0.2
-"""How often who waits looks for a signal: the kernel may have handed it to another thread, which wakes nobody [s]."""
+"""Interval of checking for signals while waiting [s]: the kernel may deliver one to another thread."""
 
 
 def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.0, service: Service = HERE) -> int:
@@ -377,7 +377,7 @@ def watch(*, service: Service = HERE) -> int:
 
 
 HISTORY_TIMEOUT_S = 1.0
-"""After so long without another event the past is over: a thousand of them come in a tenth of that [s]."""
+"""Time without another event after which the past events are complete [s]; a thousand take a tenth of that."""
 
 
 def events(
@@ -481,7 +481,7 @@ def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title:
 
 
 def show(service: Address, content: object, words: str) -> None:
-    """Print what a command comes to: words, or with --json its content."""
+    """Print the result of a command: words, or with --json its content."""
     if service.json:
         terminal.json(content)
     else:

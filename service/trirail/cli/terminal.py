@@ -1,4 +1,4 @@
-"""What the commands print for people, and for programs with --json."""
+"""Output of the commands, for people, and with --json for programs."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.it
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
 VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
 SERVICE_TIMEOUT_S = 3.0
-"""A service from which nothing is heard for so long is taken for gone [s]."""
+"""Silence after which the service counts as gone [s]."""
 
 
 def plain(words: str) -> str:
-    """Return words from outside for the console: nothing in them is markup, steers it or begins a line."""
+    """Return external text for the console, without markup, control characters and line breaks."""
     return escape(printable(words))
 
 
@@ -57,7 +57,7 @@ def print_line(words: str) -> None:
 
 @contextlib.contextmanager
 def drawing(file: Path) -> Iterator[None]:
-    """Say why a picture cannot be drawn to a file. Raises TrirailError."""
+    """Convert errors of drawing a picture to a file. Raises TrirailError with the reason."""
     try:
         yield
     except ImportError as error:
@@ -72,7 +72,7 @@ def print_error(words: str) -> None:
 
 
 def json(content: object) -> None:
-    """Print one JSON object on a line of its own, at once."""
+    """Print one JSON object on a line of its own, and flush it."""
     sys.stdout.write(json_printable(msgspec.json.encode(content).decode()) + "\n")
     sys.stdout.flush()
 
@@ -87,7 +87,7 @@ def print_error_json(error: TrirailError) -> None:
 
 
 def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
-    """Say that the service is up, where it is, and what it lacks."""
+    """Print that the service is up, with its addresses and missing rights."""
     from trirail.config import metrics_url
 
     loop, recorder = ready["loop"], ready["recorder"]
@@ -109,7 +109,7 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
 
 
 def _reach(config: Config) -> list[str]:
-    """Return the options that a command on this machine needs to reach a service; none where it is the usual one."""
+    """Return the options by which a command on this machine reaches the service; none for the default service."""
     options = []
     if (robot := config.robot.name) != HERE.robot:
         options += ["--robot", robot]
@@ -120,16 +120,16 @@ def _reach(config: Config) -> list[str]:
 
 
 MIN_SLOWDOWN = 1.001
-"""A goal that is slowed by less is as asked."""
+"""Slowdown below which a goal counts as unchanged."""
 
 
 def slowed(reply: GoalReply) -> str:
-    """Say how much slower an accepted goal is than was asked for; nothing where it is not."""
+    """Return how much an accepted goal is slowed, in words; "" if it is not."""
     return f"slowed {reply.slowed:.4g} times: it would be beyond the limits" if reply.slowed > MIN_SLOWDOWN else ""
 
 
 def notes(reply: GoalReply) -> str:
-    """Say what is out of the ordinary with an accepted goal; nothing where all is as asked."""
+    """Return remarks on an accepted goal in parentheses; "" if it is executed as requested."""
     remarks = [words] if (words := slowed(reply)) else []
     if reply.stops_first:
         remarks.append("stops on the old path first")
@@ -140,7 +140,7 @@ def notes(reply: GoalReply) -> str:
 
 @contextlib.contextmanager
 def measuring(title: str, *, show: bool = True) -> Iterator[Callable[[float], None]]:
-    """Show on standard error, where that is a terminal, how far a measurement is; no thread of it draws meanwhile."""
+    """Show the progress of a measurement on standard error if that is a terminal, without a drawing thread."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
     show = show and err.is_terminal
     with Progress(*columns, console=err, transient=True, auto_refresh=False, disable=not show) as progress:
@@ -149,7 +149,7 @@ def measuring(title: str, *, show: bool = True) -> Iterator[Callable[[float], No
 
 
 def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> Result:
-    """Wait for a goal's end and show its progress. Ctrl-C stops it, a second one leaves: then raises ServiceError."""
+    """Wait for the end of a goal and show its progress. Ctrl-C stops it; a second Ctrl-C raises ServiceError."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -172,7 +172,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
         try:
             return wait_for_end()
         except KeyboardInterrupt:
-            # Beside the waiting, so that a second Ctrl-C is heard at once.
+            # In another thread, so that a second Ctrl-C takes effect immediately.
             threading.Thread(target=_cancel, args=(goal,), name="cancel", daemon=True).start()
             progress.update(task, description="stopping; Ctrl-C again leaves")
         try:
@@ -184,12 +184,12 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
 
 
 def _cancel(goal: GoalHandle) -> None:
-    with contextlib.suppress(TrirailError):  # it has ended; or nobody answers, and then its end is not heard either
+    with contextlib.suppress(TrirailError):  # it has ended, or the service does not answer
         goal.cancel()
 
 
 def left(state: State, goal: GoalState) -> str:
-    """Say how long the path of the goal under way still takes, or that it has ended and the robot settles."""
+    """Return the remaining time of the active goal in words, or that the robot settles."""
     if goal.progress >= 1.0:
         return "settling"
     if state.mode == Mode.HOLDING:
@@ -198,13 +198,13 @@ def left(state: State, goal: GoalState) -> str:
 
 
 def print_event(occurred: Event) -> None:
-    """Print an event on a line, with the time of the clock on the wall."""
+    """Print an event on one line, with its wall-clock time."""
     level = f"[{LEVELS[occurred.level]}]{occurred.level:7}[/]"
     out.print(f"{occurred.seq:5}  {wall_clock(occurred.time)}  {level}  {plain(occurred.message)}", soft_wrap=True)
 
 
 def print_checks(found: Sequence[Check]) -> None:
-    """Print each check on a line, and under it what to do."""
+    """Print each check on one line, with the remedy below it."""
     for check in found:
         verdict = f"[{VERDICTS[check.verdict]}]{check.verdict:8}[/]"
         out.print(f"{verdict} {check.name:13} {plain(check.found)}", soft_wrap=True)
