@@ -15,7 +15,7 @@ from typing import Any
 import docstrings
 import msgspec
 from trirail.errors import RefusalCode
-from trirail.wire import goal_kind, goals, looks, messages, state, vocabulary
+from trirail.wire import goal_kind, goals, looks, marks, messages, state, vocabulary
 from trirail.wire.event_codes import EventCode
 from trirail.wire.vocabulary import Command, NoContent
 
@@ -43,7 +43,15 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "info": (state.Info, "The reply to a query on info."),
 }
 """Type of each message, and a description of where it is used, by file."""
-MODULES = (*(sys.modules[kind.__module__] for kind in goals.KINDS), goal_kind, vocabulary, looks, messages, state)
+MODULES = (
+    *(sys.modules[kind.__module__] for kind in goals.KINDS),
+    goal_kind,
+    marks,
+    vocabulary,
+    looks,
+    messages,
+    state,
+)
 """Modules that define the types in the messages."""
 
 

@@ -16,14 +16,14 @@ import numpy as np
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 
-__all__ = ["LEGS", "PARALLEL", "THETA_1", "AnyLeg", "Crossing", "across", "check_finite", "theta", "wrapped"]
+__all__ = ["LEGS", "PARALLEL", "THETA_1", "AnyLeg", "CrossSlide", "across", "check_finite", "theta", "wrapped"]
 
 LEGS = ("A", "B", "C")
 PARALLEL = 1e-9  # |sin| of the angle between a cross slide and its rail up to which the leg counts as singular
 THETA_1 = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # (3)
 
 
-class Crossing(NamedTuple):
+class CrossSlide(NamedTuple):
     """Position and direction of a leg's cross slide, for drawings."""
 
     point: tuple[float, float]
@@ -77,7 +77,7 @@ class AnyLeg(Protocol):
         ...
 
     @property
-    def crossing(self) -> Crossing:
+    def crossing(self) -> CrossSlide:
         """How to draw the cross slide."""
         ...
 

@@ -19,7 +19,7 @@ import numpy as np
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.joints import Joint, serial_leg
-from trirail.kinematics.leg import PARALLEL, THETA_1, Crossing, check_finite, theta
+from trirail.kinematics.leg import PARALLEL, THETA_1, CrossSlide, check_finite, theta
 
 __all__ = ["CrossLeg"]
 
@@ -65,9 +65,9 @@ class CrossLeg:
         return math.hypot(*self.pivot)
 
     @property
-    def crossing(self) -> Crossing:
+    def crossing(self) -> CrossSlide:
         """How to draw the cross slide: on the carriage, which the pivot leaves along it."""
-        return Crossing(self.pivot, self.cross_angle, False)
+        return CrossSlide(self.pivot, self.cross_angle, False)
 
     def keys(self) -> dict[str, Any]:
         """Return its numbers by the keys of [[geometry.leg]] [m, rad]."""

@@ -17,7 +17,7 @@ import numpy as np
 from trirail.errors import KinematicsError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.joints import Joint, serial_leg
-from trirail.kinematics.leg import PARALLEL, THETA_1, Crossing, across, check_finite, theta
+from trirail.kinematics.leg import PARALLEL, THETA_1, CrossSlide, across, check_finite, theta
 
 __all__ = ["Leg"]
 
@@ -66,9 +66,9 @@ class Leg:
         return math.hypot(*self.edge_point)
 
     @property
-    def crossing(self) -> Crossing:
+    def crossing(self) -> CrossSlide:
         """How to draw the edge: on the platform, from its edge point."""
-        return Crossing(self.edge_point, self.edge_angle, True)
+        return CrossSlide(self.edge_point, self.edge_angle, True)
 
     def keys(self) -> dict[str, Any]:
         """Return its numbers by the keys of [[geometry.leg]] [m, rad]."""
