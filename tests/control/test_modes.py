@@ -118,6 +118,11 @@ RULES = [
     ),
     Rule("a jog that nobody renews ends", {E.NOT_RENEWED}, {MOVING: Step(RELEASING, Action.BRAKE)}),
     Rule(
+        "an edge ends its goal, also a paused one",
+        {E.INPUT_EDGE},
+        {MOVING: Step(RELEASING, Action.BRAKE), PAUSING: Step(RELEASING), PAUSED: Step(HOLDING)},
+    ),
+    Rule(
         "homing begins where the robot holds",
         {E.HOME},
         {

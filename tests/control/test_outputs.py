@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from typing import Any
 
 import msgspec
@@ -12,8 +13,10 @@ from control_rig import CONFIG, ControlRig, PerfectDrives
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, Input, Output, load
 from trirail.errors import RefusalCode
+from trirail.wire.event_codes import EventCode
 from trirail.wire.goals import PoseGoal
 from trirail.wire.marks import Mark, StopAt, Switch
+from trirail.wire.messages import GoalReply
 from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused, Request
 from trirail.wire.vocabulary import Command, Mode, SetOutput
 
@@ -185,6 +188,65 @@ def _as_near(rig: Rig, row: Switch, pose: tuple[float, float, float], best: int)
     return bool(here <= there + 1e-6)
 
 
+@pytest.mark.parametrize("kind", ROBOTS)
+@pytest.mark.generated(*range(25))
+def test_in_sessions_of_goals_no_mark_switches_twice_or_after_its_goals_end(kind: str, seed: int) -> None:
+    """Twenty random goals per session, that follow, blend into or preempt each other, or are stopped."""
+    rng = np.random.default_rng(1000 + seed)
+    rig = Rig(kind)
+    rig.enable()
+    replies: dict[str, GoalReply] = {}
+    sent: dict[str, PoseGoal] = {}
+    for number in range(20):
+        x, y, phi = rng.uniform(-1.0, 1.0, 3) * REACH[kind]
+        shares = rng.uniform(0.0, 1.0, int(rng.integers(1, 3)))
+        marks = tuple(Mark("valve", value=bool(rng.random() < 0.5), at_path_fraction=float(share)) for share in shares)
+        blend = float(rng.uniform(1e-4, 0.005)) if rng.random() < 0.5 else None
+        goal = PoseGoal(x, y, phi, speed=float(rng.uniform(0.2, 1.0)), blend=blend, marks=marks)
+        if isinstance(answer := rig.send(f"g{number}", goal), Accepted):
+            sent[f"g{number}"], replies[f"g{number}"] = goal, answer.reply
+        for _ in range(int(rng.integers(3))):
+            rig.cycles(int(rng.integers(1, 150)))
+            match rng.integers(4):
+                case 0:
+                    rig.order("override", float(rng.uniform(0.1, 2.0)))
+                case 1 if rig.mode is Mode.MOVING:
+                    rig.order("pause")
+                    rig.cycles(int(rng.integers(1, 100)))
+                    rig.order("resume")
+                case 2 if rng.random() < 0.2:
+                    rig.order("stop")
+                case _:
+                    pass
+        if rng.random() < 0.5:
+            rig.until(rig.holds, 60_000)
+    rig.until(rig.holds, 60_000)
+    rig.cycles(200)
+    assert len(sent) > 5
+    ends = {notice.id: notice for notice in rig.notices if notice.kind == "goal"}
+    assert {ends[name].outcome for name in sent} <= {"done", "preempted", "stopped"}
+    switched = Counter((row.goal, row.mark) for row in rig.switches)
+    assert set(switched.values()) <= {1}
+    for name, goal in sent.items():
+        if ends[name].outcome == "done" and goal.blend is None:
+            assert {mark for of, mark in switched if of == name} == set(range(len(goal.marks))), name
+    poses = np.array(rig.poses)
+    for row in rig.switches:
+        assert rig.words[row.cycle - 1][0] >> 16 & 1 in (row.value, *_others(rig, row))
+        assert row.commanded == tuple(rig.poses[row.cycle - 1])
+        placed = next(placed for placed in replies[row.goal].marks if placed.mark == row.mark)
+        around = poses[row.cycle - 2 : row.cycle + 1]
+        before, here, after = np.linalg.norm((around - placed.pose) / REACH[kind], axis=1)
+        assert here <= after + 1e-6, row
+        # The setpoint at the start of a path that preempts another has been sent when the goal begins.
+        assert here <= before + 1e-6 or placed.time <= rig.config.period / 2.0, row
+
+
+def _others(rig: Rig, row: Switch) -> list[bool]:
+    """Return the values to which later marks switch the same output in the same cycle."""
+    return [other.value for other in rig.switches if other.cycle == row.cycle and other != row]
+
+
 def test_pulses_last_their_width_and_are_closed_by_a_stop(rig: Rig) -> None:
     mark = Mark("valve", start=0.0, increment=0.005, pulse_width=0.01)
     answer = rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, marks=(mark,)))
@@ -273,6 +335,46 @@ def test_a_goal_ends_at_an_edge(rig: Rig) -> None:
     assert end.params["x"] == pytest.approx(edge[0].params["x"])
     assert rig.poses[-1][0] < 0.045
     assert not rig.switches
+
+
+def test_goals_behind_one_that_ends_at_an_edge_do_not_run(rig: Rig) -> None:
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.2, blend=0.001, stop_at=StopAt("part")))
+    assert isinstance(rig.send("g2", PoseGoal(0.0, 0.03, 0.0, blend=0.001)), Accepted)
+    rig.cycles(200)
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.until(rig.holds, 5000)
+    rig.cycles(500)
+    assert sorted(rig.outcomes()) == [("g1", "done"), ("g2", "stopped")]
+    assert rig.poses[-1][1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("paused_for", [1, 2000])
+def test_an_edge_ends_a_paused_goal(rig: Rig, paused_for: int) -> None:
+    rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=0.2, stop_at=StopAt("part")))
+    rig.cycles(200)
+    rig.order("pause")
+    rig.cycles(paused_for)
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycles(2)
+    rig.until(rig.holds, 5000)
+    (end,) = (notice for notice in rig.notices if notice.kind == "goal")
+    assert (end.outcome, end.reason) == ("done", "input part rising")
+    before = rig.poses[-1]
+    assert isinstance(rig.command("resume"), Refused)
+    rig.cycles(100)
+    assert np.array_equal(before, rig.poses[-1])
+
+
+def test_a_goal_sent_while_one_ends_at_an_edge_is_done_for_its_own_reason(rig: Rig) -> None:
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.5, stop_at=StopAt("part")))
+    rig.cycles(200)
+    rig.drives.inputs = (0, 1 << 16, 0)
+    rig.cycle()
+    rig.send("g2", PoseGoal(0.0, 0.0, 0.0))
+    rig.until(rig.holds, 20_000)
+    ends = {notice.id: notice for notice in rig.notices if notice.kind == "goal"}
+    assert ends["g2"].outcome == "done"
+    assert ends["g2"].event_code is not EventCode.INPUT_REACHED
 
 
 def test_other_edges_are_events_alone(rig: Rig) -> None:

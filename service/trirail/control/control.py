@@ -33,6 +33,7 @@ from trirail.motion.runs import ZERO_RATES, MotionState, Run, rest
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.event_codes import EventCode, coded
+from trirail.wire.marks import StopAt
 from trirail.wire.messages import FaultDetail, Notice, Outcome
 from trirail.wire.packets import (
     Announcement,
@@ -231,7 +232,7 @@ class Control:
         if behind is None:
             behind = self.measured.update(feedback, self._stands)
         self._tell_warnings(feedback)
-        self._tell_edges(before, feedback)
+        self._handle_edges(before, feedback)
         mode = self.state.mode
         if feedback.fault is not None:
             drive, cause, code, message = feedback.fault
@@ -303,7 +304,7 @@ class Control:
             text = coded(f"{number} outputs switched", EventCode.OUTPUTS_SWITCHED, goal=goal, number=number)
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
-    def _tell_edges(self, before: Feedback, now: Feedback) -> None:
+    def _handle_edges(self, before: Feedback, now: Feedback) -> None:
         """Report the inputs that have changed; stop the goal that is to end at such an edge."""
         goal, pose = self.ledger.goal, self.measured.pose
         x, y, phi = pose
@@ -313,11 +314,12 @@ class Control:
             )
             text = coded(words, EventCode.INPUT_CHANGED, input=name, value=float(value), x=x, y=y, phi=phi)
             self.ledger.notices.append(Notice("input", "info", text.text, **text.fields))
-            if goal is not None and goal.stop_at is not None and self.state.mode is Mode.MOVING:
-                edge = "rising" if value else "falling"
-                if (goal.stop_at.input, goal.stop_at.edge) == (name, edge):
-                    reached = coded(f"input {name} {edge}", EventCode.INPUT_REACHED, input=name, x=x, y=y, phi=phi)
-                    self.modes.go(ModeEvent.INPUT_EDGE, reached)
+            edge = StopAt(name, "rising" if value else "falling")
+            if goal is not None and goal.stop_at == edge and self.state.has_goal and not self.state.released:
+                reached = coded(f"input {name} {edge.edge}", EventCode.INPUT_REACHED, input=name, x=x, y=y, phi=phi)
+                self.ledger.end("stopped", reached, but=1)
+                self.modes.withdraw(ModeEvent.INPUT_EDGE, reached)
+                self.modes.go(ModeEvent.INPUT_EDGE, reached)
 
     def write(self) -> None:
         """Send the setpoints."""

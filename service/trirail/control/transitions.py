@@ -23,6 +23,7 @@ from trirail.wire.vocabulary import Command, Mode
 _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.STANDSTILL: "done",
     ModeEvent.ARRIVED: "done",
+    ModeEvent.INPUT_EDGE: "done",
     ModeEvent.FAULT: "faulted",
 }
 """Outcome of a goal on an event that ends it; "stopped" on all others."""
@@ -97,6 +98,8 @@ class Transitions:
         self._act(decided)
         if event is ModeEvent.INPUT_EDGE:
             self._edge = reason
+        elif goal is not None:
+            self._edge = None
         before, self.state = self.state, decided.state
         if self.state.mode is not before.mode:
             self.entered = self.cycle
@@ -107,7 +110,7 @@ class Transitions:
             self._schedule.stop_on_path()  # also where it brakes already: no goal begins on the way
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = EventCode.RELEASED if before.released else EventCode.ARRIVED
-            at_end = self._edge if before.released and self._edge is not None else coded(arrived.value, arrived)
+            at_end = self._edge if self._edge is not None else coded(arrived.value, arrived)
             self._ledger.end(outcome, at_end if outcome == "done" else reason)
             self._edge = None
         if self.state.mode is not before.mode:

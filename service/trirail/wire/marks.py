@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-import msgspec
 from msgspec import Meta, Struct
 from trirail_drivers.interface import Triple
 
+from trirail.wire.decoding import converted, prepare
 from trirail.wire.sizes import MAX_NAME
 
 Length = Annotated[float, Meta(ge=0.0, le=1e3)]
@@ -101,7 +101,7 @@ MarkLike = Mark | Mapping[str, Any]
 
 def marks_of(marks: Sequence[MarkLike]) -> tuple[Mark, ...]:
     """Return marks that may be given by mappings. Raises ValueError for impossible ones."""
-    return tuple(mark if isinstance(mark, Mark) else msgspec.convert(dict(mark), Mark) for mark in marks)
+    return tuple(mark if isinstance(mark, Mark) else converted(dict(mark), Mark) for mark in marks)
 
 
 Marks = Annotated[
@@ -125,13 +125,16 @@ StopAtLike = StopAt | Mapping[str, Any]
 
 def stop_at_of(edge: StopAtLike | None) -> StopAt | None:
     """Return an edge that may be given by a mapping. Raises ValueError for an impossible one."""
-    return edge if edge is None or isinstance(edge, StopAt) else msgspec.convert(dict(edge), StopAt)
+    return edge if edge is None or isinstance(edge, StopAt) else converted(dict(edge), StopAt)
 
 
 StopAtEdge = Annotated[
     StopAt | None,
     Meta(description="edge of an input at which it ends, by a controlled stop"),
 ]
+
+
+prepare(Mark, StopAt)
 
 
 class PlacedMark(Struct, frozen=True, omit_defaults=True):
