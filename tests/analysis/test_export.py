@@ -6,9 +6,11 @@ from pathlib import Path
 
 import made
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 from pyarrow import csv, parquet
 from trirail.analysis import export
 from trirail.config import SIM, load
@@ -19,7 +21,8 @@ from trirail.telemetry.reading import read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.recording import Recording
 from trirail.wire.goals import MoveGoal
-from trirail.wire.messages import Event
+from trirail.wire.marks import Switch, switch_rows
+from trirail.wire.messages import Event, Notice
 from trirail.wire.packets import ControlInput, GoalRequest
 from trirail.wire.records import DTYPE, PART_NAMES
 from trirail.wire.vocabulary import MODES
@@ -36,11 +39,45 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return read(path)
 
 
+def read_table(path: Path) -> pa.Table:
+    """Return a table that was written, by the reader of its format."""
+    match path.suffix:
+        case ".csv":
+            return csv.read_csv(path)
+        case ".parquet":
+            return parquet.read_table(path)
+        case _:
+            array = np.load(path)
+            return pa.table(
+                {name: array[name].tolist() if name != "wall" else array[name] for name in array.dtype.names}
+            )
+
+
+@pytest.mark.parametrize("suffix", export.FORMATS)
+def test_every_switch_comes_back(suffix: str, tmp_path: Path) -> None:
+    config = load(SIM)
+    recorder = Recorder(config, tmp_path, path=tmp_path / "made.rrd", live=False)
+    recorder.records(made.records(1.0).tobytes())
+    happened = [
+        Switch(
+            "g", k, "valve", k % 2 == 0, 100 * k, 0.1 * k, 1.8e9 + 0.1 * k, (0.01 * k, 1 / 3, 0.0), (0.1, 0.2, 0.3 / 7)
+        )
+        for k in range(1, 6)
+    ]
+    for number, part in enumerate((happened[:2], happened[2:])):
+        notice = Notice("output", "info", "outputs switched", goal="g", marks=tuple(part))
+        recorder.event(Event(**structs.asdict(notice), seq=number, t=0.6, cycle=600, time=1.8e9 + 0.6))
+    recorder.close()
+    path = tmp_path / f"switches{suffix}"
+    assert export.write_switches(read(tmp_path / "made.rrd"), path) == len(happened)
+    assert read_table(path).to_pylist() == switch_rows(tuple(happened))
+
+
 @pytest.mark.parametrize("suffix", export.FORMATS)
 def test_every_number_comes_back(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / f"table{suffix}"
     assert export.write(recording, path) == len(recording.records)
-    rows = csv.read_csv(path) if suffix == ".csv" else parquet.read_table(path)
+    rows = read_table(path)
     np.testing.assert_array_equal(rows["wall"].to_numpy().astype("datetime64[ns]"), recording.wall)
     found = rows.drop_columns(["wall"]).to_pydict()
     assert found["t"] == recording.t.tolist()
@@ -63,7 +100,7 @@ def test_a_file_is_never_written_over_and_its_name_says_its_format(recording: Re
     with pytest.raises(ServiceError, match="exists already: name another file"):
         export.write(recording, path)
     assert path.read_text() == "mine"
-    with pytest.raises(ServiceError, match=r"must end in \.csv or \.parquet"):
+    with pytest.raises(ServiceError, match=r"must end in .csv, .parquet or .npy"):
         export.write(recording, tmp_path / "table.xls")
 
 

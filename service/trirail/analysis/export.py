@@ -1,21 +1,38 @@
-"""Export of a recording as a table with one row per cycle, CSV or Parquet."""
+"""Export of a recording as a table, with one row per cycle or per switch of an output: CSV, Parquet or numpy."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import BinaryIO, Final
 
+import numpy as np
+import pyarrow as pa
 from pyarrow import csv, parquet
 
 from trirail.errors import ServiceError
 from trirail.telemetry.recording import Recording, table
+from trirail.wire.marks import Switch, switch_rows
 
-FORMATS = (".csv", ".parquet")
+FORMATS = (".csv", ".parquet", ".npy")
 """Accepted file suffixes."""
+SWITCHES: Final = pa.schema(
+    [
+        ("goal", pa.string()),
+        ("mark", pa.int64()),
+        ("output", pa.string()),
+        ("value", pa.bool_()),
+        ("cycle", pa.int64()),
+        *((name, pa.float64()) for name in ("t", "time")),
+        ("closed", pa.bool_()),
+        *((f"{kind}_{name}", pa.float64()) for kind in ("commanded", "measured") for name in ("x", "y", "phi")),
+    ]
+)
+"""Columns of the table of switches; lengths in m, angles in rad, times in s."""
 
 
 def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
-    """Write the table of a recording, as CSV or Parquet by the file's suffix; return the number of rows.
+    """Write the table of a recording, as CSV, Parquet or numpy by the file's suffix; return the number of rows.
 
     Parameters
     ----------
@@ -31,18 +48,50 @@ def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
     ServiceError
         A column or the suffix is unknown, the file exists, or it cannot be written.
     """
+    return _write(path, lambda: table(recording, columns))
+
+
+def write_switches(recording: Recording, path: Path) -> int:
+    """Write the switches of outputs on the paths of goals, one per row; return their number.
+
+    `path` and errors as in write. The columns are those of trirail.wire.marks.Switch, with one number in each.
+    """
+    return _write(path, lambda: pa.Table.from_pylist(switch_rows(switches(recording)), SWITCHES))
+
+
+def switches(recording: Recording) -> tuple[Switch, ...]:
+    """Return the switches of outputs on the paths of goals, in the order in which they happened."""
+    events = (line.event for line in recording.events if line.event is not None)
+    return tuple(sorted((switch for event in events for switch in event.marks), key=lambda switch: switch.cycle))
+
+
+def _write(path: Path, make: Callable[[], pa.Table]) -> int:
     if path.suffix not in FORMATS:
-        raise ServiceError(f"{path}: its name must end in {' or '.join(FORMATS)}")
-    rows = table(recording, columns)
+        raise ServiceError(f"{path}: its name must end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
+    rows = make()
     try:
         # Mode x: an existing file, say another export, is never overwritten.
         with path.open("xb") as file:
-            if path.suffix == ".csv":
-                csv.write_csv(rows, file)
-            else:
-                parquet.write_table(rows, file)
+            _WRITERS[path.suffix](rows, file)
     except FileExistsError as error:
         raise ServiceError(f"{path} exists already: name another file") from error
     except OSError as error:
         raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
     return len(rows)
+
+
+def _save_numpy(rows: pa.Table, file: BinaryIO) -> None:
+    """Write a structured array whose fields are the columns."""
+    columns = [column.to_numpy() for column in rows.columns]
+    columns = [column.astype(str) if column.dtype == object else column for column in columns]
+    array = np.empty(len(rows), [(name, column.dtype) for name, column in zip(rows.column_names, columns, strict=True)])
+    for name, column in zip(rows.column_names, columns, strict=True):
+        array[name] = column
+    np.save(file, array)
+
+
+_WRITERS: Final[Mapping[str, Callable[[pa.Table, BinaryIO], None]]] = {
+    ".csv": csv.write_csv,
+    ".parquet": parquet.write_table,
+    ".npy": _save_numpy,
+}

@@ -99,19 +99,20 @@ def export(
     every: notation.Time | None = None,
     columns: str = "",
     goal: str | None = None,
+    switches: Annotated[bool, Flag] = False,
     json: Json = False,
 ) -> int:
-    """Write a recorded session as a table, CSV or Parquet.
+    """Write a recorded session as a table: CSV, Parquet or numpy.
 
-    A row a cycle, in SI units.
+    One row per cycle, in SI units.
 
     Parameters
     ----------
     file
         Recording, or all files of one that was rotated.
     out
-        File to write, never over one that exists; its suffix is its format: .csv, .parquet. Beside the recording, as
-        CSV, if absent.
+        File to write, never over one that exists; its suffix is its format: .csv, .parquet, .npy. Beside the
+        recording, as CSV, if absent.
     begin
         First time, since the start of the service's loop, as report shows times: 12.5s.
     end
@@ -122,12 +123,17 @@ def export(
         Names of columns, or words of names, with commas between: pose,error. All if absent.
     goal
         From when a goal of this id was given until it ended.
+    switches
+        One row per switch of an output on a path instead, with the cycle and both poses.
     """
-    from trirail.analysis.export import write
+    from trirail.analysis.export import write, write_switches
 
     path = out or file[0].with_suffix(".csv")
     wanted = [column.strip() for column in columns.split(",") if column.strip()]
-    rows = write(_read(file).part(begin, end, goal=goal, every=every), path, wanted)
+    if switches and (every is not None or wanted):
+        raise ServiceError("--switches has a row for each switch: leave --every and --columns out")
+    recording = _read(file).part(begin, end, goal=goal, every=every)
+    rows = write_switches(recording, path) if switches else write(recording, path, wanted)
     if json:
         terminal.json({"file": str(path), "rows": rows})
     else:

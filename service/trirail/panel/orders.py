@@ -72,7 +72,8 @@ class Orders:
     async def _answer(self, ask: Callable[[], Awaitable[object]], what: str, name: str = "") -> None:
         """Send a request and report its result; commands that stop the robot never wait and have their own places."""
         stops = isinstance(what, Command) and what.stops
-        if isinstance(what, Command) and not stops and self._under_way[what]:
+        repeats = isinstance(what, Command) and not stops and what is not Command.SET_OUTPUT  # it is of one output
+        if repeats and self._under_way[what]:
             return
         place = "stops" if stops else "others"
         if self._under_way[place] >= UNDER_WAY:

@@ -61,6 +61,7 @@ class ServiceMetrics(Collector):
             yield from _loop(service)
             yield from _goals(service)
             yield from _can(service)
+            yield from _digital(service)
             yield from _use(service.use)
         if (recorder := self._health.recorder) is not None:
             words = "Batches that are missing, by where they should be."
@@ -116,6 +117,11 @@ def _can(service: ServiceMeasured) -> Iterator[Metric]:
     }
     words = "Cyclic frames of a drive that were late or lost."
     yield _counter("can_troubled_frames", words, ["drive", "kind"], frames)
+
+
+def _digital(service: ServiceMeasured) -> Iterator[Metric]:
+    yield _gauge("output", "Value of a digital output.", ["name"], service.outputs)
+    yield _gauge("input", "Value of a digital input.", ["name"], service.inputs)
 
 
 def _use(use: InUse) -> Iterator[Metric]:

@@ -87,6 +87,10 @@ class ServiceMeasured(Struct, frozen=True):
     """Use of limited resources."""
     warnings: tuple[str, ...]
     """Warnings of resources nearly used up."""
+    outputs: dict[str, bool] = {}
+    """Value of each output of the configuration."""
+    inputs: dict[str, bool] = {}
+    """Value of each input of the configuration."""
 
 
 class RecorderMeasured(Struct, frozen=True):
@@ -152,6 +156,8 @@ class Meter:
                 faults=tuple(FaultCount(fault, times) for fault, times in self._faults.items()),
                 use=use,
                 warnings=warnings,
+                outputs=state.outputs,
+                inputs=state.inputs,
             )
         )
 
