@@ -328,7 +328,7 @@ def test_a_goal_ends_at_an_edge(rig: Rig) -> None:
     rig.cycle()
     edge = [notice for notice in rig.notices if notice.kind == "input"]
     assert len(edge) == 1
-    assert edge[0].params["value"] == 1.0
+    assert edge[0].params["on"] == 1.0
     rig.until(rig.holds, 5000)
     (end,) = (notice for notice in rig.notices if notice.kind == "goal")
     assert (end.outcome, end.reason) == ("done", "input part rising")
@@ -384,7 +384,7 @@ def test_other_edges_are_events_alone(rig: Rig) -> None:
     rig.until(rig.holds, 5000)
     (end,) = (notice for notice in rig.notices if notice.kind == "goal")
     assert (end.outcome, end.reason) == ("done", "arrived") or end.outcome == "done"
-    assert [notice.params["value"] for notice in rig.notices if notice.kind == "input"] == [1.0, 0.0]
+    assert [notice.params["on"] for notice in rig.notices if notice.kind == "input"] == [1.0, 0.0]
 
 
 @pytest.mark.parametrize(

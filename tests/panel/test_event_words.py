@@ -122,7 +122,9 @@ def test_every_value_makes_a_difference_to_the_sentence(folder: Path) -> None:
     changed: list[tuple[EventCode, str, dict[str, float | str], dict[str, float | str]]] = []
     for code in CODES:
         params = values(code, 0) | ({"cause": "emcy"} if "cause" in code.params else {})
-        changed += [(code, name, params, params | {name: values(code, 1)[name]}) for name in params]
+        changed += [
+            (code, name, params, params | {name: 0.0 if name == "on" else values(code, 1)[name]}) for name in params
+        ]
     before = shown(folder, [event(code, params) for code, _, params, _ in changed])
     after = shown(folder, [event(code, params) for code, _, _, params in changed])
     same = [(code, name, one) for (code, name, *_), one, two in zip(changed, before, after, strict=True) if one == two]

@@ -62,7 +62,7 @@ class Comparison(NamedTuple):
     plans_differing: int
     """Recorded answers that differ from the replay's in any bit."""
     differing: int
-    """Cycles whose setpoints or mode differ in any bit."""
+    """Cycles whose setpoints, mode or outputs differ in any bit."""
     first: int | None
     """First of these cycles."""
     position: Triple
@@ -100,13 +100,14 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
     else:
         planner, inputs = LocalPlanner(config), requests
     try:
-        setpoints, modes = _run(Control(config, drives, planner), drives, planner, clock, records, inputs)
+        setpoints, modes, outputs = _run(Control(config, drives, planner), drives, planner, clock, records, inputs)
     finally:
         clock.run()
         drives.close()
     recorded = np.stack([records[name] for name in SETPOINT_FIELDS], axis=1)
     # Compared as integers: the same bits, including the sign of a zero.
     differs = (setpoints.view(np.int64) != recorded.view(np.int64)).any(axis=(1, 2)) | (modes != records["mode"])
+    differs |= (outputs != records["outputs"]).any(axis=1)
     greatest = np.abs(setpoints - recorded).max(axis=0).tolist()
     return Comparison(
         cycles=len(records),
@@ -128,8 +129,12 @@ def _run(
     clock: _SimulatedClock,
     records: NDArray[np.void],
     inputs: Sequence[ControlInput],
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return the setpoints of each cycle, position [m] and velocity [m/s], (N, 2, 3), and the modes, (N,)."""
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64]]:
+    """Return what each cycle commands.
+
+    These are the setpoints, position [m] and velocity [m/s], (N, 2, 3), the modes, (N,), and the drives' output words,
+    (N, 3).
+    """
     clock.step()
     drives.sync()
     control.start(drives.read())
@@ -137,14 +142,16 @@ def _run(
     pending = deque(inputs)
     setpoints = np.zeros((len(records), 2, 3))
     modes = np.zeros(len(records), np.uint8)
+    outputs = np.zeros((len(records), 3), np.int64)
     for row in range(len(records)):
         clock.step()
         drives.sync()
         _run_cycle(control, drives, planner, list(_due_inputs(pending, control.cycles + 1)))
         setpoints[row] = control.setpoints.rows[:2]
         modes[row] = MODES.index(control.state.mode)
+        outputs[row] = control.outputs.words
         control.conclude()
-    return setpoints, modes
+    return setpoints, modes, outputs
 
 
 def _run_cycle(

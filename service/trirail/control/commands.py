@@ -186,7 +186,7 @@ class Commands:
         name, value = request.content.output, request.content.value
         self._outputs.set(name, value, self._modes.state.mode)
         words = f"output {name} {'on' if value else 'off'} by {request.user}"
-        text = coded(words, EventCode.OUTPUT_SET, output=name, value=float(value), user=request.user)
+        text = coded(words, EventCode.OUTPUT_SET, output=name, on=float(value), user=request.user)
         self._ledger.notices.append(Notice("output", "info", text.text, user=request.user, **text.fields))
 
     def _acquire(self, request: CommandRequest) -> None:

@@ -312,7 +312,7 @@ class Control:
             words = (
                 f"input {name} {'on' if value else 'off'} at x {x * 1e3:.3f} mm, y {y * 1e3:.3f} mm, phi {phi:.5f} rad"
             )
-            text = coded(words, EventCode.INPUT_CHANGED, input=name, value=float(value), x=x, y=y, phi=phi)
+            text = coded(words, EventCode.INPUT_CHANGED, input=name, on=float(value), x=x, y=y, phi=phi)
             self.ledger.notices.append(Notice("input", "info", text.text, **text.fields))
             edge = StopAt(name, "rising" if value else "falling")
             if goal is not None and goal.stop_at == edge and self.state.has_goal and not self.state.released:

@@ -64,6 +64,8 @@ def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dic
         "velocity": platform.velocity,
         "speeds": SPEEDS,
         "homes": info.homes,
+        "outputs": info.outputs,
+        "inputs": info.inputs,
         "sliders": robot.geometry.labels,
         "resolution": MICROMETRES if platform.x[1] - platform.x[0] <= STAGE else MILLIMETRES,
         "ignores_lease": [each.value for each in Command if each.ignores_lease],

@@ -15,7 +15,7 @@ from trirail.wire.decoding import converted, decoded, prepare
 from trirail.wire.event_codes import EventCode
 from trirail.wire.looks import AlignmentLook, alignment_event_text
 from trirail.wire.messages import GoalReply, Notice
-from trirail.wire.packets import Announcement, ControlInput
+from trirail.wire.packets import Announcement, ControlInput, GoalRequest
 from trirail.wire.plan_packets import Extended, Planned
 
 
@@ -62,6 +62,11 @@ def encode_input(what: ControlInput) -> str:
         entry = _recorded_notice(what.given.notice)
     elif isinstance(what.given, Planned | Extended):
         entry = _recorded_plan(what.given)
+    elif isinstance(what.given, GoalRequest):
+        entry = msgspec.to_builtins(what.given)
+        for name in ("marks", "stop_at"):  # fields of later goals: older programs refuse what they do not know
+            if not entry["goal"].get(name, True):
+                del entry["goal"][name]
     else:
         return msgspec.json.encode(what).decode()
     return msgspec.json.encode(msgspec.to_builtins(what) | {"given": entry}).decode()
@@ -89,6 +94,8 @@ def _recorded_plan(plan: Planned | Extended) -> _Line:
     fields = msgspec.to_builtins(plan)
     fields |= fields.pop("reply")
     later = [name for name in _LATER if getattr(plan.reply, name) != getattr(_PLAIN_REPLY, name)]
+    if plan.switches:
+        later.append("switches")
     return {name: fields[name] for name in ("type", *_PLANS[fields["type"]], *later)}
 
 

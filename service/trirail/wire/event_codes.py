@@ -70,9 +70,9 @@ class EventCode(StrEnum):
     SLIDER_MOVED = "slider_moved", "a slider moved while its drive was off", "slider", "position_before", "position"
 
     # Outputs and inputs.
-    OUTPUT_SET = "output_set", "a user has set an output", "output", "value", "user"
+    OUTPUT_SET = "output_set", "a user has set an output", "output", "on", "user"
     OUTPUTS_SWITCHED = "outputs_switched", "outputs have switched on the path of a goal", "goal", "number"
-    INPUT_CHANGED = "input_changed", "an input has changed", "input", "value", "x", "y", "phi"
+    INPUT_CHANGED = "input_changed", "an input has changed", "input", "on", "x", "y", "phi"
     INPUT_REACHED = "input_reached", "an input has changed at which the goal was to end", "input", "x", "y", "phi"
 
     # Poses and alignments.

@@ -28,6 +28,7 @@ export function barriers(robot, state, choice) {
     // After a stop the service refuses goals until the robot stands; a jog that brakes may be followed by another.
     goal: !robot.permissions.includes("goal") ? ["bar.role"] : POWERED.includes(mode) && (mode !== "stopping" || goal) ? null : [`bar.${mode}`],
     override: null,
+    set_output: robot.permissions.includes("set_output") ? null : ["bar.role"],
     teach: !choice.name ? ["bar.name"] : known && !taught ? ["bar.configured", { name: choice.name }]
       : mode === "holding" || mode === "disabled" ? null : [`bar.${mode}`],
     forget: !choice.name ? ["bar.name"] : taught ? null : ["bar.not_taught", { name: choice.name }],

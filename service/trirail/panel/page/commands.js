@@ -49,6 +49,7 @@ export class Commands {
     for (const control of document.querySelectorAll(".hold, #poses button, #go")) bar(control, bars.goal);
     for (const id of ["override", "teach", "forget"]) bar(byId(id), bars[id]);
     for (const id of ["file-start", "follow"]) bar(byId(id), bars.follow);
+    for (const control of document.querySelectorAll("[data-output]")) bar(control, bars.set_output);
     bar(byId("here"), state ? null : ["bar.contact"]);
     return !bars.goal;
   }

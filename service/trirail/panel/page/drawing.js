@@ -1,6 +1,7 @@
 // The mechanism as an SVG, in metres, y upwards: fixed parts once, the others where a state has them.
 
 const SVG = "http://www.w3.org/2000/svg";
+const TICKS = 500; // so many switches are drawn, the newest
 
 export class Drawing {
   constructor(svg, robot) {
@@ -33,6 +34,8 @@ export class Drawing {
     lines(parts.outline, "wanted", this.chosen);
     lines(parts.arms, "wanted", this.chosen);
     this.route = add("polyline", "");
+    this.ticks = add("g", "");
+    this.tickSize = 0.008 * (high[0] - low[0]);
     this.wanted(null, null);
     this.platform = add("g", "moving");
     lines(parts.outline, "platform", this.platform);
@@ -77,6 +80,21 @@ export class Drawing {
   path(poses, may) {
     this.route.setAttribute("class", may ? "route free" : "route barred");
     this.route.setAttribute("points", points(poses));
+  }
+
+  // Mark where an output has switched: filled where it has switched on.
+  tick([x, y], on, title) {
+    if (this.ticks.childElementCount >= TICKS) this.ticks.firstChild.remove();
+    const dot = this.ticks.appendChild(document.createElementNS(SVG, "circle"));
+    dot.setAttribute("class", on ? "tick on" : "tick");
+    dot.setAttribute("r", this.tickSize);
+    dot.setAttribute("cx", x);
+    dot.setAttribute("cy", -y);
+    dot.appendChild(document.createElementNS(SVG, "title")).textContent = title;
+  }
+
+  clearTicks() {
+    this.ticks.replaceChildren();
   }
 
   // Where a pointer is, in metres.

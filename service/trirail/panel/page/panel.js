@@ -10,6 +10,7 @@ import { Following } from "./following.js";
 import { Going } from "./going.js";
 import { Jogging } from "./jogging.js";
 import { Naming } from "./naming.js";
+import { Outputs } from "./outputs.js";
 import { Readings } from "./readings.js";
 import { Sessions } from "./sessions.js";
 import { refusal } from "./service_words.js";
@@ -46,6 +47,7 @@ const speed = () => jogging.speed;
 const going = new Going(send, now, answer, speed);
 const following = new Following(send, now, allow, answer, speed);
 const naming = new Naming(send, allow, answer, speed, note);
+const outputs = new Outputs(send, answer);
 const sessions = new Sessions(now);
 
 // ------------------------------------------------------------------ to the server
@@ -79,6 +81,7 @@ const takes = {
     drawing = new Drawing(byId("mechanism"), robot);
     readings.robot(robot);
     charts.robot(robot);
+    outputs.robot(robot);
     commands.roles(robot);
     jogging.show();
     going.show();
@@ -99,6 +102,7 @@ const takes = {
     line.event(event);
     alignment.event(event);
     commands.event(event);
+    outputs.event(event, drawing);
   },
   silent() {
     lost("service");
@@ -146,6 +150,7 @@ function draw() {
   drawing.show(state);
   charts.state(state, performance.now());
   readings.state(state);
+  outputs.state(state);
   line.state(state);
   going.state(state);
   commands.show();

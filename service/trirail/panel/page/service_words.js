@@ -49,6 +49,7 @@ const SHOWN = {
   phi: (value) => angle(value),
   position: metres,
   position_before: metres,
+  on: (value) => say(value ? "input.on" : "input.off"),
   value: limited,
   limit: limited,
   settle: (value) => `${number(value * 1e3, 0, 3)} ms`,
