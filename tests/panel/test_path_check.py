@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from trirail.config import SIM, FramesTable, load
 from trirail.motion.runs import centre_motion, rest
 from trirail.panel.path_check import CheckedPath, checked_path, problem
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.workspace.violations import violations
 
 TIP, TABLE = (0.02, 0.03), (0.05, 0.02, 0.3)
 FRAMES = FramesTable(tool={"tip": TIP}, work={"table": TABLE})
-CONFIGURED = ShownRobot.configured(load(SIM))
-ROBOT = ShownRobot(CONFIGURED.name, CONFIGURED.geometry, CONFIGURED.limits, CONFIGURED.rate_hz, FRAMES)
+CONFIGURED = DrawnRobot.from_config(load(SIM))
+ROBOT = DrawnRobot(CONFIGURED.name, CONFIGURED.geometry, CONFIGURED.limits, CONFIGURED.rate_hz, FRAMES)
 ZERO = (0.0, 0.0, 0.0)
 place = st.floats(-0.2, 0.2)
 

@@ -13,10 +13,10 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
 from trirail.errors import ServiceError
-from trirail.telemetry.readout import Standing
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.sinks import Relay, free_port, live_relay, live_server
-from trirail.telemetry.streams import LIVE_HZ, Shortfall, Streams, open_together
+from trirail.telemetry.streams import LIVE_HZ, MissingDataReport, Streams, open_together
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event
@@ -89,13 +89,13 @@ class RemoteRobot:
         self._subscribe(info.robot)
         self._first_records = self._first(info)
         offset_ns = time.time_ns() - int(unpack(self._first_records)[-1]["deadline_ns"])
-        self.streams = Streams(ShownRobot.of_info(info), name, offset_ns, root)
+        self.streams = Streams(DrawnRobot.from_info(info), name, offset_ns, root)
         self._thread = threading.Thread(target=self._run, name=f"records of {info.robot}", daemon=True)
 
     def draw(self, relay: Relay) -> None:
         """Draw from now on, in a thread."""
         self.streams.attach(relay, LIVE_HZ)
-        self._missing = Shortfall(self.streams, MISSING, lambda: (self.lost, relay.skipped))
+        self._missing = MissingDataReport(self.streams, MISSING, lambda: (self.lost, relay.skipped))
         self._records(self._first_records)
         self._thread.start()
 
@@ -157,7 +157,7 @@ class RemoteRobot:
 
     def _state(self, state: State) -> None:
         goal, target = (state.goal.id, state.goal.target) if state.goal else (None, None)
-        self.streams.stands(Standing(goal, target, state.override, "; ".join(state.faults) or None))
+        self.streams.update_state(ReadoutState(goal, target, state.override, "; ".join(state.faults) or None))
         if state.loop.bus_load != self._bus_load:
             self._bus_load = state.loop.bus_load
             self.streams.bus_load(state.loop.bus_load)

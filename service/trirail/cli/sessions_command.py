@@ -82,16 +82,16 @@ def sessions(
     rebuild
         Read every recording, and write the .json beside it again.
     """
-    from trirail.telemetry.sessions import Wanted, fault_codes, find, recorded
+    from trirail.telemetry.sessions import SessionFilter, fault_codes, find, recorded
 
     if not folder.is_dir():
         raise ServiceError(f"{folder}: no such folder: name that of [telemetry] directory")
-    wanted = Wanted(
+    wanted = SessionFilter(
         robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
     )
     files = recorded(folder, reread=rebuild, on_read=_ReadingReport())
     matches = find(files, wanted)
-    known = fault_codes(files) if fault is not None and not find(files, Wanted(fault=fault)) else []
+    known = fault_codes(files) if fault is not None and not find(files, SessionFilter(fault=fault)) else []
     shown = matches[-last:] if last else matches
     if json:
         terminal.json({"folder": str(folder), "found": len(matches), "sessions": msgspec.to_builtins(shown)})

@@ -11,7 +11,7 @@ from trirail.client.held_jog import SPEEDS
 from trirail.errors import ConfigError, ServiceError
 from trirail.panel.permissions import permissions
 from trirail.telemetry import palette
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.sizes import MAX_FILE
 from trirail.wire.state import Info
 from trirail.wire.vocabulary import Command, Role
@@ -38,15 +38,15 @@ MILLIMETRES: dict[str, Any] = {
 """Unit of lengths on the page, units per metre, and decimals of lengths and degrees; jog steps [m] and [°]."""
 
 
-def shown(info: Info) -> ShownRobot:
+def shown(info: Info) -> DrawnRobot:
     """Return the robot that a service describes. Raises ServiceError if the service has another version."""
     try:
-        return ShownRobot.of_info(info)
+        return DrawnRobot.from_info(info)
     except (msgspec.ValidationError, ConfigError) as error:
         raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
 
 
-def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dict[str, Any]:
+def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dict[str, Any]:
     """Return the description, ready to encode, for a tab whose user has a role."""
     parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform

@@ -15,7 +15,7 @@ from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.runs import centre_motion, nominal_motion, rest, tool_motion
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames, rotated
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import Tool, TrajectoryGoal
 from trirail.wire.packed_trajectory import packed
 from trirail.workspace.violations import violations
@@ -41,7 +41,7 @@ class Obstacle(Struct, frozen=True, omit_defaults=True):
     unit: str = ""
 
 
-def problem(robot: ShownRobot, start: Triple, end: Triple, tool: Tool | None, frame: str) -> Obstacle | None:
+def problem(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | None, frame: str) -> Obstacle | None:
     """Return an obstacle on the line in pose space from one pose to another; None if none is known.
 
     `start` is the pose of the centre in the base frame, `end` that of the tool in a frame of the robot, x, y [m] and
@@ -83,7 +83,7 @@ class CheckedPath(Struct, frozen=True, omit_defaults=True):
     """Ratio of that duration to the requested one."""
 
 
-def checked_path(robot: ShownRobot, name: str, text: str, stretch: bool) -> CheckedPath:
+def checked_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> CheckedPath:
     """Parse a trajectory and plan it from its first point as the service would, which checks the whole path."""
     line: list[Triple] = []
     try:
