@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.errors import ServiceError
 from trirail.panel.recordings import Recordings
-from trirail.panel.server import LONGEST, Panel, refused
+from trirail.panel.server import MAX_MESSAGE, Panel, refused
 from waiting import WITHIN
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -251,7 +251,7 @@ def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, cap
     if end == "cut off":
         opened.socket.shutdown(socket.SHUT_RDWR)
     elif end == "too large":
-        opened.send("x" * (LONGEST + 1))
+        opened.send("x" * (MAX_MESSAGE + 1))
     else:
         opened.close()
     for thread in serving:

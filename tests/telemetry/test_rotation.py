@@ -384,7 +384,7 @@ def test_records_that_never_came_are_told_of(tmp_path: Path) -> None:
     feed(recording, np.delete(sent, slice(400, 460)), time)
     recording.close()
     assert len(told) == 1
-    assert told[0].endswith("60 cycles that the recorder was too slow for")
+    assert told[0].endswith("60 cycles (recorder too slow)")
 
 
 # ---------------------------------------------------------------------- the black box
@@ -481,7 +481,7 @@ def test_a_black_box_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
     blocked.write_text("")
     _, told = faulted(blocked / "x", 1.0, at=0.6, after=0.2)
     assert told[0].startswith("black box: the minute before the fault is not saved: cannot write a recording to")
-    assert told[0].endswith("Not a directory; telemetry.directory must be a folder that can be written")
+    assert told[0].endswith("Not a directory; set telemetry.directory to a folder that can be written")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
@@ -494,6 +494,6 @@ def test_where_the_disk_is_full_a_black_box_asks_for_room(
     monkeypatch.setattr("trirail.telemetry.rotation._try", full)
     _, told = faulted(tmp_path, 1.0, at=0.6, after=0.2)
     assert told[0].endswith(
-        f"{os.strerror(number)}; make room on that disk; telemetry.keep_mb bounds what recordings take of it"
+        f"{os.strerror(number)}; free some space on that disk; telemetry.keep_mb limits the size of all recordings"
     )
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Description of a robot for a tab, to draw it and to label its buttons, from the service's own information."""
+"""Description of a robot for a tab, which draws it and labels its buttons."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ MILLIMETRES: dict[str, Any] = {
 """Unit of lengths on the page, units per metre, and decimals of lengths and degrees; jog steps [m] and [°]."""
 
 
-def shown(info: Info) -> DrawnRobot:
-    """Return the robot that a service describes. Raises ServiceError if the service has another version."""
+def drawn_robot(info: Info) -> DrawnRobot:
+    """Return the robot of a service's information. Raises ServiceError if the service has another version."""
     try:
         return DrawnRobot.from_info(info)
     except (msgspec.ValidationError, ConfigError) as error:
-        raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
+        raise ServiceError(f"the service has another version, {info.version}: {error}") from error
 
 
 def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dict[str, Any]:
-    """Return the description, ready to encode, for a tab whose user has a role."""
+    """Return the description for a tab, ready to encode; `role` is that of the user."""
     parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {
