@@ -183,7 +183,7 @@ def test_commands_that_nobody_answers_are_bounded_and_hinder_no_stop(name: str) 
             refused = 0
             while refused < 2 * MAX_PENDING:
                 said = str(tab.recv(PATIENCE))
-                refused += '"refused"' in said and "wait for their answers" in said
+                refused += '"refused"' in said and "already waiting for replies" in said
             if name == "goto":
                 stop(tab)
         answered = 0

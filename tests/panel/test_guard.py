@@ -175,12 +175,12 @@ def test_it_listens_on_the_loopback_alone(panel: Panel) -> None:
 
 @pytest.mark.parametrize("port", [-1, 65536, 99999])
 def test_what_is_no_port_is_told(port: int) -> None:
-    with pytest.raises(ServiceError, match=f"port {port} cannot be listened on"):
+    with pytest.raises(ServiceError, match=f"port {port}: cannot listen"):
         Panel(FakeRobot().robot(), port)
 
 
 def test_a_port_that_is_taken_is_told() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(ServiceError, match="cannot be listened on"):
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(ServiceError, match="cannot listen"):
         Panel(FakeRobot().robot(), taken.getsockname()[1])
 
 
