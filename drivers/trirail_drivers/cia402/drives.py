@@ -313,7 +313,7 @@ class Cia402(Driver[Cia402Axis]):
         """Continue from the tables: see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._heartbeat_due = float(times["beat_due"])
-        self._wire.hand_in(self._tables.arrived, handled, arrived, error)
+        self._wire.return_frames(self._tables.arrived, handled, arrived, error)
         feedback = self._feedback()
         if synced is not None:
             self._synced = synced

@@ -207,7 +207,7 @@ class Odrive(Driver[OdriveAxis]):
         """Continue from the tables: see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._errors_due, self._next_request = float(times["beat_due"]), int(times["next_beat"])
-        self._wire.hand_in(self._tables.arrived, handled, arrived, error)
+        self._wire.return_frames(self._tables.arrived, handled, arrived, error)
         feedback = self._feedback()
         if synced is not None:
             self._synced = synced
