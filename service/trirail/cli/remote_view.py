@@ -26,8 +26,8 @@ from trirail.wire.state import Info, State
 HISTORY_MB = 256.0
 """Memory for what viewers that connect late are shown of the past; nothing else runs in this process [1e6 bytes]."""
 FIRST_RECORDS_TIMEOUT_S = 5.0
-"""How long the first records may take [s]."""
-MISSING = "missing so far: {} cycles on the way here, {} batches in this view (viewer too slow)"
+"""Time-out for the first records [s]."""
+MISSING = "missing data: {} cycles on the way here, {} batches in this view (viewer too slow)"
 
 
 class RemoteView:
@@ -49,7 +49,7 @@ class RemoteView:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
         self.url = server.uri
-        """Where viewers on this machine connect."""
+        """Address for viewers on this machine."""
         if len(self.robots) == 1:
             stream = self.robots[0].streams.open(server)
         else:
@@ -73,9 +73,9 @@ class RemoteView:
 
 
 class RemoteRobot:
-    """What comes of one robot, and its drawing. Raises ServiceError where no records come.
+    """Received data of one robot, and its drawing. Raises ServiceError if no records arrive.
 
-    The wall clock is this machine's at the first record, so it is late by the way through the network.
+    Wall-clock times are this machine's at the first record, so they are late by the network's delay.
     """
 
     def __init__(self, info: Info, session: zenoh.Session, name: str, root: str) -> None:

@@ -28,7 +28,7 @@ from trirail.wire.endpoints import is_local
 WEB_PORT = 9090
 """The web viewer's port, where it is free."""
 START_TIMEOUT_S = 20.0
-"""How long the web viewer may take to answer [s]."""
+"""Time-out for the start of the web viewer [s]."""
 
 
 def run(
@@ -88,7 +88,7 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
     if not info.live:
         raise ServiceError(
             "the service has no live view (telemetry.live_port = 0): "
-            "trirail view --records draws one here from what it publishes"
+            "trirail view --records draws one here from the published records"
         )
     parts = urlsplit(info.live)
     try:
