@@ -143,7 +143,7 @@ def _print(listed: list[RecordedSession], of: int) -> None:
         for line in filter(None, (*map(terminal.plain, session.files), _faults(session))):
             terminal.out.print(Padding(line, (0, 0, 0, 4)))
     sessions = terminal.counted(of, "session")
-    terminal.print_line(f"{len(listed)} of {listed}" if len(listed) < of else listed)
+    terminal.print_line(f"{len(listed)} of {sessions}" if len(listed) < of else sessions)
 
 
 def _lasted(session: RecordedSession) -> str:
