@@ -26,8 +26,8 @@ from trirail.motion.limits import Bounds
 from trirail.panel.description import describe
 from trirail.processes.publications import info
 from trirail.telemetry import curves, provenance, readout
-from trirail.telemetry.readout import Standing
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.wire.records import DTYPE
 from trirail.workspace.violations import violations
 from trirail_drivers.interface import NAMES
@@ -74,7 +74,7 @@ def test_nothing_that_people_read_of_a_stage_has_the_letter_of_a_slider(stage: s
     config = load(SIM.parent / f"{stage}.toml")
     labels, limits = config.geometry.labels, config.limits
     told = info(config)
-    robot = ShownRobot.of_info(msgspec.convert(msgspec.to_builtins(told), type(told)))
+    robot = DrawnRobot.from_info(msgspec.convert(msgspec.to_builtins(told), type(told)))
     said = [str(each) for each in violations(robot.geometry, limits, (0.02, 0.02, 0.02))]
     bounds = Bounds(limits, config.period, labels=robot.geometry.labels)
     for number, label in enumerate(labels):
@@ -87,14 +87,14 @@ def test_nothing_that_people_read_of_a_stage_has_the_letter_of_a_slider(stage: s
         inverse(robot.geometry, (0.0, 0.0, np.nan))
     said.append(str(wrong.value))
     said += [check.found + check.remedy for each in CONFIG_CHECKS for check in each.run(config)]
-    said.append(readout.markdown(np.zeros(1, DTYPE)[0], Standing(), labels))
+    said.append(readout.markdown(np.zeros(1, DTYPE)[0], ReadoutState(), labels))
     assert not [words for words in said if LETTER.search(words)]
     assert f"| {' | '.join(labels)} |" in said[-1]
     shown = describe(told, robot, "me", None)
     assert (shown["sliders"], shown["resolution"]["unit"]) == (labels, "µm")
     drawn = curves.plots(robot)[curves.POSITION].moving
     assert tuple(line.name for line in drawn) == labels
-    assert provenance.labels(provenance.texts(config)) == labels
+    assert provenance.labels(provenance.text_documents(config)) == labels
     assert provenance.labels({}) == NAMES
     assert live.limits_of(told) == limits
 

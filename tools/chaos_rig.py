@@ -23,7 +23,7 @@ from trirail.errors import EmptyRecordingError, ServiceError, TrirailError
 from trirail.processes.operating_system import child
 from trirail.telemetry.reading import read
 from trirail.telemetry.recording import Recording
-from trirail.telemetry.sinks import HOST, free_port
+from trirail.telemetry.sinks import LOOPBACK, free_port
 from trirail.wire.state import State
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import canopen_frames
@@ -98,7 +98,7 @@ class Rig:
         zenoh, live = self.ports
         changes = CHANGES | {
             "interface": f'"unix"\nchannel = "{self.bus_path}"',
-            "listen": f'["tcp/{HOST}:{zenoh}"]',
+            "listen": f'["tcp/{LOOPBACK}:{zenoh}"]',
             "live_port": str(live),
             "directory": f'"{self.folder}/recordings"',
         }
@@ -129,7 +129,7 @@ class Rig:
     @property
     def locator(self) -> str:
         """Locator of the service."""
-        return f"tcp/{HOST}:{self.ports[0]}"
+        return f"tcp/{LOOPBACK}:{self.ports[0]}"
 
     def robot(self) -> Robot:
         """Return a client."""
@@ -214,7 +214,7 @@ class Rig:
             with socket.socket() as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 try:
-                    probe.bind((HOST, port))
+                    probe.bind((LOOPBACK, port))
                 except OSError:
                     return False
         return True

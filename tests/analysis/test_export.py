@@ -138,7 +138,7 @@ def test_columns_are_names_of_fields_or_words_of_these(recording: Recording) -> 
     assert recordings.table(recording, ["error", "following_error"]).num_columns == 4
     with pytest.raises(ServiceError, match=r"no column poze: did you mean pose\?"):
         recordings.table(recording, ["poze"])
-    with pytest.raises(ServiceError, match="no column torque: a word of these was expected: wall, mode, cycle"):
+    with pytest.raises(ServiceError, match="no column torque: expected one of, or a word in: wall, mode, cycle"):
         recordings.table(recording, ["torque"])
 
 

@@ -24,7 +24,7 @@ from ports import free_port
 from rerun.chunk import Chunk, RrdReader
 from trirail.cli import view
 from trirail.config import SIM, load
-from trirail.telemetry.readout import Standing
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.endpoints import is_local
 from waiting import wait_until
@@ -56,7 +56,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "made.rrd"
     recorder = Recorder(load(SIM), path.parent, path=path, live=False)
     recorder.bus_load(0.75)
-    recorder.stands(Standing("g-1", (0.05, 0.02, 0.3)))
+    recorder.update_state(ReadoutState("g-1", (0.05, 0.02, 0.3)))
     records = made.records(10.0)
     for start in range(0, len(records), 50):
         recorder.records(records[start : start + 50].tobytes())

@@ -73,7 +73,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 def test_a_recording_holds_the_map_itself(tmp_path: Path) -> None:
     config = load(robot_file(tmp_path, format_map(a_map()).encode(), BOTH))
     (tmp_path / "as_built.toml").unlink()
-    again = provenance.configuration(provenance.texts(config))
+    again = provenance.configuration(provenance.text_documents(config))
     assert again == config
     assert msgspec.json.decode(msgspec.json.encode(config), type=Config) == config
 

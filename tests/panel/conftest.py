@@ -8,7 +8,7 @@ import pytest
 from chromium import Page, chromium
 from panel.fake_robot import FakeRobot
 from trirail.client import held_jog
-from trirail.panel import orders, tab
+from trirail.panel import tab, tab_requests
 from trirail.panel.server import Panel
 
 SHOWN = "document.body.dataset.contact === 'yes'"
@@ -51,6 +51,6 @@ def enabled(page: Page, robot: FakeRobot) -> Page:
 def slow_hand(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Take a hand's signs that come late: on a busy machine a browser says no more than it is given the time for."""
     monkeypatch.setattr(held_jog, "TIMEOUT", 2.0)
-    for module in (tab, orders):
-        monkeypatch.setattr(module, "FRESH", 5000)
+    for module in (tab, tab_requests):
+        monkeypatch.setattr(module, "MAX_STATE_AGE_MS", 5000)
     panel._files["hold.js"] = panel._files["hold.js"].replace(b"HUNG = 180;", b"HUNG = 1800;")

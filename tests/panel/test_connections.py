@@ -19,9 +19,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
-from trirail.panel.connections import ASKING, TABS
-from trirail.panel.orders import UNDER_WAY
+from trirail.panel.connections import MAX_REQUESTS, MAX_TABS
 from trirail.panel.server import Panel
+from trirail.panel.tab_requests import MAX_PENDING
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -105,7 +105,7 @@ WAYS = st.sampled_from(["bare", "half", "deaf", "junk", "let go"])
 
 
 @settings(max_examples=15)
-@given(st.lists(st.tuples(WAYS, st.integers(1, 2 * ASKING)), min_size=1, max_size=6))
+@given(st.lists(st.tuples(WAYS, st.integers(1, 2 * MAX_REQUESTS)), min_size=1, max_size=6))
 def test_whatever_is_held_the_page_is_served_and_an_open_tab_stops(
     panel: Served, tab: ClientConnection, turns: list[tuple[str, int]]
 ) -> None:
@@ -152,7 +152,7 @@ def test_it_serves_again_when_there_are_descriptors_again() -> None:
 def test_more_tabs_than_there_may_be_are_refused_in_a_sentence() -> None:
     with Panel(FakeRobot().robot(), 0) as inside, contextlib.ExitStack() as tabs:
         url = f"{inside.url.replace('http', 'ws')}socket"
-        opened = [tabs.enter_context(connect(url, legacy=True)) for _ in range(TABS)]
+        opened = [tabs.enter_context(connect(url, legacy=True)) for _ in range(MAX_TABS)]
         with pytest.raises(InvalidStatus) as refusal, connect(url, legacy=True):
             pass
         assert refusal.value.response.status_code == 503
@@ -178,16 +178,16 @@ def test_commands_that_nobody_answers_are_bounded_and_hinder_no_stop(name: str) 
     ask = {"stop": '{"do": "command", "name": "stop"}', "goto": goto}[name]
     with Panel(robot.robot(), 0) as inside, connect(f"{inside.url.replace('http', 'ws')}socket", legacy=True) as tab:
         with robot.hanging({"stop": "stop", "goto": "goal"}[name]):
-            for _ in range(3 * UNDER_WAY):
+            for _ in range(3 * MAX_PENDING):
                 tab.send(ask)
             refused = 0
-            while refused < 2 * UNDER_WAY:
+            while refused < 2 * MAX_PENDING:
                 said = str(tab.recv(PATIENCE))
-                refused += '"refused"' in said and "wait for their answers" in said
+                refused += '"refused"' in said and "already waiting for replies" in said
             if name == "goto":
                 stop(tab)
         answered = 0
-        while answered < UNDER_WAY:
+        while answered < MAX_PENDING:
             said = str(tab.recv(PATIENCE))
             answered += '"done","to":"stop"' in said or '"accepted","to":"named"' in said
-    assert len(robot.gone_to) == (UNDER_WAY if name == "goto" else 0)
+    assert len(robot.gone_to) == (MAX_PENDING if name == "goto" else 0)

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.errors import ServiceError
 from trirail.panel.recordings import Recordings
-from trirail.panel.server import LONGEST, Panel, refused
+from trirail.panel.server import MAX_MESSAGE, Panel, refused
 from waiting import WITHIN
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -175,12 +175,12 @@ def test_it_listens_on_the_loopback_alone(panel: Panel) -> None:
 
 @pytest.mark.parametrize("port", [-1, 65536, 99999])
 def test_what_is_no_port_is_told(port: int) -> None:
-    with pytest.raises(ServiceError, match=f"port {port} cannot be listened on"):
+    with pytest.raises(ServiceError, match=f"port {port}: cannot listen"):
         Panel(FakeRobot().robot(), port)
 
 
 def test_a_port_that_is_taken_is_told() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(ServiceError, match="cannot be listened on"):
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(ServiceError, match="cannot listen"):
         Panel(FakeRobot().robot(), taken.getsockname()[1])
 
 
@@ -251,7 +251,7 @@ def test_a_tab_that_goes_in_whatever_way_is_no_error(panel: Panel, end: str, cap
     if end == "cut off":
         opened.socket.shutdown(socket.SHUT_RDWR)
     elif end == "too large":
-        opened.send("x" * (LONGEST + 1))
+        opened.send("x" * (MAX_MESSAGE + 1))
     else:
         opened.close()
     for thread in serving:

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.config import SIM, FramesTable, load
 from trirail.motion.runs import centre_motion, rest
-from trirail.panel.path_check import CheckedPath, checked_path, problem
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.panel.path_check import CheckedPath, check_path, find_obstacle
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.workspace.violations import violations
 
 TIP, TABLE = (0.02, 0.03), (0.05, 0.02, 0.3)
 FRAMES = FramesTable(tool={"tip": TIP}, work={"table": TABLE})
-CONFIGURED = ShownRobot.configured(load(SIM))
-ROBOT = ShownRobot(CONFIGURED.name, CONFIGURED.geometry, CONFIGURED.limits, CONFIGURED.rate_hz, FRAMES)
+CONFIGURED = DrawnRobot.from_config(load(SIM))
+ROBOT = DrawnRobot(CONFIGURED.name, CONFIGURED.geometry, CONFIGURED.limits, CONFIGURED.rate_hz, FRAMES)
 ZERO = (0.0, 0.0, 0.0)
 place = st.floats(-0.2, 0.2)
 
@@ -31,11 +31,11 @@ def test_a_pose_that_is_out_of_reach_is_never_called_free(
     c, s = math.cos(angle), math.sin(angle)
     of_point = x + c * pose[0] - s * pose[1], y + s * pose[0] + c * pose[1], angle + pose[2]
     centre = centre_motion(rest(of_point), TIP if tool else (0.0, 0.0)).pose
-    found = problem(ROBOT, ZERO, pose, tool, frame)
+    found = find_obstacle(ROBOT, ZERO, pose, tool, frame)
     reached = not violations(ROBOT.geometry, ROBOT.limits, np.array(centre))
     assert reached or (found and not found.on_way)
-    assert problem(ROBOT, ZERO, pose, "no such", frame)
-    assert problem(ROBOT, ZERO, pose, tool, "no such")
+    assert find_obstacle(ROBOT, ZERO, pose, "no such", frame)
+    assert find_obstacle(ROBOT, ZERO, pose, tool, "no such")
 
 
 rows = st.lists(st.lists(st.one_of(st.floats(-2.0, 2.0).map(str), st.text(max_size=5)), max_size=6).map(",".join))
@@ -44,7 +44,7 @@ texts = st.one_of(st.text(), rows.map(lambda lines: "\n".join(["t,x,y,phi", *lin
 
 @given(st.sampled_from(["a.csv", "a.json", "", "…"]), texts, st.booleans())
 def test_whatever_is_in_a_file_comes_to_an_answer(name: str, text: str, stretch: bool) -> None:
-    found = checked_path(ROBOT, name, text, stretch)
+    found = check_path(ROBOT, name, text, stretch)
     assert isinstance(found, CheckedPath)
     assert found.why or (found.duration > 0.0 and len(found.line) > 2)
 
@@ -52,7 +52,7 @@ def test_whatever_is_in_a_file_comes_to_an_answer(name: str, text: str, stretch:
 @given(st.lists(st.tuples(place, place, st.floats(-0.6, 0.6)), min_size=1, max_size=6), st.booleans())
 def test_a_path_that_is_called_free_stays_in_reach(poses: list[tuple[float, float, float]], stretch: bool) -> None:
     lines = [f"{k},{x},{y},{phi}" for k, (x, y, phi) in enumerate([ZERO, *poses])]
-    found = checked_path(ROBOT, "path.csv", "\n".join(["t,x,y,phi", *lines]), stretch)
+    found = check_path(ROBOT, "path.csv", "\n".join(["t,x,y,phi", *lines]), stretch)
     if found.why:
         return
     assert found.line[0] == ZERO

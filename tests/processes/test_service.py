@@ -767,7 +767,7 @@ def test_a_recording_that_suffers_is_told_to_everyone(service: Service) -> None:
         in_motion(robot, speed=0.2)
         recorder = service.child("recorder")
         resource.prlimit(recorder, resource.RLIMIT_FSIZE, (50_000, 50_000))  # more than the log has, less than a second
-        told(robot, lambda heard: heard[-1].level == "warning" and "takes no more" in heard[-1].message)
+        told(robot, lambda heard: heard[-1].level == "warning" and "cannot be written" in heard[-1].message)
         until(robot, lambda state: any("nothing is recorded" in warning for warning in state.warnings))
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
     service.end()

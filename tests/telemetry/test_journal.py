@@ -19,8 +19,8 @@ STOP = ControlInput(4, 1300, 5_050_000_000, CommandRequest(2, "ann", Command.STO
 
 def test_lines_of_one_log_are_one_chunk_with_their_own_times() -> None:
     remark = Entry(EVENTS, 1.5, SAID * 1e-9 + 0.25, "a word", "error")
-    given = [journal.control_input(what, 1000, 1_000_000_000) for what in (GOAL, STOP)]
-    events, requests = journal.chunks([journal.said(EVENT), given[0], remark, given[1]])
+    given = [journal.input_entry(what, 1000, 1_000_000_000) for what in (GOAL, STOP)]
+    events, requests = journal.chunks([journal.event_entry(EVENT), given[0], remark, given[1]])
     assert (events.entity_path, requests.entity_path) == (EVENTS, REQUESTS)
     batch = events.to_record_batch()
     assert batch.column("TextLog:text").to_pylist() == [["    1.250 s   goal g expired"], ["    1.500 s   a word"]]

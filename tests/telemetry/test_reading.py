@@ -23,10 +23,10 @@ from trirail.config import SIM, load
 from trirail.errors import EmptyRecordingError, ServiceError
 from trirail.telemetry import journal, reading
 from trirail.telemetry.columns import FIELDS, RECORD, Column, Timelines, chunks, structs
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.reading import OlderRecordingWarning, read
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.scene import Scene
-from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.messages import Event
 from trirail.wire.records import DTYPE
 
@@ -109,7 +109,7 @@ def test_texts_that_hold_for_the_whole_session_come_by_entity(tmp_path: Path) ->
     stream.save(path)
     stream.log("config", rr.TextDocument("[robot]\nname = 'x'"), static=True)
     stream.log("passing", rr.TextDocument("not for the whole session"))
-    stream.send_chunks(Scene(ShownRobot.configured(load(SIM)), 0).complete(made.records(0.1)))
+    stream.send_chunks(Scene(DrawnRobot.from_config(load(SIM)), 0).complete(made.records(0.1)))
     stream.disconnect()
     recording = read(path)
     assert recording.texts == {"/config": "[robot]\nname = 'x'"}
@@ -224,7 +224,7 @@ def test_records_of_another_version_are_refused_by_field(tmp_path: Path, layout:
     path, other = tmp_path / "a.rrd", np.zeros(10, layout)
     stream = rr.RecordingStream("trirail")
     stream.save(path)
-    stream.send_chunks(chunks(Timelines(1000, 0).of(other), [Column(RECORD, FIELDS, structs(other))]))
+    stream.send_chunks(chunks(Timelines(1000, 0).for_records(other), [Column(RECORD, FIELDS, structs(other))]))
     stream.disconnect()
     with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its records differ in {differs}$"):
         read(path)
@@ -240,7 +240,7 @@ def test_fields_that_an_older_version_did_not_write_read_as_nothing(lacking: set
         stream = rr.RecordingStream("trirail")
         stream.save(path)
         columns = [Column(RECORD, FIELDS, structs(sent[there]))] if there else []
-        stream.send_chunks(chunks(Timelines(1000, 0).of(sent), columns))
+        stream.send_chunks(chunks(Timelines(1000, 0).for_records(sent), columns))
         stream.disconnect()
         if "cycle" in lacking:
             with pytest.raises(ServiceError):
@@ -263,10 +263,10 @@ def test_events_and_requests_of_another_version_are_refused(tmp_path: Path, log:
     stream = rr.RecordingStream("trirail")
     stream.save(path)
     columns = [Column(RECORD, FIELDS, structs(sent))]
-    stream.send_chunks(chunks(Timelines(1000, 0).of(sent), columns))
+    stream.send_chunks(chunks(Timelines(1000, 0).for_records(sent), columns))
     said = [Column(f"/{log}", kind, pa.array([["?"]])) for kind in (journal.TEXT, journal.LEVEL, journal.WORDS)]
     said.append(Column(f"/{log}", journal.JSON, pa.array([['{"seq": 1, "omen": "dark"}']])))
-    stream.send_chunks(chunks(Timelines(1000, 0).of(sent[:1]), said))
+    stream.send_chunks(chunks(Timelines(1000, 0).for_records(sent[:1]), said))
     stream.disconnect()
     with pytest.raises(ServiceError, match=rf"a\.rrd: written by another version: its {log} cannot be read: "):
         read(path)
@@ -279,10 +279,10 @@ def test_events_and_requests_that_lack_a_column_are_refused_by_its_name(tmp_path
     path, sent = tmp_path / "a.rrd", made.records(0.1)
     stream = rr.RecordingStream("trirail")
     stream.save(path)
-    stream.send_chunks(chunks(Timelines(1000, 0).of(sent), [Column(RECORD, FIELDS, structs(sent))]))
+    stream.send_chunks(chunks(Timelines(1000, 0).for_records(sent), [Column(RECORD, FIELDS, structs(sent))]))
     kinds = [kind for kind in (journal.TEXT, journal.LEVEL, journal.WORDS, journal.JSON) if kind is not lacks]
     said = [Column(f"/{log}", kind, pa.array([["?"]])) for kind in kinds]
-    stream.send_chunks(chunks(Timelines(1000, 0).of(sent[:1]), said))
+    stream.send_chunks(chunks(Timelines(1000, 0).for_records(sent[:1]), said))
     stream.disconnect()
     with pytest.raises(
         ServiceError, match=rf"a\.rrd: written by another version: its {log} have no {lacks.component}$"

@@ -20,8 +20,8 @@ from rerun.error_utils import RerunWarning
 from trirail.config import SIM, load
 from trirail.processes.operating_system import python
 from trirail.telemetry import readout
-from trirail.telemetry.readout import Standing
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.sinks import live_relay, live_server
 from trirail.telemetry.streams import Streams
 from trirail.wire.vocabulary import MODES, Mode
@@ -34,16 +34,16 @@ def test_it_says_mode_goal_pose_sliders_and_what_is_wrong() -> None:
     record["pose"] = 0.0123456, -0.02, np.radians(12.5)
     record["position"] = 0.001, -0.0025, 0.1
     record["progress"], record["remaining"] = 0.4, 0.71
-    said = readout.markdown(record, Standing("g-1", (0.03, 0.0, 0.5), 0.5, "drive B: EMCY 8700"))
+    said = readout.markdown(record, ReadoutState("g-1", (0.03, 0.0, 0.5), 0.5, "drive B: EMCY 8700"))
     assert "**FAULT**   override 50%   goal **g\\-1**: 40%, 0.7 s left" in said
-    assert "40%, waits half-way" in readout.markdown(record, Standing("g-1", override=0.0))
+    assert "40%, waits half-way" in readout.markdown(record, ReadoutState("g-1", override=0.0))
     record["mode"] = MODES.index(Mode.HOLDING)
-    assert "40%, waits half-way" in readout.markdown(record, Standing("g-1"))
+    assert "40%, waits half-way" in readout.markdown(record, ReadoutState("g-1"))
     record["mode"] = MODES.index(Mode.FAULT)
     assert "**drive B\\: EMCY 8700**" in said
     assert "| measured | 12.346 | -20.000 | 12.500 | λ [mm] | 1.000 | -2.500 | 100.000 |" in said
     assert "| goal | 30.000 | 0.000 | 28.648 |" in said
-    assert "| goal | – | – | – |" in readout.markdown(record, Standing())
+    assert "| goal | – | – | – |" in readout.markdown(record, ReadoutState())
 
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1)
@@ -52,7 +52,7 @@ WORDS = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1)
 @given(WORDS, WORDS)
 def test_what_clients_and_drives_wrote_is_shown_as_it_is(goal: str, fault: str) -> None:
     """By a parser of Markdown that others wrote: no link, no picture, no table comes of a goal's id."""
-    said = readout.markdown(RECORD, Standing(goal, None, 1.0, fault))
+    said = readout.markdown(RECORD, ReadoutState(goal, None, 1.0, fault))
     tokens = MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(said)
     inline = [token for token in tokens if token.type == "inline"]
     assert "".join(child.content for child in inline[1].children or ()) == fault
@@ -62,7 +62,7 @@ def test_what_clients_and_drives_wrote_is_shown_as_it_is(goal: str, fault: str) 
 
 def test_a_viewer_that_joins_late_is_sent_the_present_first(tmp_path: Path) -> None:
     port, saved, batches = free_port(), tmp_path / "seen.rrd", 100
-    streams = Streams(ShownRobot.configured(load(SIM)), "late", 0)
+    streams = Streams(DrawnRobot.from_config(load(SIM)), "late", 0)
     relay = live_relay(streams.open(live_server(port, 64.0)))
     streams.attach(relay, 5)
     for number, batch in enumerate(np.split(made.records(20.0), batches)):

@@ -22,9 +22,9 @@ from rerun.chunk import Chunk, RrdReader
 from trirail.config import SIM, Config, load
 from trirail.errors import ServiceError
 from trirail.telemetry.candump import CandumpLog
-from trirail.telemetry.readout import Standing
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
-from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import BACKLOG, RESERVE, Archive, Relay, is_watched
 from trirail.telemetry.streams import Streams
 from trirail.wire.messages import Event
@@ -198,7 +198,7 @@ def test_a_full_disk_is_counted_and_said_and_recording_goes_on(tmp_path: Path, m
     assert recording.lost > 0
     (level, text), *_ = reversed(lines(recording.path))
     assert level == "WARN"
-    assert text.startswith(f"missing so far: {recording.lost} batches in the file")
+    assert text.startswith(f"missing data: {recording.lost} batches in the file")
 
 
 def test_a_stuck_disk_is_left_alone_until_it_answers() -> None:
@@ -280,7 +280,7 @@ PLATFORM = "/robot/platform"
 
 
 def test_sinks_of_one_pace_share_their_drawings_and_a_change_of_pace_loses_none() -> None:
-    streams = Streams(ShownRobot.configured(configured()), "shown", 0)
+    streams = Streams(DrawnRobot.from_config(configured()), "shown", 0)
     file, live = Kept(), Kept()
     streams.attach(file, 1)
     records = made.records(6.0)
@@ -315,7 +315,7 @@ def test_a_live_view_is_drawn_for_only_while_somebody_watches(tmp_path: Path, mo
     drawn: list[int] = []
     draw = recording._streams.scene.drawn
 
-    def counted(records: NDArray[np.void], standing: Standing) -> list[Chunk]:
+    def counted(records: NDArray[np.void], standing: ReadoutState) -> list[Chunk]:
         drawn.append(len(records))
         return draw(records, standing)
 
@@ -394,7 +394,7 @@ def test_a_batch_of_frames_that_the_disk_takes_in_part_leaves_no_part(tmp_path: 
         log.write(batch)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert (log.lost, log.trouble) == (1, f"{tmp_path / 'x.log'} takes no more: No space left on device")
+    assert (log.lost, log.trouble) == (1, f"{tmp_path / 'x.log'} cannot be written: No space left on device")
     log.write(batch)
     log.close()
     assert (log.lost, log.trouble) == (1, "")

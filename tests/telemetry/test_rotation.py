@@ -27,10 +27,10 @@ from trirail.processes import loop
 from trirail.processes.recording import GATHER
 from trirail.processes.reports import BATCHES_PER_SECOND
 from trirail.telemetry import blackbox, provenance, retention
-from trirail.telemetry.blackbox import AFTER, BEFORE, BlackBox
+from trirail.telemetry.blackbox import AFTER_S, BEFORE_S, BlackBox
 from trirail.telemetry.provenance import SOFTWARE
 from trirail.telemetry.reading import join, read
-from trirail.telemetry.readout import Standing
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.recording import Recording
 from trirail.telemetry.rotation import RETRY
@@ -149,8 +149,8 @@ def test_a_folder_that_cannot_be_made_again_is_said_and_tried_again(tmp_path: Pa
     feed(recording, sent[30_000:], time)
     assert recording.unrecorded == ("", "")
     recording.close()
-    assert f"the recording goes on in {recording.path}" in told[1]
-    assert told[2].startswith(f"recorded again; missing so far: {recording.lost} batches")
+    assert f"the recording continues in {recording.path}" in told[1]
+    assert told[2].startswith(f"recorded again; missing data: {recording.lost} batches")
     assert len(told) == 3
     assert read(recording.path).records["cycle"][-1] == len(sent) - 1
 
@@ -316,7 +316,7 @@ def test_a_full_disk_is_told_of_once_and_once_when_it_is_well_again(
     recording.close()
     assert [words.partition(":")[0] for words in told] == [
         "nothing is recorded",
-        "recorded again; missing so far",
+        "recorded again; missing data",
     ]
     assert f"{tmp_path} is full: 10 MB are free" in told[0]
     assert f"{recording.lost} batches in the file" in told[1]
@@ -338,7 +338,7 @@ late = sent[3900:].copy()
 late["deadline_ns"] += int((RETRY + 10.0) * 1e9)
 here.feed(recording, late, time)
 recording.close()
-assert "takes no more" in told[0], (told, os._exit(1))
+assert "cannot be written" in told[0], (told, os._exit(1))
 print(recording.path, flush=True)
 os._exit(0)
 """
@@ -384,7 +384,7 @@ def test_records_that_never_came_are_told_of(tmp_path: Path) -> None:
     feed(recording, np.delete(sent, slice(400, 460)), time)
     recording.close()
     assert len(told) == 1
-    assert told[0].endswith("60 cycles that the recorder was too slow for")
+    assert told[0].endswith("60 cycles (recorder too slow)")
 
 
 # ---------------------------------------------------------------------- the black box
@@ -397,7 +397,7 @@ def faulted(folder: Path, seconds: float, at: float, after: float) -> tuple[list
     box = BlackBox(1000, lambda name, _: recorder(folder, time, config, name=name), lambda text: told.append(text.text))
     sent = made.records(seconds)
     cycle = round(at * 1000)
-    box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
+    box.latch("update_state", ReadoutState(None, (0.01, 0.02, 0.1)))
     feed(box, sent[: cycle - 500], time)
     box.control_input(goal(cycle - 500))
     feed(box, sent[cycle - 500 : cycle], time)
@@ -418,8 +418,8 @@ def test_a_fault_keeps_the_minute_before_and_the_stop(tmp_path: Path) -> None:
     assert path.name.startswith("fault-2026112")
     cycles = box.records["cycle"]
     assert np.all(np.diff(cycles) == 1)
-    assert cycles[0] <= 65_000 - BEFORE * 1000
-    assert cycles[-1] >= 65_000 + AFTER * 1000 - 1
+    assert cycles[0] <= 65_000 - BEFORE_S * 1000
+    assert cycles[-1] >= 65_000 + AFTER_S * 1000 - 1
     assert [line.text for line in box.events] == ["drive B: emergency 4310", "fault: drive B: emergency 4310"]
     assert box.requests == (goal(64_500),)
     assert provenance.configuration(box.texts) == configured(rotate_mb=1.0, capture_can=True)
@@ -428,12 +428,12 @@ def test_a_fault_keeps_the_minute_before_and_the_stop(tmp_path: Path) -> None:
 
 
 def test_a_flood_of_messages_before_a_fault_leaves_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blackbox, "SAID_MB", 0.05)
+    monkeypatch.setattr(blackbox, "MAX_MESSAGES_MB", 0.05)
     time, told = Time(), list[str]()
     box = BlackBox(
         1000, lambda name, _: recorder(tmp_path, time, configured(), name=name), lambda text: told.append(text.text)
     )
-    box.stands("stands", Standing(None, (0.01, 0.02, 0.1)))
+    box.latch("update_state", ReadoutState(None, (0.01, 0.02, 0.1)))
     sent = made.records(3.0)
     for number in range(100):
         feed(box, sent[20 * number :][:20], time)
@@ -455,9 +455,9 @@ def test_a_flood_of_messages_before_a_fault_leaves_the_newest(tmp_path: Path, mo
     *flood, fault = (line.text for line in read(path).events)
     assert fault == "drive B: emergency 4310"
     assert flood == [f"{number:04}" * 50 for number in range(100) for _ in range(5)][-len(flood) :]
-    assert 40 < len(flood) < 50_000 / (blackbox.OVERHEAD + 200)
+    assert 40 < len(flood) < 50_000 / (blackbox.MESSAGE_OVERHEAD + 200)
     assert len(read(path).records) == 2000
-    assert "too much was said for the black box" in told[0]
+    assert "black box: messages exceed" in told[0]
 
 
 def test_a_service_that_ends_right_after_a_fault_keeps_it_too(tmp_path: Path) -> None:
@@ -480,8 +480,8 @@ def test_a_black_box_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     _, told = faulted(blocked / "x", 1.0, at=0.6, after=0.2)
-    assert told[0].startswith("the last minute before the fault is not kept: cannot write a recording to")
-    assert told[0].endswith("Not a directory; telemetry.directory must be a folder that can be written")
+    assert told[0].startswith("black box: the minute before the fault is not saved: cannot write a recording to")
+    assert told[0].endswith("Not a directory; set telemetry.directory to a folder that can be written")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
@@ -494,6 +494,6 @@ def test_where_the_disk_is_full_a_black_box_asks_for_room(
     monkeypatch.setattr("trirail.telemetry.rotation._try", full)
     _, told = faulted(tmp_path, 1.0, at=0.6, after=0.2)
     assert told[0].endswith(
-        f"{os.strerror(number)}; make room on that disk; telemetry.keep_mb bounds what recordings take of it"
+        f"{os.strerror(number)}; free some space on that disk; telemetry.keep_mb limits the size of all recordings"
     )
     assert list(tmp_path.iterdir()) == []

@@ -15,9 +15,9 @@ from rerun.chunk import Chunk
 from trirail.config import SIM, FramesTable, LegTable, load
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.processes.publications import info
-from trirail.telemetry.readout import Standing
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.scene import Scene
-from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.records import DTYPE
 from trirail.wire.state import Info
 from trirail.wire.vocabulary import MODES, Mode
@@ -38,7 +38,7 @@ GENERAL = Geometry(
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene(ShownRobot.configured(CONFIG), WALL_OFFSET_NS)
+    return Scene(DrawnRobot.from_config(CONFIG), WALL_OFFSET_NS)
 
 
 def by_entity(chunks: list[Chunk]) -> dict[str, Chunk]:
@@ -73,7 +73,7 @@ def test_sliders_are_drawn_on_their_rail_and_on_their_edge(geometry: Geometry) -
     records["pose"], records["position"] = records["commanded_pose"], records["commanded_position"]
     parts = RobotParts.from_geometry(geometry, CONFIG.limits.slider)
     config = _with_geometry(geometry)
-    drawn = by_entity(Scene(ShownRobot.configured(config), 0).drawn(records, Standing()))
+    drawn = by_entity(Scene(DrawnRobot.from_config(config), 0).drawn(records, ReadoutState()))
 
     points = values(drawn["/robot/sliders"], "Points2D:positions")
     centre = values(drawn["/robot/platform"], "Transform3D:translation")[:, 0, :2]
@@ -121,7 +121,7 @@ def test_curves_are_in_the_units_of_people(scene: Scene) -> None:
     records = made.records(0.5)
     slider = CONFIG.limits.slider
     records["position"][9] = *slider.positions[0], 0.0
-    drawn = by_entity(scene.drawn(records, Standing()))
+    drawn = by_entity(scene.drawn(records, ReadoutState()))
     newest = records[9::10]
     position = values(drawn["/sliders/position"], "Scalars:scalars")
     assert position[:, :3] == pytest.approx(newest["position"] * 1e3)
@@ -136,7 +136,7 @@ def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
     records = made.records(0.5)
     records["following_error"][123] = [-2e-3, 1e-3, 0.0]
     records["lateness_ns"][271] = 5_000_000
-    drawn = by_entity(scene.drawn(records, Standing()))
+    drawn = by_entity(scene.drawn(records, ReadoutState()))
     error = values(drawn["/sliders/following_error"], "Scalars:scalars")
     assert error[12, :2] == pytest.approx([-2000.0, 1000.0])
     timing = values(drawn["/loop/timing"], "Scalars:scalars")
@@ -145,14 +145,20 @@ def test_no_spike_is_lost_to_thinning(scene: Scene) -> None:
 
 def test_a_gap_in_the_cycles_is_a_gap_in_time(scene: Scene) -> None:
     records = np.concatenate([made.records(0.1)[:33], made.records(0.1)[58:]])
-    t = by_entity(scene.drawn(records, Standing()))["/pose/phi"].to_record_batch().column("t").to_numpy().astype(int)
+    t = (
+        by_entity(scene.drawn(records, ReadoutState()))["/pose/phi"]
+        .to_record_batch()
+        .column("t")
+        .to_numpy()
+        .astype(int)
+    )
     assert np.array_equal(t // 1_000_000, [9, 19, 29, 32, 59, 69, 79, 89, 99])
 
 
 def test_modes_are_said_when_they_change_and_at_the_start_of_a_batch(scene: Scene) -> None:
     records = made.records(0.1)
     records["mode"][40:] = MODES.index(Mode.STOPPING)
-    mode = by_entity(scene.drawn(records, Standing()))["/mode"]
+    mode = by_entity(scene.drawn(records, ReadoutState()))["/mode"]
     assert values(mode, "StateChange:state").tolist() == [["moving"], ["stopping"]]
     t = mode.to_record_batch().column("t").to_numpy().astype(int)
     assert np.array_equal(t, [0, 40_000_000])
@@ -201,17 +207,21 @@ def test_the_distance_to_singularity_is_that_of_the_mathematics() -> None:
 
 def test_limits_of_the_following_error_come_into_view_with_it(scene: Scene) -> None:
     records = made.records(0.1)
-    limits = values(by_entity(scene.drawn(records, Standing()))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
+    limits = values(by_entity(scene.drawn(records, ReadoutState()))["/sliders/following_error"], "Scalars:scalars")[
+        :, 3:
+    ]
     assert np.isnan(limits.astype(float)).all()
     records["following_error"][50, 1] = 3.5e-3
-    limits = values(by_entity(scene.drawn(records, Standing()))["/sliders/following_error"], "Scalars:scalars")[:, 3:]
+    limits = values(by_entity(scene.drawn(records, ReadoutState()))["/sliders/following_error"], "Scalars:scalars")[
+        :, 3:
+    ]
     assert np.isnan(limits[:, 0].astype(float)).all()
     assert np.all(limits[:, 1] == 4000.0)
 
 
 def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() -> None:
     answered = msgspec.json.decode(msgspec.json.encode(info(CONFIG)), type=Info)
-    told, configured = ShownRobot.of_info(answered), ShownRobot.configured(CONFIG)
+    told, configured = DrawnRobot.from_info(answered), DrawnRobot.from_config(CONFIG)
     assert (told.name, told.limits, told.rate_hz) == (configured.name, configured.limits, configured.rate_hz)
     assert told.geometry.legs == configured.geometry.legs
 
@@ -219,7 +229,7 @@ def test_a_robot_is_the_same_by_its_configuration_and_by_its_services_words() ->
 def test_tools_and_work_frames_are_drawn_with_their_names_as_a_service_tells_them() -> None:
     frames = FramesTable(tool={"camera": (0.03, -0.02)}, work={"part": (0.05, 0.01, math.pi / 2.0)})
     told = msgspec.json.decode(msgspec.json.encode(info(msgspec.structs.replace(CONFIG, frames=frames))), type=Info)
-    drawn = dict(Scene(ShownRobot.of_info(told), WALL_OFFSET_NS).still())
+    drawn = dict(Scene(DrawnRobot.from_info(told), WALL_OFFSET_NS).still())
     tools, part = drawn["/robot/platform/tools"], drawn["/robot/frames/part"]
     assert isinstance(tools, rr.Points2D)
     assert isinstance(part, rr.LineStrips2D)

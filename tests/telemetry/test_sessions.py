@@ -20,10 +20,10 @@ from trirail.config import SIM, Config, load
 from trirail.telemetry import contents, retention
 from trirail.telemetry import sessions as found_sessions
 from trirail.telemetry.blackbox import BlackBox
-from trirail.telemetry.contents import Contents, FaultEntry, of_file
+from trirail.telemetry.contents import Contents, FaultEntry, read_contents
 from trirail.telemetry.recorder import Recorder
 from trirail.telemetry.retention import sidecar
-from trirail.telemetry.sessions import RecordedSession, Wanted, find, recorded
+from trirail.telemetry.sessions import RecordedSession, SessionFilter, find, recorded
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.packets import CommandRequest, ControlInput, GoalRequest
@@ -119,7 +119,7 @@ def sessions(folder: Path, *options: str) -> list[RecordedSession]:
 def test_what_the_recorder_enters_is_what_its_files_hold(tmp_path: Path) -> None:
     record(tmp_path)
     kept = find(recorded(tmp_path, on_read=lambda path: pytest.fail(f"{path} was read")))
-    read: list[Contents] = [of_file(path) for path in tmp_path.glob("*.rrd")]
+    read: list[Contents] = [read_contents(path) for path in tmp_path.glob("*.rrd")]
     assert len(kept) == 2
     assert find(read) == kept
     box, whole = sorted(kept, key=lambda session: session.reason is None)
@@ -250,14 +250,14 @@ def test_a_recorder_that_cannot_write_beside_its_recording_says_so_and_records(t
     recording.records(made.records(0.1).tobytes())
     recording.close()
     assert ["cannot be written, trirail sessions reads the recording" in words for words in told] == [True]
-    assert of_file(recording.path).cycles == 100
+    assert read_contents(recording.path).cycles == 100
 
 
 def test_what_stands_beside_a_recording_is_for_the_same_people(tmp_path: Path) -> None:
     recording = record(tmp_path)
     for mode in (0o640, 0o600):
         recording.chmod(mode)
-        contents.save(recording, of_file(recording))
+        contents.save(recording, read_contents(recording))
         assert sidecar(recording).stat().st_mode & 0o777 == mode
 
 
@@ -337,7 +337,7 @@ def files(draw: st.DrawFn) -> list[Contents]:
     return found
 
 
-def fits(parts: list[Contents], wanted: Wanted) -> bool:
+def fits(parts: list[Contents], wanted: SessionFilter) -> bool:
     """Whether a session is wanted: said once more."""
     goals = {(user, outcome) for part in parts for user, outcomes in part.goals.items() for outcome in outcomes}
     said = [f"{each.fault.cause} 0x{each.fault.code:04X} {each.message}".lower() for p in parts for each in p.faults]
@@ -381,7 +381,7 @@ def test_a_session_that_runs_is_found_and_one_that_was_cut_off_is_read(
 @given(
     files(),
     st.builds(
-        Wanted,
+        SessionFilter,
         st.none() | st.sampled_from(["x", "y"]),
         st.none() | when,
         st.none() | when,
@@ -390,7 +390,7 @@ def test_a_session_that_runs_is_found_and_one_that_was_cut_off_is_read(
         st.none() | outcomes,
     ),
 )
-def test_what_is_wanted_is_found_and_nothing_else(found: list[Contents], wanted: Wanted) -> None:
+def test_what_is_wanted_is_found_and_nothing_else(found: list[Contents], wanted: SessionFilter) -> None:
     by_session: dict[str, list[Contents]] = {}
     for each in found:
         by_session.setdefault(each.session, []).append(each)

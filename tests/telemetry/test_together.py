@@ -13,8 +13,8 @@ from cli.test_view import near, needs_vulkan
 from rerun.chunk import RrdReader
 from trirail.config import SIM, load
 from trirail.telemetry import palette
-from trirail.telemetry.readout import Standing
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.sinks import Relay, live_relay
 from trirail.telemetry.streams import LIVE_HZ, Streams, open_together
 from trirail.wire.messages import Event
@@ -28,7 +28,7 @@ def show(streams: Streams, relay: Relay) -> None:
     """Move for five seconds."""
     records = made.records(5.0)
     streams.attach(relay, LIVE_HZ)
-    streams.stands(Standing("g-1", (0.05, 0.02, 0.3)))
+    streams.update_state(ReadoutState("g-1", (0.05, 0.02, 0.3)))
     for start in range(0, len(records), 1000):
         streams.records(records[start : start + 1000].tobytes())
     streams.event(Event("mode", "info", f"{streams.shown.robot.name} moves", seq=1, t=0.5, cycle=500, time=0.5))
@@ -45,7 +45,7 @@ def entities(path: Path) -> set[str]:
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two robots, in a file as a viewer would get it."""
     path = tmp_path_factory.mktemp("together") / "two.rrd"
-    robot = ShownRobot.configured(load(SIM))
+    robot = DrawnRobot.from_config(load(SIM))
     both = [Streams(replace(robot, name=name), name, STARTED[name], f"/{name}") for name in NAMES]
     relay = live_relay(open_together(both, "two", rr.FileSink(path)))
     for streams in both:
@@ -56,7 +56,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_each_has_all_that_one_alone_has_and_nothing_of_another(file: Path, tmp_path: Path) -> None:
     alone = tmp_path / "alone.rrd"
-    streams = Streams(ShownRobot.configured(load(SIM)), "alone", 0)
+    streams = Streams(DrawnRobot.from_config(load(SIM)), "alone", 0)
     relay = live_relay(streams.open(rr.FileSink(alone)))
     show(streams, relay)
     relay.close()

@@ -27,7 +27,7 @@ class LentFrames(FrameIO, Protocol):
     def access(self) -> BusAccess:
         """Access for compiled code."""
 
-    def hand_in(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
         """Take back `number` frames: `receive` returns those after the first `handled`, then raises `error` (errno.h).
 
         `error` is 0 if receiving has not failed.
@@ -75,7 +75,7 @@ class FrameCalls:
         """Restrict the received identifiers, see FrameIO."""
         self._frames.set_identifiers(identifiers)
 
-    def hand_in(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
+    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
         """Take frames back: `receive` returns those of the last call after the first `handled`."""
         self._returned.extend(self._last_received[handled:number])
 

@@ -136,7 +136,7 @@ class SocketFrames:
         """The socket."""
         return BusAccess(self._socket.fileno())
 
-    def hand_in(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
         """Take frames back: `receive` returns those after the first `handled`, then raises `error` (errno.h)."""
         self._returned.extend(arrived.unpacked(handled, number))
         self._error = error

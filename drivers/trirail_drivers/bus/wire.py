@@ -163,9 +163,9 @@ class Wire:
         sends = not self._unsent and self._unsent_cycles == 0
         return self.fault is None and not self._warnings and not self.down and sends
 
-    def hand_in(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
+    def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
         """Take back frames that compiled code has received: see frame_calls.LentFrames."""
-        self._frames.hand_in(arrived, handled, number, error)
+        self._frames.return_frames(arrived, handled, number, error)
 
     def warn(self, text: str) -> None:
         """Add a warning; the same one only once between resets."""

@@ -12,7 +12,7 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 
 class Difference(NamedTuple):
-    """A value to be changed in a drive."""
+    """Value to change in a drive."""
 
     object: str
     """Index and subindex, as 6085:00."""

@@ -26,7 +26,7 @@ from trirail_drivers.cia402.one_drive import HAS_POWER, SetUp, Start
 from trirail_drivers.cia402.other_masters import OtherMasters
 from trirail_drivers.cia402.returning import ReturningCia402
 from trirail_drivers.config import NO_IO, DigitalIo
-from trirail_drivers.driver.axis_row import NOTHING_SENT, NOWHERE
+from trirail_drivers.driver.axis_row import NO_OFFSET, NOTHING_SENT
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
@@ -299,7 +299,7 @@ class Cia402(Driver[Cia402Axis]):
             lent.begin, lent.beats, lent.setpoints = map(packed_frames, ([self._sync], self._beats, self._setpoints))
             lent.outputs = packed_frames(self._outputs)
             lent.end = lent.setpoints.headers
-        lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NOWHERE, lent.times[0]["traffic"]
+        lent.times[0] = self._off_deadline, due, self._drives.heartbeat, beats, 0, NO_OFFSET, lent.times[0]["traffic"]
         words = [(axis.controlword, axis.statusword, axis.inputs) for axis in self._axes]
         if words != self._lent_state:
             self._lent_state = words
@@ -313,11 +313,11 @@ class Cia402(Driver[Cia402Axis]):
         """Continue from the tables: see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._heartbeat_due = float(times["beat_due"])
-        self._wire.hand_in(self._tables.arrived, handled, arrived, error)
+        self._wire.return_frames(self._tables.arrived, handled, arrived, error)
         feedback = self._feedback()
         if synced is not None:
             self._synced = synced
-            if times["begun"] != NOWHERE:
+            if times["begun"] != NO_OFFSET:
                 self._begin(synced, self._heartbeat_due, int(times["begun"]))
         return feedback
 

@@ -21,7 +21,7 @@ from trirail_drivers.errors import BusAbsentError, BusError, DriveError
 from trirail_drivers.interface import Clock, DriveGroup
 from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated import SimulatedBus, SimulatedDevice
-from trirail_drivers.simulated.carriages import Mounted
+from trirail_drivers.simulated.carriages import DriveMounting
 from trirail_drivers.simulated.faults import Faults
 
 # The BusError has python-can's reason; standard error shows only that one line.
@@ -123,12 +123,12 @@ def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequen
     return devices, Faults(devices, scales, protocol.fault_frames, mounted=mounted)
 
 
-def _mounted(built: Sequence[config.SimulatedSlider] | None, index: int, drive: config.Drive) -> Mounted:
+def _mounted(built: Sequence[config.SimulatedSlider] | None, index: int, drive: config.Drive) -> DriveMounting:
     """Return the true axis of a simulated drive, by its node id; without one, the configured axis."""
     for slider, each in enumerate(built or ()):
         if each.node == drive.node:
-            return Mounted(slider, each.direction * each.counts_per_metre)
-    return Mounted(index, drive.direction * drive.counts_per_metre)
+            return DriveMounting(slider, each.direction * each.counts_per_metre)
+    return DriveMounting(index, drive.direction * drive.counts_per_metre)
 
 
 def _opening_error(section: config.Can, error: Exception) -> str:

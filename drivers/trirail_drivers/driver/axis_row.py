@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-NOWHERE: Final = -1
+NO_OFFSET: Final = -1
 """Offset of a number that a frame does not have."""
 NOTHING_SENT: Final = -1
 """Value of `outputs_sent` before any outputs were sent."""
@@ -100,7 +100,7 @@ class AxisRow(ctypes.Structure):
     position_at: int
     """Offset of the position in the setpoint's frame [bytes]."""
     velocity_at: int
-    """Offset of the velocity in the setpoint's frame [bytes]; NOWHERE for none."""
+    """Offset of the velocity in the setpoint's frame [bytes]; NO_OFFSET for none."""
     has_outputs: bool
     """Whether it has digital outputs."""
     maps_outputs: bool

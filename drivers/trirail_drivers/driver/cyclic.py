@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
-from trirail_drivers.driver.axis_row import AXIS, NOWHERE
+from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET
 from trirail_drivers.interface import Feedback
 
 MOST_FRAMES: Final = 32
@@ -26,8 +26,8 @@ EXPECTED = np.dtype(
         ("axis", "u1"),
         ("mask", "u1", 8),  # bits of its data that decide something
         ("data", "u1", 8),  # required values of those bits
-        ("position_at", "i1"),  # offset of a 32-bit position in it [bytes], NOWHERE for none
-        ("status_at", "i1"),  # offset of a statusword in it [bytes], NOWHERE for none
+        ("position_at", "i1"),  # offset of a 32-bit position in it [bytes], NO_OFFSET for none
+        ("status_at", "i1"),  # offset of a statusword in it [bytes], NO_OFFSET for none
         ("lives", "u1"),  # whether it is a sign of life
     ],
     align=True,
@@ -41,7 +41,7 @@ TIMES = np.dtype(
         ("beat_period", "<f8"),  # period of these [s]
         ("beats", "<i8"),  # number of these sent together
         ("next_beat", "<i8"),  # index of the next one
-        ("begun", "<i8"),  # frames sent at the newest cycle's beginning before one was refused; NOWHERE for none
+        ("begun", "<i8"),  # frames sent at the newest cycle's beginning before one was refused; NO_OFFSET for none
         ("traffic", "<i8"),  # bits on the bus in quiet cycles since the start
     ],
     align=True,
@@ -55,8 +55,8 @@ def expected_row(
     data: bytes,
     mask: bytes,
     *,
-    position_at: int = NOWHERE,
-    status_at: int = NOWHERE,
+    position_at: int = NO_OFFSET,
+    status_at: int = NO_OFFSET,
     lives: bool = False,
 ) -> tuple[Any, ...]:
     """Return a row of EXPECTED, from the data received last."""

@@ -21,7 +21,7 @@ import can
 from trirail_drivers import config
 from trirail_drivers.bus.reopening import Reopening
 from trirail_drivers.config import NO_IO, DigitalIo
-from trirail_drivers.driver.axis_row import NOWHERE
+from trirail_drivers.driver.axis_row import NO_OFFSET
 from trirail_drivers.driver.cyclic import Cyclic
 from trirail_drivers.driver.driver import Driver
 from trirail_drivers.driver.recovery import Recovery
@@ -199,7 +199,7 @@ class Odrive(Driver[OdriveAxis]):
         if not all(axis.is_steady(self._target_state(axis)) for axis in self._axes):
             return None
         times, requests = self._tables.times, (1, self._next_request)
-        times[0] = self._off_deadline, due, cansimple.ERROR_PERIOD, *requests, NOWHERE, times[0]["traffic"]
+        times[0] = self._off_deadline, due, cansimple.ERROR_PERIOD, *requests, NO_OFFSET, times[0]["traffic"]
         self._table_writer.fill(follow=self._enabled, within=self._drives.following_error)
         return self._tables
 
@@ -207,11 +207,11 @@ class Odrive(Driver[OdriveAxis]):
         """Continue from the tables: see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._errors_due, self._next_request = float(times["beat_due"]), int(times["next_beat"])
-        self._wire.hand_in(self._tables.arrived, handled, arrived, error)
+        self._wire.return_frames(self._tables.arrived, handled, arrived, error)
         feedback = self._feedback()
         if synced is not None:
             self._synced = synced
-            if times["begun"] != NOWHERE:
+            if times["begun"] != NO_OFFSET:
                 self._send_cycle_start(synced, self._errors_due, int(times["begun"]))
         return feedback
 

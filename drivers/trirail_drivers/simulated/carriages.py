@@ -8,7 +8,7 @@ from typing import NamedTuple
 from trirail_drivers.simulated.servo import Servo
 
 
-class Mounted(NamedTuple):
+class DriveMounting(NamedTuple):
     """Slider that a drive actually moves, whatever its configuration says."""
 
     slider: int

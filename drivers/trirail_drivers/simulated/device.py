@@ -204,7 +204,7 @@ class Device:
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.reset()
         self._route()
-        self.errors.mute(state is Nmt.STOPPED)
+        self.errors.suppress(state is Nmt.STOPPED)
 
     def _route(self) -> None:
         """Select the frames to accept (CiA 301, NMT states and communication object relation)."""
@@ -224,7 +224,7 @@ class Device:
         self._handlers = handlers
 
     def _heartbeat(self, _data: bytes) -> None:
-        self._error_control.heard(self._now)
+        self._error_control.on_heartbeat(self._now)
         self._master_back()
 
     def _master_back(self) -> None:

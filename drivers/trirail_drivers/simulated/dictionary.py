@@ -41,7 +41,7 @@ VALUE_TOO_LOW = 0x06090032
 WRONG_STATE = 0x08000022
 NO_DATA = 0x08000024
 
-LONGEST = 1 << 16
+MAX_DOMAIN_SIZE = 1 << 16
 """Maximum size of a text or domain [bytes]."""
 
 _UNSIGNED = {0x01: 1, 0x05: 1, 0x06: 2, 0x16: 3, 0x07: 4, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
@@ -88,11 +88,11 @@ class ObjectEntry:
         self._signed = kind in _SIGNED
         self.size: int | None = (_UNSIGNED | _SIGNED | _OCTETS).get(kind)
         """Size [bytes]; None if the length is not fixed."""
-        given = variable.value if variable.value is not None else variable.default
-        self.unset = given is None
+        eds_value = variable.value if variable.value is not None else variable.default
+        self.unset = eds_value is None
         """Whether the EDS has no power-on value."""
-        self.default = self.value = self._wrapped(given) if self.integer and isinstance(given, int) else 0
-        self._default_content = self.content = b"" if self.integer else _octets(variable, given, self.size)
+        self.default = self.value = self._wrapped(eds_value) if self.integer and isinstance(eds_value, int) else 0
+        self._default_content = self.content = b"" if self.integer else _octets(variable, eds_value, self.size)
         low, high = variable.min, variable.max
         if low is not None and high is not None and low > high:  # some EDS files write "no limit" like this
             low = high = None
@@ -127,7 +127,7 @@ class ObjectEntry:
         """Write bytes from the bus. Raises SdoAbortedError, and keeps the old value, if they are refused."""
         if self._limits is None:
             raise SdoAbortedError(READ_ONLY)
-        longest = self.size or LONGEST
+        longest = self.size or MAX_DOMAIN_SIZE
         if len(data) > longest:
             raise SdoAbortedError(TOO_LONG)
         if self.size is not None and len(data) < self.size:
@@ -159,10 +159,10 @@ class ObjectEntry:
         bits = 8 * (self.size or 0) - self._signed
         self.value = max(-(1 << bits) if self._signed else 0, min(round(number), (1 << bits) - 1))
 
-    def _wrapped(self, given: int) -> int:
+    def _wrapped(self, eds_value: int) -> int:
         """Return a value of the EDS, which may contain a negative number as its two's complement."""
         bits = 8 * (self.size or 0)
-        value = given % (1 << bits)
+        value = eds_value % (1 << bits)
         return value - (1 << bits) if self._signed and value >> (bits - 1) else value
 
     def restore(self) -> None:
@@ -170,16 +170,16 @@ class ObjectEntry:
         self.value, self.content = self.default, self._default_content
 
 
-def _octets(variable: ODVariable, given: object, size: int | None) -> bytes:
+def _octets(variable: ODVariable, eds_value: object, size: int | None) -> bytes:
     """Return the EDS value of an object that is not an integer, as transmitted."""
-    if isinstance(given, int) and size is not None:  # EDS files write times as integers
-        return (given % (1 << 8 * size)).to_bytes(size, "little")
-    if isinstance(given, str | float):
+    if isinstance(eds_value, int) and size is not None:  # EDS files write times as integers
+        return (eds_value % (1 << 8 * size)).to_bytes(size, "little")
+    if isinstance(eds_value, str | float):
         try:
-            return bytes(variable.encode_raw(given))
+            return bytes(variable.encode_raw(eds_value))
         except (ValueError, TypeError):  # text outside ASCII
-            return str(given).encode("utf-8")
-    return bytes(given) if isinstance(given, bytes) else bytes(size or 0)
+            return str(eds_value).encode("utf-8")
+    return bytes(eds_value) if isinstance(eds_value, bytes) else bytes(size or 0)
 
 
 class Dictionary:

@@ -67,7 +67,7 @@ class Emergencies:
         self._update_register()
         self._held_back = None
 
-    def mute(self, muted: bool) -> None:
+    def suppress(self, muted: bool) -> None:
         """Suppress EMCY in STOPPED, and send the newest one on leaving that state (CiA 301)."""
         self._muted = muted
         if not muted and self._held_back is not None:

@@ -38,7 +38,7 @@ class ErrorControl:
         node, milliseconds = divmod(self._consumer.value, 1 << 16)
         return node if node and milliseconds else None
 
-    def heard(self, now: float) -> None:
+    def on_heartbeat(self, now: float) -> None:
         """Handle a heartbeat of the watched node: the first one, or the next after a loss, starts the time-out."""
         self._consumer_due = now + (self._consumer.value & 0xFFFF) * 1e-3
 

@@ -61,7 +61,7 @@ class SimulatedExchange:
             if self._faults.idle:
                 self._drives[index].receive_remote(can_id, now)
             else:
-                self._faults.carry(index, True, can_id, b"", partial(self._hand_request_in, index, can_id))
+                self._faults.carry(index, True, can_id, b"", partial(self._deliver_request, index, can_id))
 
     def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
         """Deliver a frame to some drives, as modified by faults."""
@@ -71,21 +71,21 @@ class SimulatedExchange:
                 self._drives[index].receive(can_id, data, now)
         else:
             for index in indices:
-                self._faults.carry(index, True, can_id, data, partial(self._hand_in, index, can_id))
+                self._faults.carry(index, True, can_id, data, partial(self._deliver_to_drive, index, can_id))
 
-    def _hand_request_in(self, index: int, can_id: int, _data: bytes) -> None:
+    def _deliver_request(self, index: int, can_id: int, _data: bytes) -> None:
         self._drives[index].receive_remote(can_id, self._clock())
 
-    def _hand_in(self, index: int, can_id: int, data: bytes) -> None:
+    def _deliver_to_drive(self, index: int, can_id: int, data: bytes) -> None:
         self._drives[index].receive(can_id, data, self._clock())
 
     def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
         """Deliver a drive's frame to the master and the other drives, as modified by faults."""
         if self._faults.idle:
-            self._hand_out(others, can_id, data)
+            self._deliver_from_drive(others, can_id, data)
         else:
-            self._faults.carry(index, False, can_id, data, partial(self._hand_out, others, can_id))
+            self._faults.carry(index, False, can_id, data, partial(self._deliver_from_drive, others, can_id))
 
-    def _hand_out(self, others: Sequence[int], can_id: int, data: bytes) -> None:
+    def _deliver_from_drive(self, others: Sequence[int], can_id: int, data: bytes) -> None:
         self._emit(can_id, data)
         self._to_drives(others, can_id, data)

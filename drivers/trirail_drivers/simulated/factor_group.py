@@ -65,10 +65,10 @@ class FactorGroup:
         self.position = self._position()
         _, velocity, acceleration = (entry.value for entry in self._codes)
         by_factor, of_factor = self._ratio(0x6096), self._ratio(0x6097)
-        told = self._unit(velocity, 1) or (self.position / by_factor if by_factor else None)
-        self.velocity = told or self._mechanics.velocity
-        told = self._unit(acceleration, 2) or (self.velocity / of_factor if of_factor else None)
-        self.acceleration = told or self._mechanics.acceleration
+        unit = self._unit(velocity, 1) or (self.position / by_factor if by_factor else None)
+        self.velocity = unit or self._mechanics.velocity
+        unit = self._unit(acceleration, 2) or (self.velocity / of_factor if of_factor else None)
+        self.acceleration = unit or self._mechanics.acceleration
 
     def _written(self, _entry: ObjectEntry, _old: int) -> None:
         self.refresh()

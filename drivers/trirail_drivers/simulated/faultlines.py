@@ -188,7 +188,7 @@ _OF_BUS: Final = {
 _KINDS: Final = _OF_FRAMES | _OF_DRIVES | _OF_BUS
 
 
-class _Words:
+class _FaultLineReader:
     """Words of a line, consumed one by one."""
 
     def __init__(self, line: str) -> None:
@@ -212,7 +212,7 @@ class _Words:
 
 def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
     """Parse one line for drives with these names of frames. Raises FaultSyntaxError, which gives the correct form."""
-    words = _Words(line)
+    words = _FaultLineReader(line)
     delay, chance, condition = 0.0, 1.0, None
     while words.next_is("at", "when", "with"):
         match words.left.pop(0):
@@ -246,7 +246,7 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
     return Fault(line, name, drives, value, tuple(chosen), delay, condition, chance, duration, number)
 
 
-def _condition(words: _Words) -> Condition:
+def _condition(words: _FaultLineReader) -> Condition:
     example = "when B moving A silent"
     drive = words.next_word("when", "A, B, C or any", example)
     if drive not in (*NAMES, "any"):
@@ -269,7 +269,7 @@ def _frames(word: str, known: Mapping[str, Frames]) -> Frames:
     return Frames(None, identifier)
 
 
-def _lasting(words: _Words, name: str, momentary: bool) -> tuple[float, int | None]:
+def _lasting(words: _FaultLineReader, name: str, momentary: bool) -> tuple[float, int | None]:
     if not words.left:
         return (0.0 if momentary else math.inf), None
     words.left.pop(0)

@@ -15,11 +15,11 @@ from trirail_drivers.bus import canerrors
 from trirail_drivers.bus.can_frame import ERROR
 from trirail_drivers.errors import DriveError, FileError
 from trirail_drivers.interface import NAMES, Clock, PowerState
-from trirail_drivers.simulated.carriages import Carriages, Mounted
+from trirail_drivers.simulated.carriages import Carriages, DriveMounting
 from trirail_drivers.simulated.devices import SimulatedDevice
 from trirail_drivers.simulated.emergency import Emergencies
 from trirail_drivers.simulated.faultlines import OF_PINS, OF_SLIDERS, Condition, Fault, FaultSyntaxError, Frames, parse
-from trirail_drivers.simulated.servo import SOUND
+from trirail_drivers.simulated.servo import INTACT
 
 MOVING: Final = 1e-3
 """Minimum speed at which a slider counts as moving [m/s]."""
@@ -30,7 +30,7 @@ MOST_BABBLED: Final = 100
 
 _STOPPING = (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
-_EVERY = (Frames(None, None),)
+_ALL_FRAMES = (Frames(None, None),)
 
 Deliver = Callable[[bytes], None]
 
@@ -39,7 +39,7 @@ def _to_nobody(*_said: object) -> None:
     """Discard announcements of faults, or frames, that have no receiver."""
 
 
-class _Active:
+class _ActiveFault:
     """A pending or active fault."""
 
     def __init__(self, fault: Fault, since: float) -> None:
@@ -55,7 +55,7 @@ class _Active:
     def strikes(self, index: int, to_drive: bool, can_id: int, node: int) -> bool:
         if not self.begun or self.over or index not in self.fault.drives:
             return False
-        return any(frames.match(to_drive, can_id, node) for frames in self.fault.frames or _EVERY)
+        return any(frames.match(to_drive, can_id, node) for frames in self.fault.frames or _ALL_FRAMES)
 
 
 class Faults:
@@ -68,7 +68,7 @@ class Faults:
         frames: Mapping[str, Frames],
         seed: int = 0,
         announce: Callable[[str], None] = _to_nobody,
-        mounted: Sequence[Mounted] | None = None,
+        mounted: Sequence[DriveMounting] | None = None,
     ) -> None:
         """`counts_per_metre`: negative if counts fall as the slider's position rises. `frames`: those with names.
 
@@ -76,7 +76,9 @@ class Faults:
         from its own slider and `counts_per_metre`; a line names a drive by that slider.
         """
         self.announce = announce
-        self._mounted = [Mounted(*each) for each in enumerate(counts_per_metre)] if mounted is None else list(mounted)
+        self._mounted = (
+            [DriveMounting(*each) for each in enumerate(counts_per_metre)] if mounted is None else list(mounted)
+        )
         self._drive_of = {each.slider: index for index, each in enumerate(self._mounted)}
         self.carriages = Carriages([drive.servo for drive in drives], [each.counts_per_metre for each in self._mounted])
         """True positions of the sliders."""
@@ -87,7 +89,7 @@ class Faults:
         self._scales = [each.counts_per_metre for each in self._mounted]
         """Counts of each drive per metre of actual slider travel."""
         self._random = random.Random(seed)
-        self._active: list[_Active] = []
+        self._active: list[_ActiveFault] = []
         self._held: list[tuple[float, int, Deliver, bytes]] = []
         self._order = itertools.count()
         self._clock: Clock = lambda: 0.0
@@ -115,7 +117,7 @@ class Faults:
 
     def add(self, line: str) -> None:
         """Add the fault of a line. Raises FaultSyntaxError."""
-        fault = self._of_drives(parse(line, self._frames))
+        fault = self._with_drive_indices(parse(line, self._frames))
         if fault.name == "emcy":
             for index in fault.drives:
                 if self._drives[index].emergencies is None:
@@ -126,9 +128,9 @@ class Faults:
                     raise FaultSyntaxError(f"{line}: drive {NAMES[index]} has no digital outputs and inputs")
         if self.idle:
             self._now = self._clock()
-        self._active.append(_Active(fault, self._now))
+        self._active.append(_ActiveFault(fault, self._now))
 
-    def _of_drives(self, fault: Fault) -> Fault:
+    def _with_drive_indices(self, fault: Fault) -> Fault:
         """Return the fault with configured indices of drives in place of the sliders that the drives are mounted on."""
         condition, drives = fault.condition, fault.drives
         if fault.name not in OF_SLIDERS:
@@ -212,7 +214,7 @@ class Faults:
 
     # When faults begin and end.
 
-    def _is_due(self, active: _Active, elapsed: float) -> bool:
+    def _is_due(self, active: _ActiveFault, elapsed: float) -> bool:
         fault = active.fault
         if self._now - active.since < fault.delay or (fault.condition and not self._holds(fault.condition)):
             return False
@@ -237,7 +239,7 @@ class Faults:
             case _:
                 return drive.power in _FAULTY
 
-    def _begin(self, active: _Active) -> None:
+    def _begin(self, active: _ActiveFault) -> None:
         fault = active.fault
         active.begun = True
         active.since = self._now
@@ -261,7 +263,7 @@ class Faults:
             self._break_drives()
             self._end(active)
 
-    def _end(self, active: _Active) -> None:
+    def _end(self, active: _ActiveFault) -> None:
         fault = active.fault
         self.announce(f"is over: {fault.line}" + (f" ({active.struck} frames)" if self._strikes_frames(fault) else ""))
         match fault.name:
@@ -276,7 +278,7 @@ class Faults:
             case "error-passive":
                 self._emit_error(canerrors.CONTROLLER, canerrors.ACTIVE)
         if fault.chance < 1.0 and fault.number is None and not self._strikes_frames(fault):
-            self._active.append(_Active(fault, self._now))
+            self._active.append(_ActiveFault(fault, self._now))
 
     @staticmethod
     def _strikes_frames(fault: Fault) -> bool:
@@ -321,7 +323,7 @@ class Faults:
         if "loose" in fault:
             return 0.0, 0.0
         if "slips" not in fault:
-            return SOUND
+            return INTACT
         held = 1.0 - fault["slips"].value  # while the slider's position rises
         return (held, 1.0) if rising > 0.0 else (1.0, held)
 

@@ -18,7 +18,7 @@ HARDWARE: Final = (4, 4, 58)
 FIRMWARE: Final = (0, 6, 10)
 CAN: Final = "axis0.config.can"
 VELOCITY_CONTROL: Final = 2
-NEVER: Final = float("inf")
+NO_TIMEOUT: Final = float("inf")
 BOOT: Final = 0.25
 """Time for which a restarted drive reports that it is initialising [s]."""
 
@@ -27,12 +27,12 @@ _CYCLIC: Final = {
     "encoder": cansimple.GET_ENCODER_ESTIMATES,
     "error": cansimple.GET_ERROR,
 }
-_SENT: Final = tuple(
+_SENT_CYCLIC: Final = tuple(
     (name, f"{CAN}.{name}_msg_rate_ms", command)
     for name, command in (("heartbeat", cansimple.HEARTBEAT), *_CYCLIC.items())
 )
 """Cyclic messages: name, setting with the period [ms], and command."""
-_OTHERS: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
+_UNSENT_CYCLIC: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
 """Further cyclic messages that no client reads: their settings are stored and reported, but nothing is sent."""
 _REQUESTS: Final = (
     cansimple.GET_VERSION,
@@ -54,7 +54,9 @@ class SimulatedOdrive:
     It sends heartbeats and the cyclic messages that its settings enable.
     """
 
-    def __init__(self, node: int, servo: Servo, *, heartbeat: float, friction: float, watchdog: float = NEVER) -> None:
+    def __init__(
+        self, node: int, servo: Servo, *, heartbeat: float, friction: float, watchdog: float = NO_TIMEOUT
+    ) -> None:
         self.node = node
         self.servo = servo
         self.axis_state = AxisState.IDLE
@@ -71,18 +73,18 @@ class SimulatedOdrive:
         self.version = Version(HARDWARE, FIRMWARE)
         self.serial = 0x3664_0000_0000 + node
         self.settings: dict[str, float] = {
-            "axis0.config.enable_watchdog": watchdog < NEVER,
-            "axis0.config.watchdog_timeout": watchdog if watchdog < NEVER else 0.0,
+            "axis0.config.enable_watchdog": watchdog < NO_TIMEOUT,
+            "axis0.config.watchdog_timeout": watchdog if watchdog < NO_TIMEOUT else 0.0,
             f"{CAN}.input_vel_scale": 1000,
             f"{CAN}.heartbeat_msg_rate_ms": round(1000 * heartbeat),
-            **{f"{CAN}.{name}_msg_rate_ms": 0 for name in (*_CYCLIC, *_OTHERS)},
+            **{f"{CAN}.{name}_msg_rate_ms": 0 for name in (*_CYCLIC, *_UNSENT_CYCLIC)},
             "axis0.pos_vel_mapper.status": 0,
         }
         """Settings by path; endpoints as its firmware numbers them."""
         self._input = (servo.position, 0.0)
         self._friction = friction
         self._fed = self._moved_at = 0.0
-        self._booted = NEVER
+        self._booted = NO_TIMEOUT
         self._due: dict[str, float] = {}
         """Time at which each cyclic message is due [s]."""
         self._transmit: Callable[[int, bytes], None] = _discard
@@ -143,12 +145,12 @@ class SimulatedOdrive:
             self._move(now - self._moved_at)
             self._moved_at = now
         if now >= self._booted:
-            self._booted = NEVER
+            self._booted = NO_TIMEOUT
             self.axis_state, self.errors = AxisState.IDLE, Error(0)
         watchdog = self.settings["axis0.config.watchdog_timeout"]
         if self._armed and self.settings["axis0.config.enable_watchdog"] and now >= self._fed + watchdog:
             self.fail(Error.WATCHDOG_TIMER_EXPIRED)
-        for name, setting, command in _SENT:
+        for name, setting, command in _SENT_CYCLIC:
             if now >= self._due[name] and (period := self.settings[setting] / 1000.0):
                 self._answer(command)
                 self._due[name] += period

@@ -49,8 +49,8 @@ class Pdo(ABC):
         """Maximum number of objects in its mapping."""
         while (mapping, self._most + 1) in objects:
             self._most += 1
-        given = [objects.internal(mapping, n).default for n in range(1, self._most + 1)]
-        self._count = objects.internal(mapping, 0, (*given, 0).index(0))
+        defaults = [objects.internal(mapping, n).default for n in range(1, self._most + 1)]
+        self._count = objects.internal(mapping, 0, (*defaults, 0).index(0))
         self._changed = changed
         self.entries: tuple[ObjectEntry, ...] = ()
         self.layout = Struct("<")

@@ -69,7 +69,7 @@ _INTERPOLATE: Final = 1 << 4
 
 _STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
 """Values of 605Ah: quick-stop ramp into SWITCH ON DISABLED, or remaining in QUICK STOP ACTIVE."""
-_STAYS: Final = (5, 6, 7, 8)
+_STAY_OPTIONS: Final = (5, 6, 7, 8)
 """Values of 605Ah with which it remains in QUICK STOP ACTIVE."""
 
 _WINDOW_OFF: Final = 0xFFFFFFFF
@@ -161,7 +161,7 @@ class Profile:
     @property
     def stays_stopped(self) -> bool:
         """Whether it remains in QUICK STOP ACTIVE (605Ah)."""
-        return self._quick_stop_option.value in _STAYS
+        return self._quick_stop_option.value in _STAY_OPTIONS
 
     @property
     def window(self) -> tuple[float, float]:

@@ -38,7 +38,7 @@ class BlockUpload:
         self._size = request[4]
         self._check_size()
 
-    def takes(self, data: bytes) -> bool:
+    def accepts(self, data: bytes) -> bool:
         """Return whether a frame belongs to the transfer."""
         return data[0] >> 5 == _UPLOAD and data[0] & 0x03 != 0
 
@@ -97,7 +97,7 @@ class BlockDownload:
         self._number = 0
         self._last = False
 
-    def takes(self, data: bytes) -> bool:
+    def accepts(self, data: bytes) -> bool:
         """Return whether a frame belongs to the transfer: until the last segment, every frame but an abort."""
         if self._last:
             return data[0] >> 5 == _DOWNLOAD and data[0] & 0x03 == _END

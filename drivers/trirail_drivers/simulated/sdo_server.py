@@ -10,7 +10,7 @@ from canopen import SdoAbortedError
 from canopen.sdo.server import SdoServer as CanopenServer
 
 from trirail_drivers.simulated.dictionary import (
-    LONGEST,
+    MAX_DOMAIN_SIZE,
     NO_DATA,
     READ_ONLY,
     TOO_LONG,
@@ -58,7 +58,7 @@ class SdoServer(CanopenServer):
         if len(data) != 8:
             return
         block = self._block
-        if block is None or not block.takes(data):
+        if block is None or not block.accepts(data):
             self._block = None
             self.on_request(0, data, 0.0)  # type: ignore[no-untyped-call]
             return
@@ -102,7 +102,7 @@ class SdoServer(CanopenServer):
         elif command & _SIZED and entry.size not in (None, int.from_bytes(payload, "little")):
             raise SdoAbortedError(WRONG_LENGTH)
         self._uploads = False
-        self._longest = 0 if command & _EXPEDITED else entry.size or LONGEST
+        self._longest = 0 if command & _EXPEDITED else entry.size or MAX_DOMAIN_SIZE
         super().init_download(_HEADER.pack(command, index, subindex, payload))  # type: ignore[no-untyped-call]
 
     def init_upload(self, request: bytes) -> None:
@@ -151,7 +151,7 @@ class SdoServer(CanopenServer):
         entry = self._writable(data)
         if data[0] & 0x02 and entry.size not in (None, int.from_bytes(data[4:], "little")):
             raise SdoAbortedError(WRONG_LENGTH)
-        self._block = block = BlockDownload(data, entry.size or LONGEST)
+        self._block = block = BlockDownload(data, entry.size or MAX_DOMAIN_SIZE)
         self._answer(0xA0 | data[0] & CRC_WANTED, bytes([block.size]))
 
     def _name(self, request: bytes) -> None:

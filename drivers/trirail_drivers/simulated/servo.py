@@ -8,7 +8,7 @@ from typing import Final
 from trirail_drivers import config
 from trirail_drivers.driver.ramp import brake
 
-SOUND: Final = (1.0, 1.0)
+INTACT: Final = (1.0, 1.0)
 """Shares of the travel that a sound encoder counts, forwards and backwards."""
 
 
@@ -46,7 +46,7 @@ class Servo:
         """Whether a limit applied in the last step."""
         self.forced_velocity: float | None = None
         """Defect: velocity of the slider [counts/s] whatever its setpoint, until its brake holds it."""
-        self.encoder = SOUND
+        self.encoder = INTACT
         """Defect: shares of the travel that the encoder counts, forwards and backwards; (0, 0) if it is loose."""
         self.motor = 1.0
         """Defect: -1 if the motor turns against its encoder, as with two phases exchanged."""

@@ -41,15 +41,15 @@ def calibrate(
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
-    """Find how the cameras show the table, by six moves of the stage, and keep it with the marks as they lie now.
+    """Calibrate the cameras by six moves of the stage, and save the calibration with the marks' present positions.
 
-    The robot is enabled, and its marks in the pictures, also after the moves. The file's targets are where the marks
-    are when it has gone back: lay a part right for it, or edit them.
+    Enable the robot first. All marks must be in the pictures, also after the moves. The file's targets are the marks'
+    positions after the last move: align a part before the calibration, or edit the targets.
 
     Parameters
     ----------
     file
-        Where to keep it; what is there already is kept as FILE.old.
+        Calibration to write; an existing file is saved as FILE.old.
     by
         How far to move along x and y, each both ways [m], or with a unit: 0.5mm.
     angle

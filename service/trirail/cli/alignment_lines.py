@@ -41,15 +41,15 @@ def show_recorded(alignments: list[AlignmentSummary]) -> None:
             terminal.out.print(f"               {terminal.plain(name)}  {shown} µm to its target", soft_wrap=True)
 
 
-def show_calibration(found: CameraCalibration, file: Path) -> None:
+def show_calibration(result: CameraCalibration, file: Path) -> None:
     """Print what a calibration has found, and where it is kept."""
-    for name, view in found.views.items():
+    for name, view in result.views.items():
         mirrored = ", mirrored" if view.mirrored else ""
         terminal.print_line(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
-    for name, mark in found.marks.items():
+    for name, mark in result.marks.items():
         (x, y), (dx, dy) = mark.place, mark.deviation
         terminal.print_line(f"mark {name}: x {x * 1e3:.3f} ± {dx * 1e3:.3f} mm, y {y * 1e3:.3f} ± {dy * 1e3:.3f} mm")
-    terminal.print_line(f"residual {found.noise:.3f} pixel; kept in {file}")
+    terminal.print_line(f"residual {result.noise:.3f} pixel; kept in {file}")
 
 
 def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
@@ -102,7 +102,7 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
     """Print how each camera stands beside how it was calibrated."""
     for each in changes:
         (x, y), (dx, dy) = each.shift, each.shift_deviation
-        verdict = "[red]was moved: calibrate anew[/]" if each.is_changed else "as it was"
+        verdict = "[red]was moved: calibrate again[/]" if each.is_changed else "as it was"
         terminal.out.print(
             f"view {terminal.plain(each.view)}: {verdict}; shifted by x {x * 1e6:.0f} ± {dx * 1e6:.0f} µm, "
             f"y {y * 1e6:.0f} ± {dy * 1e6:.0f} µm, turned by {each.turn * 1e3:.2f} mrad, "
@@ -136,23 +136,23 @@ def _describe_look(report: LookReport, seen: Observation) -> str:
     return format_measurement(report.measurement) + ("; corrects it" if report.correction is not None else "")
 
 
-def format_measurement(found: Measurement) -> str:
+def format_measurement(alignment: Measurement) -> str:
     """Return how a part lies, in a line."""
-    x, y = found.shift
+    x, y = alignment.shift
     return (
-        f"to go: x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {found.turn * ARCSECONDS:.2f} arcsec; "
-        f"a mark {found.worst * 1e6:.2f} µm at most; distance {found.distance * 1e6:+.0f} ppm"
+        f"to go: x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {alignment.turn * ARCSECONDS:.2f} arcsec; "
+        f"a mark {alignment.worst * 1e6:.2f} µm at most; distance {alignment.distance * 1e6:+.0f} ppm"
     )
 
 
-def show_alignment(found: Alignment) -> None:
+def show_alignment(result: Alignment) -> None:
     """Print how an alignment ended."""
     reasons = {
         "reached": "the part lies right",
         "corrections": "no correction is left: raise --corrections or --tolerance, or look at backlash and noise",
-        "growing": "the error grew: the calibration is not of these cameras as they stand; calibrate anew",
+        "growing": "the error grew: the cameras have moved since the calibration; calibrate again",
         "noise": "the pictures' noise is above the tolerance: raise --looks, --tolerance or --angle, or choose marks "
         "farther apart",
     }
-    made = terminal.counted(len(found.corrections), "correction")
-    terminal.print_line(f"{made} in {found.seconds:.2f} s: {reasons[found.why]}")
+    made = terminal.counted(len(result.corrections), "correction")
+    terminal.print_line(f"{made} in {result.seconds:.2f} s: {reasons[result.why]}")

@@ -258,7 +258,7 @@ help_pages.arrange(app)
 
 
 class Terminated(BaseException):
-    """Somebody told this process to end: what a command holds is let go of on the way out, as at Ctrl-C."""
+    """Request to end this process by SIGTERM or SIGHUP; as after Ctrl-C, the command releases its lease and drives."""
 
 
 def _terminated(number: int, _frame: FrameType | None) -> None:
@@ -300,7 +300,7 @@ def main() -> None:
 
 
 def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
-    """Say what is wrong with a command line, of what, and where its usage is told."""
+    """Return the error in a command line, with the command and a pointer to its usage."""
     message = str(error).strip()
     behind = words[words.index("--") :] if "--" in words else []
     unknown = error.token.keyword if isinstance(error, UnknownOptionError) else None

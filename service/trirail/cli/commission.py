@@ -39,12 +39,12 @@ def commission(
 ) -> int:
     """Guide through the first hour with drives.
 
-    One drive at a time, 1 mm at 5 mm/s, each step asked for and judged.
+    It moves one drive at a time, 1 mm at 5 mm/s, and asks before each step.
 
-    Who is on the bus, set-up, each slider by hand, power on one drive alone, 1 mm there and back, homing, watchdogs, a
-    square of the platform, of which kind it is; then a new configuration with what was found. Every step can be refused
-    and repeated, Ctrl-C stops all drives at once, and a report is kept. Answers are lines of standard input, of a
-    person or a script. Exit 0 only if nothing that was done was found wrong. Not while the service runs.
+    The steps: nodes on the bus, set-up, each slider by hand, power on one drive alone, 1 mm there and back, homing,
+    watchdogs, a square of the platform, its kind; then a new configuration with the results. You can refuse and repeat
+    every step. Ctrl-C stops all drives immediately. A report is saved. Answers are lines of standard input, from a
+    person or a script. Exit 0 only if no step found an error. Stop the service first.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def commission(
     fault
         A fault on demand of simulated drives, as "A reversed" or "B scale 0.5"; may be repeated.
     json
-        Print the report as one JSON object; what is said meanwhile goes to standard error.
+        Print the report as one JSON object; all other output goes to standard error.
     """
     from trirail.commissioning import report as reports
     from trirail.commissioning.guide import Guide
@@ -141,7 +141,7 @@ class Console:
         from trirail.commissioning.person import QuitRequest
 
         if not self._echoes:
-            # What was typed before the question, as Enter once too often, is no answer to it: it may ask for motion.
+            # Input typed before the question, such as a second Enter, is no answer: the question may ask for motion.
             termios.tcflush(sys.stdin, termios.TCIFLUSH)
             self._typed = b""
         proposed = f" \\[{terminal.plain(question.default)}]" if question.default is not None else ""

@@ -1,4 +1,4 @@
-"""`trirail config`: the configurations that are shipped, copies of them to start from, and what a file comes to."""
+"""`trirail config`: list and copy the shipped configurations, and show the effective values of a file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trirail.cli import terminal
 from trirail.cli.options import ConfigFile, Json
 from trirail.errors import ConfigError
 
-app = App(name="config", help="List and copy shipped configurations, show what one comes to.")
+app = App(name="config", help="List and copy shipped configurations, show effective values.")
 
 BASE = "sim.toml"
 """The shipped configuration with which others are compared."""
@@ -23,7 +23,7 @@ _Tables = dict[str, Any]
 
 
 def _folder() -> Path:
-    """Where the shipped configurations are: in the installed package, or in a checkout."""
+    """Return the folder of the shipped configurations, in the installed package or in a checkout."""
     from trirail.config import SIM
 
     return SIM.parent
@@ -31,7 +31,7 @@ def _folder() -> Path:
 
 @app.default
 def shipped(*, json: Json = False) -> int:
-    """List what `trirail config copy` can copy, each with what it is for."""
+    """List the shipped configurations, which `trirail config copy` copies, each with its purpose."""
     files = shipped_files()
     if json:
         terminal.json({"folder": str(_folder()), "files": files})
@@ -74,9 +74,9 @@ def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
 
 @app.command
 def show(config: ConfigFile = None, /, *, json: Json = False) -> int:
-    """Print what a configuration comes to, every default filled in, and where it differs from the shipped sim.toml.
+    """Print a configuration with every default, and mark its differences from the shipped sim.toml.
 
-    What is printed is a configuration again.
+    The output is a valid configuration.
     """
     from trirail.telemetry.provenance import toml_lines
 
@@ -131,7 +131,7 @@ def _tables(path: Path) -> _Tables:
     from trirail.config import load  # numba, with the kinematics
 
     config = load(path)
-    if config.correction.map is not None:  # what is in that file stays there
+    if config.correction.map is not None:  # the map stays in its own file
         config = msgspec.structs.replace(config, correction=msgspec.structs.replace(config.correction, as_built=None))
     tables: _Tables = json_text.loads(msgspec.json.encode(config))
     return tables

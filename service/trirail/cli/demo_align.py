@@ -30,7 +30,7 @@ from trirail.config import corrected_geometry, load
 
 PART_COUNT = 5
 MAX_OFFSET_M, MAX_ROTATION = 0.4e-3, math.radians(0.25)
-"""How far parts lie away at most [m, rad]."""
+"""Largest offset and rotation of a part [m, rad]."""
 DISC = MarkShape("disc", 160e-6)
 MARK_POSITIONS: dict[str, Pair] = {"left": (-0.05, 0.0), "right": (0.05, 0.0)}
 VIEWS = {
@@ -42,9 +42,9 @@ MOVE_M, MOVE_ANGLE = 0.5e-3, math.radians(0.5)
 SIZE = 960, 720
 EXPOSURE, DELAY = 0.004, 0.01
 WAIT_S = 0.02
-"""How long the cameras need to show what is: exposure and delay, and the drives' settling [s]."""
+"""Time until the cameras show a new position: exposure and delay, and the drives' settling [s]."""
 BUILT_OFF, BUILT_TURNED, PLAY = 50e-6, 0.1e-3, 0.5e-6
-"""By how much the stage is built otherwise than configured, in each place [m] and angle [rad]; the drives' play [m]."""
+"""Largest building errors of the stage, in position [m] and angle [rad]; the drives' backlash [m]."""
 COLOURS = {"mark": (90, 200, 250), "target": (250, 200, 60), "residual": (240, 90, 90)}
 
 
@@ -88,7 +88,7 @@ class DrawnCameras:
 
 
 def run(file: Path, recording: Path, parts: int = PART_COUNT, seed: int = 0) -> int:
-    """Calibrate, then lay so many parts right; return 0 if each was. Pictures go to `recording` and the live view."""
+    """Calibrate, then align `parts` parts; return 0 if all succeeded. Pictures go to `recording` and the live view."""
     config = load(file)
     recording.parent.mkdir(parents=True, exist_ok=True)
     pictures = recording.with_name(f"{recording.stem}-pictures.rrd")

@@ -78,14 +78,14 @@ def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertif
     return checks
 
 
-def routers(found: Sequence[tuple[str, str]]) -> list[Check]:
+def routers(links: Sequence[tuple[str, str]]) -> list[Check]:
     """Check the routers through which users connect; without them the robot serves local users only."""
     remedy = "start the router there, or correct zenoh.connect, zenoh.router and certificates"
     return [
         Check("router", "warning", f"{endpoint}: {why}", remedy)
         if why
         else Check("router", "ok", f"{endpoint} answers")
-        for endpoint, why in found
+        for endpoint, why in links
     ]
 
 
@@ -118,21 +118,21 @@ READS: Final = (
 """Keys of a configuration on which the machine's checks depend."""
 
 
-def run_checks(path: Path, found: Findings, read: Callable[[Config], Machine]) -> list[Check]:
-    """Return each mistake of a file, and every check that can do without what is impossible; `read` reads the machine.
+def run_checks(path: Path, findings: Findings, read: Callable[[Config], Machine]) -> list[Check]:
+    """Return each mistake of a file, and every check that does not depend on the wrong keys.
 
-    It is not called where what it needs to know is impossible.
+    `read` reads the machine; it is not called if a key that it needs is wrong.
     """
-    wrong = [mistake.key for mistake in found.mistakes]
-    checks = failed_checks(path, found.mistakes)
+    wrong = [mistake.key for mistake in findings.mistakes]
+    checks = failed_checks(path, findings.mistakes)
     if overlap(READS, wrong):
-        checks += diagnose(found.config, wrong)
+        checks += diagnose(findings.config, wrong)
     else:
-        checks += examine(found.config, read(found.config), wrong)
+        checks += examine(findings.config, read(findings.config), wrong)
     if wrong:
-        skipped = "what depends on the above" + (", and the machine," if overlap(READS, wrong) else "")
-        later = f"{skipped} is looked at once that is right"
-        checks.append(Check("the rest", "warning", later, "correct it, ask again"))
+        machine = ", and those of the machine," if overlap(READS, wrong) else ""
+        later = f"checks that depend on the above{machine} were skipped"
+        checks.append(Check("the rest", "warning", later, "correct the above, then run trirail doctor again"))
     return checks
 
 
@@ -171,13 +171,13 @@ def rights(lacking: tuple[str, ...], realtime: str) -> Check:
         return Check("rights", "ok", "SCHED_FIFO, locked memory, a processor of its own")
     if realtime == "off":
         return Check("rights", "warning", lacking[0], 'loop.realtime = "prefer" takes what it gets')
-    found = ", ".join(lack.split(";")[0] for lack in lacking)
+    finding = ", ".join(lack.split(";")[0] for lack in lacking)
     remedy = "; ".join(lack.split("; ", 1)[1] for lack in lacking)
-    return Check("rights", "failure" if realtime == "enforce" else "warning", f"without {found}", remedy)
+    return Check("rights", "failure" if realtime == "enforce" else "warning", f"without {finding}", remedy)
 
 
 def clock(source: str | None, resolution: float) -> Check:
-    """The clock that the ticks come from."""
+    """Check the clock of the loop's ticks."""
     if resolution > MAX_CLOCK_RESOLUTION_S:
         reading = f"{source or 'unknown source'}, resolution {resolution * 1e3:g} ms"
         return Check("clock", "failure", reading, "boot a kernel with high-resolution timers (CONFIG_HIGH_RES_TIMERS)")
@@ -190,19 +190,19 @@ def clock(source: str | None, resolution: float) -> Check:
 
 
 def governor(governors: Mapping[int, str]) -> Check:
-    """A processor that sleeps or slows down wakes late; any may, for the loop's neighbours run on the others."""
+    """Check the frequency governors: a processor that sleeps or slows down wakes late."""
     if not governors:
         return Check("governor", "ok", "no processor has frequency scaling to be seen")
     others = sorted({name for name in governors.values() if name != PERFORMANCE})
     if not others:
         return Check("governor", "ok", f"{PERFORMANCE} on every processor")
-    of = {name: ", ".join(str(cpu) for cpu, found in governors.items() if found == name) for name in others}
-    found = "; ".join(f"{name} on processor {cpus}" for name, cpus in of.items())
-    return Check("governor", "warning", found, f"cpupower frequency-set --governor {PERFORMANCE}")
+    of = {name: ", ".join(str(cpu) for cpu, finding in governors.items() if finding == name) for name in others}
+    finding = "; ".join(f"{name} on processor {cpus}" for name, cpus in of.items())
+    return Check("governor", "warning", finding, f"cpupower frequency-set --governor {PERFORMANCE}")
 
 
 def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
-    """The loop's processor, for it alone."""
+    """Check that the loop has its processor to itself."""
     if cpu in isolated:
         return Check("processor", "ok", f"{cpu}, isolated")
     if simulated:
@@ -264,7 +264,9 @@ def _traffic(config: Config, passed: BusTraffic | None) -> list[Check]:
         return []
     share = bits_of(passed.frames, passed.data) / passed.seconds / config.can.bitrate
     name = f"{config.can.channel} traffic"
-    load = f"{share:.1%} of {config.can.bitrate} bit/s, {passed.frames} frames in {passed.seconds:.1f} s, by whomever"
+    load = (
+        f"{share:.1%} of {config.can.bitrate} bit/s, {passed.frames} frames in {passed.seconds:.1f} s, from all nodes"
+    )
     if share <= HIGH_LOAD:
         return [Check(name, "ok", load)]
     return [Check(name, "warning", load, f"look who sends: candump {config.can.channel}")]

@@ -25,7 +25,7 @@ app = App(name="drives", help="Show the drives; save, compare, restore their par
 UNTESTED_NOTE = (
     "no make of drive was tried on hardware yet: go on with trirail commission, the hand on the emergency stop"
 )
-"""What the examples of makes say in their first line, too."""
+"""Note about untested drives, also in the first line of the makers' example files."""
 Axis = Literal["A", "B", "C"]
 _MAX_NAMED: Final = 8
 """Greatest number of objects named in one line; --json and the file have all."""
@@ -33,9 +33,9 @@ _MAX_NAMED: Final = 8
 
 @app.default
 def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False, json: Json = False) -> int:
-    """Show each drive: who it says it is, its modes and units, and what its set-up would change, and why.
+    """Show each drive: identity, modes, units, and the changes of its set-up with their reasons.
 
-    Reads only, unless told to apply; no drive gets power, and nothing is stored in one. Not while the service runs.
+    Without --apply it only reads. No drive gets power, and none stores anything. Stop the service first.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def save(
 ) -> int:
     """Read every parameter of the drives into a file each, drive-A.dcf (CiA 306) and so on. Never over one that exists.
 
-    Left out is what no drive keeps: what is read-only, controlwords, targets, actual values, commands.
+    Objects that no drive stores are left out: read-only ones, controlwords, targets, actual values, commands.
 
     Parameters
     ----------
@@ -197,10 +197,10 @@ def restore(
     store: Annotated[bool, Flag] = False,
     json: Json = False,
 ) -> int:
-    """Write what differs from a file to the drive, read it back, and say what differs still: then exit 1.
+    """Restore a drive's parameters from a file, and read them back; exit 1 if any still differs.
 
-    Only without power and with no service or other master on the bus; what the set-up gives, node id and bitrate are
-    left as they are. A file of another product is refused.
+    Only without power and with no service or other master on the bus. Parameters of the set-up, node id and bitrate
+    do not change. A file of another product is refused.
 
     Parameters
     ----------

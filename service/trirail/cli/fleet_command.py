@@ -1,4 +1,4 @@
-"""`trirail fleet`: all robots that a user may see, live, who needs somebody first."""
+"""`trirail fleet`: live table of all robots that a user may see; those that need attention are first."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from trirail.client.fleet import Fleet, Member
 
 SNAPSHOT_S = 2.5
-"""How long it is listened before what was heard is printed with --json [s]: each robot says something once a second."""
+"""Duration of receiving with --json [s]; each robot sends at least once a second."""
 REFRESH_S = 0.5
-"""How often the table is drawn [s]."""
+"""Interval of drawing the table [s]."""
 
 
 def fleet(*, service: Service = HERE) -> int:
-    """Show all robots that answer at --connect, a router as a rule, until Ctrl-C: who needs somebody stands first.
+    """Show all robots at --connect, usually a router, until Ctrl-C; those that need attention are first.
 
-    A robot is silent where its loop has said nothing for 3 s. Into a file or pipe, a line whenever a robot
-    has changed. With --json, one look of 2.5 s.
+    A robot is silent if its loop has sent nothing for 3 s. Into a file or pipe, it prints a line for each change of a
+    robot. With --json, it prints once after 2.5 s.
     """
     never = threading.Event()
     from trirail.client.fleet import Fleet

@@ -1,4 +1,4 @@
-"""How `trirail --help` is arranged: groups of commands in the order in which they are needed, examples for each."""
+"""Arrangement of `trirail --help`: groups of commands in the order of use, with examples of each command."""
 
 from __future__ import annotations
 

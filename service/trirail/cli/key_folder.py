@@ -1,12 +1,12 @@
 """The folder of an authority: its certificate and key, the robot's, and one folder for each user to take away.
 
-    ca.pem  ca-key.pem    the authority: whoever has the key can make any user, so it need not be on the robot
+    ca.pem  ca-key.pem    the authority: its key can make any user, so keep it off the robot
     cert.pem  key.pem     the robot's own; with ca.pem and revoked.txt they are all that [zenoh.tls] reads here
     revoked.txt           users that have no role any more, whatever [zenoh.users] says
-    users/<user>/         ca.pem, cert.pem, key.pem: what the user needs; the key may be deleted here once he has it
+    users/<user>/         ca.pem, cert.pem, key.pem for the user; delete the key here after you have handed it over
 
-Private keys are readable by their owner alone. A file or folder is there whole or not at all: each is written beside
-its place and renamed. What is renewed is a certificate; its key stays.
+Only their owner can read private keys. No file or folder is ever incomplete: each is written beside its place and
+renamed. A renewed certificate has the same key.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class KeyFolder:
         """
         folder = self.folder / USERS / user
         if user in revoked(self.folder):
-            raise ServiceError(f"{user} was revoked, and what was lost has that name: choose another one")
+            raise ServiceError(f"{user} was revoked, and the lost certificate has that name: choose another one")
         if user == self._robot().name:
             raise ServiceError(f"{user} is the robot itself: choose another name")
         if folder.exists():
@@ -98,7 +98,7 @@ class KeyFolder:
         return self._find(name)
 
     def revoke(self, user: str) -> None:
-        """Put a user among those that have no role, and delete what there is of him."""
+        """Revoke a user's role, and delete the user's folder."""
         there = self._find(user)
         if there.is_robot:
             raise ServiceError(f"{user} is the robot itself: a new authority makes its certificate worthless")
@@ -114,10 +114,10 @@ class KeyFolder:
         return [self._robot(), *(_issued(each, is_robot=False) for each in users)]
 
     def _find(self, name: str) -> IssuedCertificate:
-        found = [each for each in self.issued() if each.name == name]
-        if not found:
+        matches = [each for each in self.issued() if each.name == name]
+        if not matches:
             raise ServiceError(f"{self.folder}: nobody is called {name}; trirail keys list shows who there is")
-        return found[0]
+        return matches[0]
 
     def _robot(self) -> IssuedCertificate:
         return _issued(self.folder, is_robot=True)

@@ -97,15 +97,15 @@ def add(
     folder: AuthorityFolder = HERE,
     json: Json = False,
 ) -> int:
-    """Make a user's certificate, in a folder to give to him.
+    """Make a user's certificate, in a folder to hand over.
 
     Parameters
     ----------
     user
-        The name in which he sends goals and commands.
+        Name of the user, which goals and commands carry.
     role
-        What he is to be: a viewer sees all and may stop, an operator also moves the robot, a maintainer also resets
-        and homes. It counts once it is in the configuration.
+        Role of the user: a viewer sees everything and may stop, an operator also moves the robot, a maintainer also
+        resets and homes. It takes effect when it is in the configuration.
     days
         How long the certificate is good.
     """
@@ -160,17 +160,17 @@ def further(
 @app.default
 @app.command(name="list")
 def show(*, folder: AuthorityFolder = HERE, json: Json = False) -> int:
-    """List the certificates and until when they are good, and who is revoked; roles are in the configuration."""
+    """List the certificates with their expiry, and the revoked users; roles are in the configuration."""
     from trirail.cli.key_folder import KeyFolder
     from trirail.wire.credentials import revoked
 
     issued, gone = KeyFolder(folder).issued(), sorted(revoked(folder))
     if json:
-        found = [
+        certificates = [
             {"name": each.name, "robot": each.serves, "expires": each.expires, "trouble": each.trouble()}
             for each in issued
         ]
-        terminal.json({"folder": str(folder), "certificates": found, "revoked": gone})
+        terminal.json({"folder": str(folder), "certificates": certificates, "revoked": gone})
         return 0
     table = terminal.table("name", "", "until", "days left", "")
     now = datetime.now(UTC)
@@ -188,8 +188,8 @@ def show(*, folder: AuthorityFolder = HERE, json: Json = False) -> int:
 def renew(name: str, /, *, days: Days = 365.0, folder: AuthorityFolder = HERE, json: Json = False) -> int:
     """Make a new certificate for the key of a user, or of the robot by its name.
 
-    A user's counts when his next session opens. The robot's counts when the service starts again: do that while the
-    robot stands.
+    A user's certificate takes effect with the user's next session, the robot's with the next start of the service:
+    restart it while the robot is at rest.
 
     Parameters
     ----------

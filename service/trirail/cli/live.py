@@ -42,7 +42,7 @@ def show(state: State, info: Info) -> None:
 
 def watch(robot: Robot, *, json_lines: bool) -> None:
     """Show the state live, or as lines of JSON, until Ctrl-C; raises ServiceError where nobody answers any more."""
-    info = robot.info()  # so that a missing service is said, not waited for
+    info = robot.info()  # fails immediately if there is no service, where the states would only be silent
     limits = limits_of(info)
     with contextlib.suppress(KeyboardInterrupt):
         if json_lines:
@@ -58,7 +58,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
 
 
 def _print_once_a_second(robot: Robot) -> None:
-    """Print a line of the state once a second, for a file or pipe, in which nothing can be drawn anew."""
+    """Print a line of the state once a second, for a file or pipe, in which a table cannot be redrawn."""
     due = -math.inf
     for state in robot.states(SERVICE_TIMEOUT_S):
         if time.monotonic() >= due:
@@ -82,7 +82,7 @@ def show_jog(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True
 
 
 def limits_of(info: Info) -> Limits:
-    """Return the limits of a robot from what its service tells of it. Raises ServiceError where they are none."""
+    """Return the limits in a service's information. Raises ServiceError if they cannot be decoded."""
     from trirail.config import Limits  # numba, with the kinematics
 
     try:
@@ -92,7 +92,7 @@ def limits_of(info: Info) -> Limits:
 
 
 def table(state: State, robot: str, labels: Labels, limits: Limits | None = None) -> Table:
-    """Return a state as a table: what is wrong, what is under way, measured and commanded, near limits, the loop."""
+    """Return a state as a table: faults, current goal, measured and commanded values, near limits, loop."""
     grid = Table.grid(padding=(0, 2))
     grid.add_row("robot", f"[bold]{plain(robot)}[/]  {_mode(state)}  t {state.t:.2f} s")
     for fault in state.faults:
@@ -179,8 +179,8 @@ def _add_sliders(grid: Table, state: State, labels: Labels) -> None:
         )
         grid.add_row(f"slider {name}", "  ".join(written))
         traffic = msgspec.to_builtins(sliders.traffic[index])
-        if said := [f"{kind.replace('_', ' ')} {count}" for kind, count in traffic.items() if count]:
-            grid.add_row("", f"[yellow]{', '.join(said)}[/]")
+        if counts := [f"{kind.replace('_', ' ')} {count}" for kind, count in traffic.items() if count]:
+            grid.add_row("", f"[yellow]{', '.join(counts)}[/]")
 
 
 def _missing(protections: Sequence[MissingProtection], labels: Labels) -> None:

@@ -286,7 +286,7 @@ def _opencv() -> Any:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class MarkSource:
-    """Where the marks are from, one of --program, --pictures and --camera, and how they are looked at."""
+    """Source of the marks, one of --program, --pictures and --camera, and settings of their detection."""
 
     program: str | None = None
     'A program that prints a line of JSON, {"mark": [u, v], …} in pixels, for each line that it reads.'
@@ -304,11 +304,11 @@ class MarkSource:
     size: float = 100.0
     "Its size in pixels: a disc's diameter, a cross's bars, a corner's sides."
     turn: float = 0.0
-    "By what angle it is turned in the picture, from u to v, in degrees."
+    "Its rotation in the picture, from u to v, in degrees."
     looks: int = 1
     "Pictures of a measurement, or at each place."
     wait: float = 0.0
-    "How long the cameras take to show what is [s]."
+    "Latency of the cameras [s]."
     speed: notation.Share = 1.0
     "Fraction of full speed, above 0 and up to 1."
 
@@ -350,7 +350,7 @@ def _window(text: str) -> tuple[str, MarkWindow]:
     try:
         u, v, width, height = map(int, numbers.split(","))
         if not (name and equals and min(u, v) >= 0 and min(width, height) > 0):
-            raise ValueError  # noqa: TRY301 - what is wrong with it is said below
+            raise ValueError  # noqa: TRY301 - the message is made below
     except ValueError:
         right = "MARK=U,V,WIDTH,HEIGHT is wanted, whole pixels from the corner above on the left, as left=0,0,640,960"
         raise TrirailError(f"--window {text}: {right}") from None

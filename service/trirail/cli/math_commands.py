@@ -23,7 +23,7 @@ SLICE_STEPS_DEG = (1, 2, 5, 10, 15, 20, 30, 45)
 CM2 = 1e4
 """Areas are shown in cm²: a stage has some, a large robot a thousand."""
 MAX_SLICES = 8
-"""So many of them at most."""
+"""Maximum number of slices."""
 
 
 def ik(
@@ -137,9 +137,9 @@ def _check_reach(config: Config, robot: Geometry, pose: Array) -> None:
         raise _out_of_reach(exceeded)
 
 
-def _out_of_reach(found: list[Violation]) -> KinematicsError:
-    first = found[0]
-    message = f"out of reach: {'; '.join(map(str, found))}"
+def _out_of_reach(violations: list[Violation]) -> KinematicsError:
+    first = violations[0]
+    message = f"out of reach: {'; '.join(map(str, violations))}"
     return KinematicsError(message, leg=first.axis if first.unit == "m" else "", value=first.value, limit=first.limit)
 
 
@@ -172,10 +172,10 @@ def workspace(
     deg: Annotated[bool, Flag] = False,
     offline: Offline = DEFAULT,
 ) -> int:
-    """Measure the workspace: what the service permits, and what the robot itself reaches.
+    """Measure the workspace that the robot reaches, and the part that the service permits.
 
-    The robot's own reach ends where sliders or platform edges do, and at the singularity margin. The service
-    permits what of it lies in the window of limits.platform.
+    The ends of sliders and platform edges, and the singularity margin, bound the robot's reach. The service permits
+    the part within the window of limits.platform.
 
     Parameters
     ----------

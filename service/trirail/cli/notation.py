@@ -58,15 +58,15 @@ def pose(values: Sequence[float], width: int = 0) -> str:
     return f"x {written(x, 'mm', 3, width)}   y {written(y, 'mm', 3, width)}   φ {written(phi, '°', 4, width)}"
 
 
-def correction(told: CorrectionInfo, labels: Labels) -> str:
+def correction(info: CorrectionInfo, labels: Labels) -> str:
     """Describe the correction of as-built errors on one line."""
     words = []
-    if told.file:
-        x, y, phi = told.greatest
+    if info.file:
+        x, y, phi = info.greatest
         most = f"{written(x, 'µm', 1)} in x, {written(y, 'µm', 1)} in y, {written(phi, 'mrad', 3)}"
-        words.append(f"{told.file}, measured {told.made}: up to {most}")
-    if any(told.backlash):
-        each = [f"{name} {written(width, 'µm', 1)}" for name, width in zip(labels, told.backlash, strict=True)]
+        words.append(f"{info.file}, measured {info.made}: up to {most}")
+    if any(info.backlash):
+        each = [f"{name} {written(width, 'µm', 1)}" for name, width in zip(labels, info.backlash, strict=True)]
         words.append(f"backlash of {', '.join(each)}")
     return "; ".join(words)
 

@@ -1,4 +1,4 @@
-"""What several commands take: which service or which robot, and how to print."""
+"""Options shared by several commands: service or robot, and output format."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Wait = Annotated[bool, Flag, Parameter(help="Show the progress; exit 0 only when
 
 
 def described(kind: type[GoalKind], field: str, as_typed: str = "") -> Parameter:
-    """Return the help of an option: what its field of a kind of goal is for, and how it is typed."""
+    """Return the help of an option: the description of its field in a kind of goal, and the notation."""
     words = field_description(kind, field)
     return Parameter(help=f"{words[0].upper()}{words[1:]}{as_typed}.")
 
@@ -83,7 +83,7 @@ def _robot(context: CompletionContext) -> Robot:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Address:
-    """Where services are, and how to print."""
+    """Address of services, and output format."""
 
     connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
     "Zenoh locator of the service or of a router."
@@ -95,13 +95,13 @@ class Address:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Service(Address):
-    """Which service to talk to."""
+    """Service to connect to."""
 
     robot: Annotated[str, Parameter(env_var="TRIRAIL_ROBOT", completer=robots)] = "demo"
     "Name of the robot, as in its configuration."
 
     def open(self) -> Robot:
-        """Return a session with it. Raises ServiceError where there is none."""
+        """Return a session with the service. Raises ServiceError if it does not answer."""
         from trirail.client.client import Robot
 
         return Robot(self.robot, self.connect, tls=self.tls)
@@ -110,7 +110,7 @@ class Service(Address):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Services(Address):
-    """Which services to talk to, all at one address."""
+    """Services to connect to, all at one address."""
 
     robot: Annotated[tuple[str, ...], Parameter(env_var="TRIRAIL_ROBOT", completer=robots, negative="")] = ("demo",)
     "Name of the robot, as in its configuration; again for another one."
@@ -122,7 +122,7 @@ HERE, ALL_HERE = Service(), Services()
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Offline:
-    """Which robot, and how to print."""
+    """Robot for commands without a service, and output format."""
 
     config: ConfigFile = None
     json: Annotated[bool, Flag] = False

@@ -1,4 +1,4 @@
-"""Reads what trirail.cli.doctor judges: kernel, rights, clock, CAN interface, and what a cycle takes."""
+"""Probes of the machine for trirail.cli.doctor: kernel, rights, clock, CAN interface, duration of a cycle."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ COUNTING_S = 1.0
 
 
 def machine(config: Config, *, quick: bool = False, progress: Callable[[float], None] | None = None) -> Machine:
-    """Read everything; `quick` measures no cycles, `progress` is told of the share of them that is done.
+    """Run all probes; `quick` measures no cycles, `progress` receives the share of measured cycles.
 
-    This process has the loop's rights for that, and no longer: whoever runs on its processor is to be left alone.
+    This process has the loop's real-time rights only during the probes, to leave the processor's other users alone.
     """
     cpu = realtime.processor(config.loop)
     running = loop_on(cpu)
@@ -119,7 +119,7 @@ def issued(config: Config) -> tuple[IssuedCertificate, ...] | None:
     folder = Path(config.zenoh.tls.directory)
     try:
         return tuple(KeyFolder(folder).issued()) if (folder / AUTHORITY_KEY).exists() else None
-    except ServiceError:  # what the guard says of it is said already
+    except ServiceError:  # the guard has already reported it
         return None
 
 
@@ -183,8 +183,8 @@ def traffic_between(before: BusTraffic | None, after: BusTraffic | None) -> BusT
 def governors() -> dict[int, str]:
     """Return the frequency governor of each processor that has one."""
     files = SYSTEM.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor")
-    found = {int(file.parts[-3].removeprefix("cpu")): _text(file) for file in files}
-    return {cpu: name for cpu, name in sorted(found.items()) if name}
+    names = {int(file.parts[-3].removeprefix("cpu")): _text(file) for file in files}
+    return {cpu: name for cpu, name in sorted(names.items()) if name}
 
 
 def loop_on(cpu: int) -> int | None:
@@ -211,7 +211,7 @@ def _rights_of(loop: LoopTable) -> Iterator[tuple[str, ...]]:
 
 
 def _available_rights(loop: LoopTable) -> Any:
-    # What is missing is for the doctor to say; the loop would refuse to run.
+    # The doctor reports missing rights; with "enforce", the loop refuses to run without them.
     return "off" if loop.realtime == "off" else "prefer"
 
 

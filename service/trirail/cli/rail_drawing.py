@@ -11,10 +11,10 @@ _RAIL_COLUMNS: Final = 60
 """Characters in which a rail is drawn."""
 
 
-def draw_lines(found: Stops) -> list[str]:
-    """Return the lines of the drawing: to scale, but that nothing is too short to be seen."""
-    low, high = found.rail or found.travel
-    low, high = min(low, found.travel[0]), max(high, found.travel[1])
+def draw_lines(stops: Stops) -> list[str]:
+    """Return the lines of the drawing: to scale, but each part at least one character long."""
+    low, high = stops.rail or stops.travel
+    low, high = min(low, stops.travel[0]), max(high, stops.travel[1])
 
     def wide(length: float) -> int:
         return min(max(1, round(length / (high - low) * _RAIL_COLUMNS)), _RAIL_COLUMNS)
@@ -22,25 +22,25 @@ def draw_lines(found: Stops) -> list[str]:
     def at(place: float) -> int:
         return round((place - low) / (high - low) * _RAIL_COLUMNS)
 
-    begin, end = (at(place) for place in found.travel)
+    begin, end = (at(place) for place in stops.travel)
     rows = [("travel", " " * begin + "━" * max(1, end - begin))]
-    if found.rail is not None:
-        first, last = (at(place) for place in found.rail)
+    if stops.rail is not None:
+        first, last = (at(place) for place in stops.rail)
         rows.insert(0, ("rail", " " * first + "─" * max(1, last - first)))
-    for name, way in (("stop", found.way), ("quick stop", found.quick_way)):
+    for name, way in (("stop", stops.way), ("quick stop", stops.quick_way)):
         rows.append((name, " " * end + "▶" * min(wide(way), _RAIL_COLUMNS // 3)))
     ends = f"{low * 1e3:<{_RAIL_COLUMNS // 2}.4g}{high * 1e3:>{_RAIL_COLUMNS // 2}.4g} mm"
     return [f"{name:10} {line}" for name, line in rows] + [f"{'':10} {ends}"]
 
 
-def show(found: Stops) -> None:
-    """Print it, and the numbers as a table."""
+def show(stops: Stops) -> None:
+    """Print the drawing, and the numbers as a table."""
     terminal.print_line("")
-    for line in draw_lines(found):
+    for line in draw_lines(stops):
         terminal.print_line(line)
-    table = terminal.table(f"from {found.velocity * 1e3:g} mm/s", "mm", "s")
-    table.add_row("stop", f"{found.way * 1e3:.3g}", f"{found.time:.3g}")
-    table.add_row("quick stop", f"{found.quick_way * 1e3:.3g}", f"{found.quick_time:.3g}")
-    if found.left is not None:
-        table.add_row("rail left beyond the travel", f"{found.left * 1e3:.3g}", "")
+    table = terminal.table(f"from {stops.velocity * 1e3:g} mm/s", "mm", "s")
+    table.add_row("stop", f"{stops.way * 1e3:.3g}", f"{stops.time:.3g}")
+    table.add_row("quick stop", f"{stops.quick_way * 1e3:.3g}", f"{stops.quick_time:.3g}")
+    if stops.left is not None:
+        table.add_row("rail left beyond the travel", f"{stops.left * 1e3:.3g}", "")
     terminal.out.print(table)

@@ -62,9 +62,9 @@ def replay(
 
 
 def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
-    """Sum a recorded session up.
+    """Summarise a recorded session.
 
-    Goals and outcomes, tracking error, timing, faults, and what is missing.
+    Goals and outcomes, tracking error, timing, faults, missing data.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _print_comparison(
         again = otherwise if compared.plans_differing else "all come out the same to the last bit"
         lines.add("plans", f"{compared.plans} as they were answered; planned again, {again}")
     else:
-        lines.add("plans", "made anew: those of the recording are of another configuration, or not in it")
+        lines.add("plans", "computed again: the recording has none, or those of another configuration")
     if compared.first is None:
         lines.add("setpoints", "[bold green]the same to the last bit[/], in every cycle")
     else:

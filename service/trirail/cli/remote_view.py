@@ -13,10 +13,10 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from trirail.client.samples import SampleReader
 from trirail.errors import ServiceError
-from trirail.telemetry.readout import Standing
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.sinks import Relay, free_port, live_relay, live_server
-from trirail.telemetry.streams import LIVE_HZ, Shortfall, Streams, open_together
+from trirail.telemetry.streams import LIVE_HZ, MissingDataReport, Streams, open_together
 from trirail.wire import zenoh_session
 from trirail.wire.credentials import Credentials
 from trirail.wire.messages import Event
@@ -26,8 +26,8 @@ from trirail.wire.state import Info, State
 HISTORY_MB = 256.0
 """Memory for what viewers that connect late are shown of the past; nothing else runs in this process [1e6 bytes]."""
 FIRST_RECORDS_TIMEOUT_S = 5.0
-"""How long the first records may take [s]."""
-MISSING = "missing so far: {} cycles on the way here, {} batches in this view (viewer too slow)"
+"""Time-out for the first records [s]."""
+MISSING = "missing data: {} cycles on the way here, {} batches in this view (viewer too slow)"
 
 
 class RemoteView:
@@ -49,7 +49,7 @@ class RemoteView:
             self._session.close()  # type: ignore[no-untyped-call]
             raise
         self.url = server.uri
-        """Where viewers on this machine connect."""
+        """Address for viewers on this machine."""
         if len(self.robots) == 1:
             stream = self.robots[0].streams.open(server)
         else:
@@ -73,9 +73,9 @@ class RemoteView:
 
 
 class RemoteRobot:
-    """What comes of one robot, and its drawing. Raises ServiceError where no records come.
+    """Received data of one robot, and its drawing. Raises ServiceError if no records arrive.
 
-    The wall clock is this machine's at the first record, so it is late by the way through the network.
+    Wall-clock times are this machine's at the first record, so they are late by the network's delay.
     """
 
     def __init__(self, info: Info, session: zenoh.Session, name: str, root: str) -> None:
@@ -89,13 +89,13 @@ class RemoteRobot:
         self._subscribe(info.robot)
         self._first_records = self._first(info)
         offset_ns = time.time_ns() - int(unpack(self._first_records)[-1]["deadline_ns"])
-        self.streams = Streams(ShownRobot.of_info(info), name, offset_ns, root)
+        self.streams = Streams(DrawnRobot.from_info(info), name, offset_ns, root)
         self._thread = threading.Thread(target=self._run, name=f"records of {info.robot}", daemon=True)
 
     def draw(self, relay: Relay) -> None:
         """Draw from now on, in a thread."""
         self.streams.attach(relay, LIVE_HZ)
-        self._missing = Shortfall(self.streams, MISSING, lambda: (self.lost, relay.skipped))
+        self._missing = MissingDataReport(self.streams, MISSING, lambda: (self.lost, relay.skipped))
         self._records(self._first_records)
         self._thread.start()
 
@@ -157,7 +157,7 @@ class RemoteRobot:
 
     def _state(self, state: State) -> None:
         goal, target = (state.goal.id, state.goal.target) if state.goal else (None, None)
-        self.streams.stands(Standing(goal, target, state.override, "; ".join(state.faults) or None))
+        self.streams.update_state(ReadoutState(goal, target, state.override, "; ".join(state.faults) or None))
         if state.loop.bus_load != self._bus_load:
             self._bus_load = state.loop.bus_load
             self.streams.bus_load(state.loop.bus_load)

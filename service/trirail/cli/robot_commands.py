@@ -1,4 +1,4 @@
-"""Commands to a running service: goals, commands, and what it says. Each says so where nobody answers."""
+"""Commands to a running service: goals, commands, state and events. Each reports a service that does not answer."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def goto(
     x
         Position of the platform's centre [m], or with a unit: 20mm, -0.8in. Alone, the name of a pose.
     y
-        Likewise along y.
+        Position along y.
     phi
         Angle of the platform, counterclockwise [rad], or with a unit: 10deg, 50mrad.
     deg
@@ -107,18 +107,18 @@ def move(
     deg: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
-    """Move the platform by so much.
+    """Move the platform relative to its commanded pose.
 
     Parameters
     ----------
     dx
-        How far along x [m], or with a unit: 5mm, 0.5um, -0.2in.
+        Distance along x [m], or with a unit: 5mm, 0.5um, -0.2in.
     dy
-        Along y.
+        Distance along y.
     dphi
-        By what angle to turn, counterclockwise [rad], or with a unit: 1deg.
+        Rotation, counterclockwise [rad], or with a unit: 1deg.
     measured
-        From where the robot is measured to be, instead of where it was sent.
+        Move relative to the measured pose instead.
     deg
         An angle without a unit is in degrees.
     """
@@ -135,7 +135,7 @@ def goal(content: str, /, *, wait: Wait = False, service: Service = HERE) -> int
     Parameters
     ----------
     content
-        Its kind and what it says, as on the wire, in SI units and radians.
+        Kind and fields of the goal, as in messages, in SI units and radians.
     """
     request: Goal = boundary.decode(content.encode(), Goal, "not a goal")
     with service.open() as robot:
@@ -183,7 +183,7 @@ def jog(
 ) -> int:
     """Move at a velocity until Ctrl-C, or while keys are held.
 
-    With --seconds for so long; without a velocity while a key is held.
+    With --seconds it ends after that time; without a velocity it moves while you hold a key.
 
     Parameters
     ----------
@@ -337,7 +337,7 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.
     Parameters
     ----------
     force
-        Take it over from who holds it: a maintainer's, if [control] takeover does not say otherwise.
+        Take it over from its holder; needs the role in [control] takeover, a maintainer's by default.
     timeout
         After how long without a sign of life from here it ends, with a controlled stop: 0.1 to 10 s.
     """
@@ -393,12 +393,12 @@ def events(
     Parameters
     ----------
     last
-        Print so many of the past, the newest, and end; 0 for all that there are.
+        Print this number of the newest past events, and end; 0 for all.
     follow
-        Go on with those to come all the same.
+        Continue with new events after --last.
     """
     with service.open() as robot:
-        now = robot.state().t  # so that a missing service is said, not waited for
+        now = robot.state().t  # fails immediately if there is no service, where the events would only be silent
         seen = 0
         if last is not None:
             until_now = itertools.takewhile(

@@ -23,17 +23,17 @@ class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """A router's configuration file."""
 
     zenoh: Zenoh
-    """As in a robot's: where it listens, certificates, and the users of all its robots; `connect` is another router."""
+    """Section as in a robot's file: listening address, certificates, users of all its robots; `connect` is a router."""
     robots: Annotated[tuple[UserName, ...], Meta(max_length=10_000)] = ()
     """The robots that may dial it, each by the common name of its certificate, which is its name in every key."""
     routers: Annotated[dict[UserName, tuple[UserName, ...]], Meta(max_length=1000)] = {}
     """Routers that may dial it, by the common names of their certificates, each with the robots behind it."""
     state_hz: Annotated[float, Meta(gt=0.0, le=200.0)] = 5.0
-    """So often a second a user is sent each robot's state at most."""
+    """Maximum rate of each robot's states to a user [Hz]."""
 
     @property
     def behind(self) -> dict[str, tuple[str, ...]]:
-        """Who may dial it, each with the robots that it speaks for: a robot for itself."""
+        """Names of robots and routers that may connect, each with the robots behind it: a robot itself."""
         return {robot: (robot,) for robot in self.robots} | self.routers
 
     @property
@@ -79,8 +79,8 @@ def settings(config: RouterConfig) -> dict[str, Any]:
     folder = Path(config.zenoh.tls.directory)
     if gone := sorted(revoked(folder) & config.behind.keys()):
         raise ServiceError(
-            f"{', '.join(gone)}: revoked, and who has the certificate would be taken for it: take the name out of "
-            "robots and routers; a robot or router that goes on gets a certificate of another name"
+            f"{', '.join(gone)}: revoked, but in robots or routers, so that the lost certificate would be accepted; "
+            "remove the name there, and give a robot or router that is still in use a certificate of another name"
         )
     own = Credentials.read_server(folder)
     if own.name in (*config.behind, *config.all_robots):

@@ -17,15 +17,15 @@ from trirail.wire.text import json_printable, printable, wall_clock
 Form = Literal["text", "json"]
 
 BURST: Final = 100
-"""So many lines may come at once."""
+"""Maximum number of lines in a burst."""
 RATE: Final = 1.0
-"""And then so many a second: who floods the robot with goals must not fill its disk. Errors are always written."""
+"""Lines per second after a burst: a flood of goals must not fill the disk. Errors are always written."""
 PRIORITIES: Final[Mapping[str, int]] = {"info": 6, "warning": 4, "error": 3}
-"""Of each level, as journald takes it in front of a line: sd-daemon(3)."""
+"""Priority of each level, which journald reads at the begin of a line: sd-daemon(3)."""
 
 
 class Log:
-    """Writes lines with time and level. At rest nothing happens, and nothing is written."""
+    """Writer of lines with time and level."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class Log:
         self._write(now, level, words, {"time": now, "kind": "service", "level": level, "message": words})
 
     def event(self, event: Event) -> None:
-        """Write an event, once: a gateway that was started again tells the past anew."""
+        """Write an event once: a restarted gateway sends past events again."""
         if event.seq <= self._newest:
             return
         self._newest = event.seq

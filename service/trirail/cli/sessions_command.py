@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from trirail.telemetry.sessions import RecordedSession
 
 FOLDER = Path("recordings")
-"""Where a service records that was started in this folder."""
+"""Default folder of recordings, for a service that was started in the current folder."""
 
 
 def _moment(_: Any, tokens: Sequence[Token]) -> datetime:
@@ -57,7 +57,7 @@ def sessions(
 ) -> int:
     """List recorded sessions, the newest last, running ones too.
 
-    When, whose goals ended how, faults, why a black box was kept.
+    Times, outcomes of goals by user, faults, reasons of black boxes.
 
     A recording without a usable .json beside it, as after a kill, is read first.
 
@@ -68,30 +68,30 @@ def sessions(
     robot
         Only those of this robot.
     since
-        Only those that went on then or later: 2026-01-31 or 2026-01-31T12:00:00, local time.
+        Only those that ended at this time or later: 2026-01-31 or 2026-01-31T12:00:00, local time.
     until
-        Only those that had begun by then.
+        Only those that began by this time.
     fault
-        Only those with a fault whose cause, code or message has this: emcy, 0x8700, "drive A".
+        Only those with a fault whose cause, code or message contains this: emcy, 0x8700, "drive A".
     user
-        Only those in which this user sent something.
+        Only those in which this user sent a goal or command.
     outcome
-        Only those with a goal that ended so; with --user, a goal of his.
+        Only those with a goal of this outcome; with --user, a goal of that user.
     last
-        At most so many, the newest; 0 for all.
+        Maximum number of sessions, the newest; 0 for all.
     rebuild
         Read every recording, and write the .json beside it again.
     """
-    from trirail.telemetry.sessions import Wanted, fault_codes, find, recorded
+    from trirail.telemetry.sessions import SessionFilter, fault_codes, find, recorded
 
     if not folder.is_dir():
         raise ServiceError(f"{folder}: no such folder: name that of [telemetry] directory")
-    wanted = Wanted(
+    wanted = SessionFilter(
         robot, since.timestamp() if since else None, until.timestamp() if until else None, fault, user, outcome
     )
     files = recorded(folder, reread=rebuild, on_read=_ReadingReport())
     matches = find(files, wanted)
-    known = fault_codes(files) if fault is not None and not find(files, Wanted(fault=fault)) else []
+    known = fault_codes(files) if fault is not None and not find(files, SessionFilter(fault=fault)) else []
     shown = matches[-last:] if last else matches
     if json:
         terminal.json({"folder": str(folder), "found": len(matches), "sessions": msgspec.to_builtins(shown)})
@@ -109,7 +109,7 @@ def _check_code(words: str | None) -> None:
 
 
 REPORT_INTERVAL_S = 1.0
-"""How often progress of reading recordings is printed [s]."""
+"""Interval of printing the progress of reading recordings [s]."""
 
 
 class _ReadingReport:
@@ -126,8 +126,8 @@ class _ReadingReport:
             print(f"reading {path.name}, recording {self._count} without a usable .json", file=sys.stderr)  # noqa: T201
 
 
-def _print(found: list[RecordedSession], of: int) -> None:
-    for session in found:
+def _print(listed: list[RecordedSession], of: int) -> None:
+    for session in listed:
         head = (
             f"[bold]{wall_clock(session.began) if session.began is not None else 'nothing recorded'}[/]",
             _lasted(session),
@@ -143,7 +143,7 @@ def _print(found: list[RecordedSession], of: int) -> None:
         for line in filter(None, (*map(terminal.plain, session.files), _faults(session))):
             terminal.out.print(Padding(line, (0, 0, 0, 4)))
     sessions = terminal.counted(of, "session")
-    terminal.print_line(f"{len(found)} of {sessions}" if len(found) < of else sessions)
+    terminal.print_line(f"{len(listed)} of {sessions}" if len(listed) < of else sessions)
 
 
 def _lasted(session: RecordedSession) -> str:
@@ -155,7 +155,7 @@ def _lasted(session: RecordedSession) -> str:
 
 
 def _faults(session: RecordedSession) -> str:
-    """Why a black box was kept; of a session its first fault, and how many more there were."""
+    """Return the reason of a black box, or a session's first fault and the number of further ones."""
     if session.trouble is not None:
         return f"[yellow]{terminal.plain(session.trouble)}[/]"
     if session.reason is not None:

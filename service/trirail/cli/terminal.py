@@ -179,7 +179,7 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
             return wait_for_end()
         except KeyboardInterrupt as second:
             raise ServiceError(
-                f"goal {goal.id} goes on: that it has stopped was not confirmed; trirail stop stops the robot"
+                f"goal {goal.id} may still be running: the stop was not confirmed; trirail stop stops the robot"
             ) from second
 
 
@@ -203,9 +203,9 @@ def print_event(occurred: Event) -> None:
     out.print(f"{occurred.seq:5}  {wall_clock(occurred.time)}  {level}  {plain(occurred.message)}", soft_wrap=True)
 
 
-def print_checks(found: Sequence[Check]) -> None:
+def print_checks(checks: Sequence[Check]) -> None:
     """Print each check on one line, with the remedy below it."""
-    for check in found:
+    for check in checks:
         verdict = f"[{VERDICTS[check.verdict]}]{check.verdict:8}[/]"
         out.print(f"{verdict} {check.name:13} {plain(check.found)}", soft_wrap=True)
         if check.remedy:

@@ -21,14 +21,14 @@ from trirail_drivers import files
 from trirail.client.client import Robot
 from trirail.errors import ServiceError
 from trirail.processes.operating_system import python
-from trirail.telemetry.sinks import HOST, free_port
+from trirail.telemetry.sinks import LOOPBACK, free_port
 from trirail.wire.credentials import credentials_for
 from trirail.wire.endpoints import is_local
 
 WEB_PORT = 9090
 """The web viewer's port, where it is free."""
 START_TIMEOUT_S = 20.0
-"""How long the web viewer may take to answer [s]."""
+"""Time-out for the start of the web viewer [s]."""
 
 
 def run(
@@ -88,11 +88,11 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
     if not info.live:
         raise ServiceError(
             "the service has no live view (telemetry.live_port = 0): "
-            "trirail view --records draws one here from what it publishes"
+            "trirail view --records draws one here from the published records"
         )
     parts = urlsplit(info.live)
     try:
-        socket.create_connection((parts.hostname or HOST, parts.port or 0), timeout=2.0).close()
+        socket.create_connection((parts.hostname or LOOPBACK, parts.port or 0), timeout=2.0).close()
     except OSError as error:
         raise ServiceError(
             f"nothing answers at {info.live} on this machine: "
@@ -104,8 +104,8 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
 def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
     """Serve the web viewer on this machine's loopback alone until it ends."""
     port, data_port = _web_port(), free_port()
-    address = source if "://" in source else f"rerun+http://{HOST}:{data_port}/proxy"
-    url = f"http://{HOST}:{port}/?url={quote(address, safe='')}&hide_welcome_screen=1"
+    address = source if "://" in source else f"rerun+http://{LOOPBACK}:{data_port}/proxy"
+    url = f"http://{LOOPBACK}:{port}/?url={quote(address, safe='')}&hide_welcome_screen=1"
     with _rerun("--serve-web", "--web-viewer-port", str(port), "--port", str(data_port), source) as server:
         deadline = time.monotonic() + START_TIMEOUT_S
         while not _answers(port):
@@ -126,7 +126,7 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 
     Raises ServiceError if it has failed by itself.
     """
-    command = python("-m", "rerun_cli", "--bind", HOST, "--hide-welcome-screen", *arguments)
+    command = python("-m", "rerun_cli", "--bind", LOOPBACK, "--hide-welcome-screen", *arguments)
     with tempfile.TemporaryFile() as log, _settings() as environment:
         viewer = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
         try:
@@ -162,7 +162,7 @@ def _web_port() -> int:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((HOST, WEB_PORT))
+            probe.bind((LOOPBACK, WEB_PORT))
         except OSError:
             return free_port()
     return WEB_PORT
@@ -170,7 +170,7 @@ def _web_port() -> int:
 
 def _answers(port: int) -> bool:
     try:
-        socket.create_connection((HOST, port), timeout=1.0).close()
+        socket.create_connection((LOOPBACK, port), timeout=1.0).close()
     except OSError:
         return False
     return True

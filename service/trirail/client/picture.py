@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from trirail.quantities import worded
 from trirail.telemetry import palette
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.palette import Colour
-from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.state import Info, State
 from trirail.workspace import part_positions
 from trirail.workspace.part_positions import RobotParts
@@ -33,7 +33,7 @@ def line(name: str, state: State) -> str:
 
 def html(info: Info, state: State) -> str:
     """Return the state with a drawing of rails, sliders and platform; the commanded platform is pale."""
-    robot = ShownRobot.of_info(info)
+    robot = DrawnRobot.from_info(info)
     mode = palette.code(next(colour for mode, colour in palette.MODES.items() if str(mode) == state.mode))
     goal = f" to <b>{escape(state.goal.id)}</b>" if state.goal is not None else ""
     faults = "".join(f"<br/><b>{escape(fault)}</b>" for fault in state.faults)
@@ -44,7 +44,7 @@ def html(info: Info, state: State) -> str:
     )
 
 
-def drawing(robot: ShownRobot, state: State) -> str:
+def drawing(robot: DrawnRobot, state: State) -> str:
     """Return the robot at a state as an SVG picture, x to the right and y upwards."""
     parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     placed = part_positions.transform_lines(parts.outline, state.pose)

@@ -11,7 +11,7 @@ from trirail_drivers.interface import Triple
 from trirail.alignment.images import Lens, Pair
 from trirail.config import as_built, room
 from trirail.errors import TrirailError
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.state import Info
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ INSTALL = "pip install 'trirail[analysis]'"
 
 def geometry_id(info: Info) -> str:
     """Return the checksum of a service's [geometry], as correction maps have it."""
-    return as_built.geometry_of(ShownRobot.of_info(info).geometry)
+    return as_built.geometry_of(DrawnRobot.from_info(info).geometry)
 
 
 def geometry_task(
@@ -43,7 +43,7 @@ def geometry_task(
         if (error.name or "").partition(".")[0] != "scipy":
             raise
         raise TrirailError(f"the fit needs SciPy, which is not installed: {INSTALL}") from error
-    robot = ShownRobot.of_info(info)
+    robot = DrawnRobot.from_info(info)
     task = GeometryTask(robot.geometry, room(robot.limits), field, views, lens, poses, looks, approach)
     task.check()
     return task

@@ -1,4 +1,4 @@
-"""A wrong value in words of the file: which key, what it is, what is allowed, and what was probably meant."""
+"""Messages about wrong values of a file: the key, its value, the allowed values, and a suggestion."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from trirail.quantities import meant
 from trirail.wire.decoding import converted
 
 Place = tuple[str | int, ...]
-"""Where in nested tables and arrays: names and indices."""
+"""Position in nested tables and arrays: names and indices."""
 
 
 def leaves(value: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
-    """Yield every value that is no table or array, with where it stands in the file."""
+    """Yield every value that is not a table or array, with its position in the file."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from leaves(inner, (*place, name))
@@ -34,12 +34,12 @@ def leaves(value: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
 
 
 class Mistake(NamedTuple):
-    """What a configuration file cannot have."""
+    """Mistake in a configuration file."""
 
     key: str
-    """Where."""
+    """Key with the mistake."""
     text: str
-    """Key, value and what is allowed, in words."""
+    """Message with the key, its value and the allowed values."""
 
 
 def overlap(keys: Iterable[str], others: Iterable[str]) -> bool:
@@ -53,22 +53,22 @@ def _holds(table: str, key: str) -> bool:
 
 
 class _WrongValue(NamedTuple):
-    """A value that its type does not take."""
+    """Value that its type does not accept."""
 
     place: Place
     text: str
     kind: mi.Type | None
-    """The type of what belongs there; None where nothing does."""
+    """Expected type; None for an unknown key."""
 
 
 def wrong_values(raw: dict[str, Any], kind: type[msgspec.Struct]) -> list[Mistake]:
-    """Return every value of nested tables that the types of a kind of file do not take."""
+    """Return a mistake for every value of nested tables that `kind`, the type of the file, does not accept."""
     return [Mistake(_key(wrong.place), wrong.text) for wrong in _wrong_values(raw, mi.type_info(kind), ())]
 
 
 def repaired(raw: dict[str, Any]) -> tuple[Config, list[Mistake]]:
-    """Return what tables hold, with all that is no value of its key; in the place of each stands one that is."""
-    tables, found = copy.deepcopy(raw), list[Mistake]()
+    """Return the configuration in tables, with a valid value in place of each wrong one, and the mistakes."""
+    tables, mistakes = copy.deepcopy(raw), list[Mistake]()
     while wrong := list(_wrong_values(tables, mi.type_info(Config), ())):
         for place, text, kind in wrong:
             table, key = _at(place[:-1], tables), _key(place)
@@ -76,13 +76,13 @@ def repaired(raw: dict[str, Any]) -> tuple[Config, list[Mistake]]:
                 del table[place[-1]]
             else:
                 table[place[-1]] = _stand_in(kind)
-            if not overlap((key,), (each.key for each in found)):  # else the stand-ins do not go together
-                found.append(Mistake(key, text))
-    return converted(tables, Config), found
+            if not overlap((key,), (each.key for each in mistakes)):  # else the stand-ins do not go together
+                mistakes.append(Mistake(key, text))
+    return converted(tables, Config), mistakes
 
 
 def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_WrongValue]:
-    """Yield what a type does not take of a value, and of all that is in it."""
+    """Yield the parts of a value, or the value itself, that a type does not accept."""
     if isinstance(value, float) and not math.isfinite(value):
         yield _WrongValue(place, f"{_key(place)} = {value}: it must be a finite number", kind)
         return
@@ -94,7 +94,7 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
             of_each = [list(_wrong_values(value, part, place)) for part in types]
             if all(of_each):
                 # The type whose shape the value has says where in it; else none is nearer than another.
-                inside = (found for found in of_each if all(wrong.place != place for wrong in found))
+                inside = (errors for errors in of_each if all(wrong.place != place for wrong in errors))
                 yield from next(inside, [_unexpected(value, kind, place)])
         case mi.StructType(), dict():
             yield from _wrong_fields(value, kind, place)
@@ -104,28 +104,28 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
             types = kind.item_types if isinstance(kind, mi.TupleType) else (kind.item_type,) * len(value)
             for index, (each, inner) in enumerate(zip(value, types, strict=True)):
                 yield from _wrong_values(each, inner, (*place, index))
-        case _ if not _takes(kind, value):
+        case _ if not _accepts(kind, value):
             yield _unexpected(value, kind, place)
 
 
 def _wrong_fields(table: dict[str, Any], kind: mi.StructType, place: Place) -> Iterator[_WrongValue]:
-    """Yield what is wrong in a table: keys, their values and, where these are right, what does not go together."""
+    """Yield wrong keys and values of a table; if there are none, values that contradict each other."""
     word = "key" if place else "section"
     fields = {field.encode_name: field for field in kind.fields}
-    found: list[_WrongValue] = []
+    wrong_fields: list[_WrongValue] = []
     for name, value in table.items():
         at = (*place, name)
         if name in fields:
-            found += _wrong_values(value, fields[name].type, at)
+            wrong_fields += _wrong_values(value, fields[name].type, at)
         else:
             close = difflib.get_close_matches(name, fields, n=1)
             hint = f"did you mean {close[0]}?" if close else f"allowed are {', '.join(fields)}"
-            found.append(_WrongValue(at, f"{_key(at)}: unknown {word}; {hint}", None))
+            wrong_fields.append(_WrongValue(at, f"{_key(at)}: unknown {word}; {hint}", None))
     for name, field in fields.items():
         if field.required and name not in table:
-            found.append(_WrongValue((*place, name), f"{_key((*place, name))}: missing {word}", field.type))
-    yield from found
-    if not found and hasattr(kind.cls, "__post_init__"):
+            wrong_fields.append(_WrongValue((*place, name), f"{_key((*place, name))}: missing {word}", field.type))
+    yield from wrong_fields
+    if not wrong_fields and hasattr(kind.cls, "__post_init__"):
         try:
             msgspec.convert(table, kind.cls)
         except msgspec.ValidationError as error:
@@ -137,17 +137,17 @@ def _wrong_fields(table: dict[str, Any], kind: mi.StructType, place: Place) -> I
 
 
 def _wrong_names(table: dict[str, Any], kind: mi.DictType, place: Place) -> Iterator[_WrongValue]:
-    """Yield what is wrong in a table whose keys are names."""
+    """Yield wrong names and values of a table whose keys are names."""
     for name, value in table.items():
-        if _takes(kind.key_type, name):
+        if _accepts(kind.key_type, name):
             yield from _wrong_values(value, kind.value_type, (*place, name))
         else:
             text = f"{_key(place)}: {name!r} is no name here: expected {expected(kind.key_type)}"
             yield _WrongValue((*place, name), text, None)
 
 
-def _takes(kind: mi.Type, value: object) -> bool:
-    """Whether a type takes a value that is no table or array of the right length."""
+def _accepts(kind: mi.Type, value: object) -> bool:
+    """Whether a type accepts a value; tables, and arrays of the right length, are checked elsewhere."""
     match kind:
         case mi.NoneType():
             return value is None
@@ -248,7 +248,7 @@ def _other_unit(value: object, kind: mi.Type) -> str:
 
 
 _POSSIBLE: Final[tuple[object, ...]] = (1, 0.5, 0, 10, 1000, 50_000, True, "x", "605A", "counts/s")
-"""Of these some value is possible for every key that is no table or array."""
+"""Candidate values: every key that is not a table or array accepts one of them."""
 
 
 def _stand_in(kind: mi.Type) -> object:
@@ -270,7 +270,7 @@ def _stand_in(kind: mi.Type) -> object:
             return values[0]
         case mi.EnumType(cls=cls):
             return next(iter(cls)).value
-    return next(value for value in _POSSIBLE if _takes(kind, value))
+    return next(value for value in _POSSIBLE if _accepts(kind, value))
 
 
 def _at(place: Place, raw: Any) -> Any:

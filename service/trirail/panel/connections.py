@@ -1,4 +1,4 @@
-"""Connections to the panel's server: idle ones block neither new connections nor the shutdown."""
+"""Connections to the panel's server; idle ones block neither new connections nor the shutdown."""
 
 from __future__ import annotations
 
@@ -9,38 +9,46 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-ASKING = 32
+MAX_REQUESTS = 32
 """Maximum number of open connections that are not tabs (browsers hold none); a new one replaces the oldest."""
-TABS = 16
+MAX_TABS = 16
 """Maximum number of tabs, which are also at most half of all connections."""
-EACH = 4
+DESCRIPTORS_PER_CONNECTION = 4
 """Descriptors per connection: its own, and three of websockets."""
-SPARE = 24
+RESERVED_DESCRIPTORS = 24
 """Descriptors reserved for the rest of the process, in addition to those open at the start."""
-PAUSE = 0.1
+ACCEPT_DELAY_S = 0.1
 """Delay before the next attempt to accept, after the system had no descriptor or memory for a connection [s]."""
-ENDING = 1.0
+CLOSE_TIMEOUT_S = 1.0
 """Time limit for the end of a closed connection [s]."""
 
 
 class Connections:
-    """Acceptor on a socket, which handles each connection in a thread of its own, until it is closed.
+    """Acceptor of connections, each handled in its own thread.
 
-    `handle` receives socket and address, and closes the socket; a refused or displaced client receives `refusal` if
-    that does not block. A client that holds silent connections, or all descriptors, does not lock out others.
+    A client that holds silent connections, or all descriptors, does not lock out others.
+
+    Parameters
+    ----------
+    listening
+        Socket to accept on.
+    handle
+        Receives the socket and address of a connection, and closes the socket.
+    refusal
+        Bytes sent to a refused or displaced client, if sending does not block.
     """
 
     def __init__(self, listening: socket.socket, handle: Callable[[socket.socket, Any], None], refusal: bytes) -> None:
         self._listening = listening
         self._handle = handle
         self._refusal = refusal
-        self._asking: dict[socket.socket, None] = {}
+        self._requests: dict[socket.socket, None] = {}
         self._tabs: set[socket.socket] = set()
         self._changed = threading.Condition()
         self._closed = False
         limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        left = limit - listening.fileno() - SPARE  # the system assigns the lowest free descriptor
-        self._most = max(2, min(ASKING + TABS, left // EACH))
+        left = limit - listening.fileno() - RESERVED_DESCRIPTORS  # the system assigns the lowest free descriptor
+        self._max_connections = max(2, min(MAX_REQUESTS + MAX_TABS, left // DESCRIPTORS_PER_CONNECTION))
 
     def accept(self) -> None:
         """Accept connections until closed."""
@@ -52,19 +60,19 @@ class Connections:
                     return
                 self._make_room()
                 with self._changed:
-                    self._changed.wait(PAUSE)
+                    self._changed.wait(ACCEPT_DELAY_S)
                 continue
-            full = len(self._asking) + len(self._tabs) >= self._most
+            full = len(self._requests) + len(self._tabs) >= self._max_connections
             if (full and not self._make_room()) or not self._begin(connection, address):
                 self._refuse(connection)
                 connection.close()
 
-    def keep(self, connection: socket.socket) -> bool:
-        """Make a connection a tab until it ends, which is never displaced; return whether there is room for it."""
+    def make_tab(self, connection: socket.socket) -> bool:
+        """Mark a connection as a tab, which is never displaced; return whether there is room for it."""
         with self._changed:
-            if len(self._tabs) >= min(TABS, self._most // 2) or connection not in self._asking:
+            if len(self._tabs) >= min(MAX_TABS, self._max_connections // 2) or connection not in self._requests:
                 return False
-            del self._asking[connection]
+            del self._requests[connection]
             self._tabs.add(connection)
             return True
 
@@ -72,10 +80,10 @@ class Connections:
         """Stop accepting, end all connections, and wait for them up to ENDING seconds."""
         with self._changed:
             self._closed = True
-            for ended in (self._listening, *self._asking, *self._tabs):
+            for ended in (self._listening, *self._requests, *self._tabs):
                 with contextlib.suppress(OSError):
                     ended.shutdown(socket.SHUT_RDWR)
-            self._changed.wait_for(lambda: not (self._asking or self._tabs), ENDING)
+            self._changed.wait_for(lambda: not (self._requests or self._tabs), CLOSE_TIMEOUT_S)
         self._listening.close()
 
     def _begin(self, connection: socket.socket, address: object) -> bool:
@@ -83,7 +91,7 @@ class Connections:
         with self._changed:
             if self._closed:
                 return False
-            self._asking[connection] = None
+            self._requests[connection] = None
         try:
             threading.Thread(target=self._serve, args=(connection, address), name="connection", daemon=True).start()
         except RuntimeError:  # no more threads
@@ -99,19 +107,19 @@ class Connections:
 
     def _forget(self, connection: socket.socket) -> None:
         with self._changed:
-            self._asking.pop(connection, None)
+            self._requests.pop(connection, None)
             self._tabs.discard(connection)
             self._changed.notify_all()
 
     def _make_room(self) -> bool:
         """Refuse the oldest connection that is not a tab, and wait for its end; return whether there was one."""
         with self._changed:
-            eldest = next(iter(self._asking), None)
+            eldest = next(iter(self._requests), None)
             if eldest is None:
                 return False
             self._refuse(eldest)
-            self._changed.wait_for(lambda: eldest not in self._asking, ENDING)
-            self._asking.pop(eldest, None)
+            self._changed.wait_for(lambda: eldest not in self._requests, CLOSE_TIMEOUT_S)
+            self._requests.pop(eldest, None)
             return True
 
     def _refuse(self, connection: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""Description of a robot for a tab, to draw it and to label its buttons, from the service's own information."""
+"""Description of a robot for a tab, which draws it and labels its buttons."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trirail.client.held_jog import SPEEDS
 from trirail.errors import ConfigError, ServiceError
 from trirail.panel.permissions import permissions
 from trirail.telemetry import palette
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.sizes import MAX_FILE
 from trirail.wire.state import Info
 from trirail.wire.vocabulary import Command, Role
@@ -38,16 +38,16 @@ MILLIMETRES: dict[str, Any] = {
 """Unit of lengths on the page, units per metre, and decimals of lengths and degrees; jog steps [m] and [°]."""
 
 
-def shown(info: Info) -> ShownRobot:
-    """Return the robot that a service describes. Raises ServiceError if the service has another version."""
+def drawn_robot(info: Info) -> DrawnRobot:
+    """Return the robot of a service's information. Raises ServiceError if the service has another version."""
     try:
-        return ShownRobot.of_info(info)
+        return DrawnRobot.from_info(info)
     except (msgspec.ValidationError, ConfigError) as error:
-        raise ServiceError(f"the service is of another version, {info.version}: {error}") from error
+        raise ServiceError(f"the service has another version, {info.version}: {error}") from error
 
 
-def describe(info: Info, robot: ShownRobot, user: str, role: Role | None) -> dict[str, Any]:
-    """Return the description, ready to encode, for a tab whose user has a role."""
+def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dict[str, Any]:
+    """Return the description for a tab, ready to encode; `role` is that of the user."""
     parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {

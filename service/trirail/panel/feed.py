@@ -1,4 +1,4 @@
-"""Published data of the service, collected once for all tabs: newest state, latest events, description of the robot."""
+"""Published data of the service, received once for all tabs: newest state, latest events, description of the robot."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import LoopThread
 from trirail.errors import TrirailError
 from trirail.panel import path_check
-from trirail.panel.description import describe, shown
+from trirail.panel.description import describe, drawn_robot
 from trirail.panel.path_check import CheckedPath, Obstacle
 from trirail.panel.permissions import permissions
 from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.vocabulary import Role
 
-SILENT = 1.0
+SILENCE_S = 1.0
 """Time without a state after which the service counts as silent [s]."""
-USERS_EVERY = 2.0
+USERS_PERIOD_S = 2.0
 """Interval between queries of the connected users [s]."""
-EVENTS = 200
+MAX_EVENTS = 200
 """Number of events kept for tabs that open later."""
-LOOKS = 50
+MAX_LOOKS = 50
 """Number of events of the last alignment kept."""
 
 
 class Feed:
-    """Subscription to one robot from `start` to `close`. Raises ServiceError if it does not answer initially.
+    """Subscription to one robot, shared by all tabs.
 
-    Tabs read data to send while holding `changed`, which is notified of anything new.
+    A tab reads data while it holds `changed`, which is notified of new data. Raises ServiceError if the service does
+    not answer.
     """
 
     def __init__(self, robot: AsyncRobot, loop: LoopThread) -> None:
@@ -46,48 +47,50 @@ class Feed:
         self._loop = loop
         self.changed = threading.Condition()
         self._pose: Triple | None = None
-        self.told: dict[str, bytes] = {}
-        """Messages for a tab, sent once and after each change, as JSON: the robot, first because nothing can be drawn
-        without it, the names of its poses, and the connected users."""
-        loop.call(self._learn_robot())
-        self.told["poses"] = loop.call(self._fetch_poses())
+        self.messages: dict[str, bytes] = {}
+        """Messages for a tab, sent once and after each change, as JSON: robot, names of its poses, connected users.
+        The robot is first, because the page cannot draw anything without it."""
+        loop.call(self._fetch_robot())
+        self.messages["poses"] = loop.call(self._fetch_poses())
         self.state: bytes | None = None
-        """Newest state, as JSON with its stamp; None while the service is silent."""
+        """Newest state with its stamp, as JSON; None while the service is silent."""
         self.stamp = 0
         """Arrival time of that state: milliseconds of this process's monotonic clock."""
-        self._events: deque[tuple[int, bytes]] = deque(maxlen=EVENTS)
-        self._aligned: list[tuple[int, bytes]] = []
-        """Events of the last alignment, regardless of the number of later ones."""
+        self._events: deque[tuple[int, bytes]] = deque(maxlen=MAX_EVENTS)
+        self._alignment_events: list[tuple[int, bytes]] = []
+        """Events of the last alignment, which later events do not displace."""
         self._alignment = ("", "")
-        self._hearing: list[Future[object]] = []
+        self._subscriptions: list[Future[object]] = []
 
     def start(self) -> None:
         """Start the subscriptions."""
-        self._hearing = [self._loop.start(hear()) for hear in (self._states, self._hear_events, self._look_for_users)]
+        self._subscriptions = [
+            self._loop.start(hear()) for hear in (self._receive_states, self._receive_events, self._poll_users)
+        ]
 
     def close(self) -> None:
         """Stop the subscriptions."""
-        for hearing in self._hearing:
-            hearing.cancel()
+        for subscription in self._subscriptions:
+            subscription.cancel()
 
     def events(self, after: int) -> list[tuple[int, bytes]]:
-        """Return the events after a number, numbered in order of arrival, as JSON."""
-        return [event for event in sorted({*self._aligned, *self._events}) if event[0] > after]
+        """Return the events numbered higher than `after`, in order of arrival, as numbers and JSON."""
+        return [event for event in sorted({*self._alignment_events, *self._events}) if event[0] > after]
 
-    def problem(self, goal: PoseGoal) -> Obstacle | None:
+    def find_obstacle(self, goal: PoseGoal) -> Obstacle | None:
         """Return the obstacle between the measured pose and a goal, like path_check.problem."""
         if self._pose is None:
             return Obstacle("nobody knows where the robot is", code="unknown")
         end = (goal.x, goal.y, goal.phi)
-        return path_check.problem(self._shown, self._pose, end, goal.tool, goal.frame)
+        return path_check.find_obstacle(self._robot_drawing, self._pose, end, goal.tool, goal.frame)
 
-    def checked_path(self, name: str, text: str, stretch: bool) -> CheckedPath:
+    def check_path(self, name: str, text: str, stretch: bool) -> CheckedPath:
         """Return the result of checking a file's path."""
-        return path_check.checked_path(self._shown, name, text, stretch)
+        return path_check.check_path(self._robot_drawing, name, text, stretch)
 
-    async def _states(self) -> None:
+    async def _receive_states(self) -> None:
         while True:
-            async with aclosing(self._robot.states(SILENT)) as states:
+            async with aclosing(self._robot.states(SILENCE_S)) as states:
                 async for state in states:
                     if self.state is None:
                         await self._describe()
@@ -100,30 +103,30 @@ class Feed:
                 self.state = self._pose = None
                 self.changed.notify_all()
 
-    async def _look_for_users(self) -> None:
+    async def _poll_users(self) -> None:
         while True:
-            await asyncio.sleep(USERS_EVERY)
+            await asyncio.sleep(USERS_PERIOD_S)
             with contextlib.suppress(TrirailError):
-                self._tell("users", msgspec.json.encode({"tell": "users", "names": await self._robot.users()}))
+                self._publish("users", msgspec.json.encode({"tell": "users", "names": await self._robot.users()}))
 
     async def _describe(self) -> None:
         """Query the robot again, because a service that was silent may have restarted."""
         poses = await self._fetch_poses()
         with contextlib.suppress(TrirailError):  # the old description remains until it answers
-            await self._learn_robot()
-            self._tell("poses", poses)
+            await self._fetch_robot()
+            self._publish("poses", poses)
 
-    async def _learn_robot(self) -> None:
+    async def _fetch_robot(self) -> None:
         """Query the robot and the user's permissions. Raises ServiceError if the service has another version."""
-        told, role = await self._robot.info(), await self._robot.role()
-        robot = shown(told)
-        about = msgspec.json.encode(describe(told, robot, self._robot.user, role))
-        self._shown = robot
-        self.recordings = told.recordings
+        info, role = await self._robot.info(), await self._robot.role()
+        robot = drawn_robot(info)
+        about = msgspec.json.encode(describe(info, robot, self._robot.user, role))
+        self._robot_drawing = robot
+        self.recordings = info.recordings
         """Folder of the service's recordings, on its machine."""
-        self.permissions = permissions(role, Role(told.takeover))
+        self.permissions = permissions(role, Role(info.takeover))
         """Permissions of the panel's user."""
-        self._tell("robot", about)
+        self._publish("robot", about)
 
     async def _fetch_poses(self) -> bytes:
         try:
@@ -133,13 +136,13 @@ class Feed:
         taught = [name for name, pose in poses.items() if pose.taught]
         return msgspec.json.encode({"tell": "poses", "names": list(poses), "taught": taught})
 
-    async def _hear_events(self) -> None:
+    async def _receive_events(self) -> None:
         numbers = itertools.count(1)
         async with aclosing(self._robot.events(history=True)) as events:
             async for event in events:
                 content = msgspec.json.encode({"tell": "event", "event": event})
                 if event.kind == "pose":
-                    self._tell("poses", await self._fetch_poses())
+                    self._publish("poses", await self._fetch_poses())
                 with self.changed:
                     numbered = next(numbers), content
                     self._events.append(numbered)
@@ -147,15 +150,15 @@ class Feed:
                         self._keep(event.alignment, numbered)
                     self.changed.notify_all()
 
-    def _tell(self, name: str, content: bytes) -> None:
+    def _publish(self, name: str, content: bytes) -> None:
         with self.changed:
-            self.told[name] = content
+            self.messages[name] = content
             self.changed.notify_all()
 
     def _keep(self, look: AlignmentLook, event: tuple[int, bytes]) -> None:
         """Keep an event with the others of the same alignment."""
         name = look.id, look.purpose
-        self._aligned = [*(self._aligned if name == self._alignment else ()), event][-LOOKS:]
+        self._alignment_events = [*(self._alignment_events if name == self._alignment else ()), event][-MAX_LOOKS:]
         self._alignment = name
 
 

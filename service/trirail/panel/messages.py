@@ -19,44 +19,44 @@ Content = Annotated[str, Meta(max_length=MAX_FILE)]
 """Content of a file."""
 
 
-class _Said(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
-    """Any message of the page."""
+class _PageMessage(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
+    """Base of the page's messages."""
 
-    wants: ClassVar[str | None] = None
+    permission: ClassVar[str | None] = None
     """Required permission; None for none."""
 
     @property
-    def needs(self) -> str | None:
+    def required_permission(self) -> str | None:
         """Return the required permission."""
-        return self.wants
+        return self.permission
 
 
-class Seen(_Said, frozen=True, tag="seen"):
+class StateDrawn(_PageMessage, frozen=True, tag="seen"):
     """Notice that the page has drawn a state."""
 
     stamp: int
     """Stamp of that state."""
 
 
-class Hold(_Said, frozen=True, tag="hold"):
-    """Notice that a jog button is held down now."""
+class JogHeld(_PageMessage, frozen=True, tag="hold"):
+    """Notice that a jog button is held down; repeated while it is."""
 
     wants = GOAL
 
     velocity: Coordinates
     """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
     seen: int
-    """Stamp of the newest state that the page has drawn: a user of an outdated picture must not move the robot."""
+    """Stamp of the newest state that the page has drawn: nobody may jog by an outdated picture."""
     tool: FrameName | None = None
     """Tool of [frames.tool] about which it turns; the centre if None."""
 
 
-class Release(_Said, frozen=True, tag="release"):
-    """Notice that no jog button is held down any more."""
+class JogReleased(_PageMessage, frozen=True, tag="release"):
+    """Notice that all jog buttons have been released."""
 
 
-class Tell(_Said, frozen=True, tag="command"):
-    """Command whose button has been pressed or whose slider has been moved."""
+class SendCommand(_PageMessage, frozen=True, tag="command"):
+    """Request to send a command: its button was pressed or its slider moved."""
 
     name: Command
     """The command."""
@@ -69,14 +69,14 @@ class Tell(_Said, frozen=True, tag="command"):
         return self.name
 
 
-class TakeOver(_Said, frozen=True, tag="takeover"):
+class TakeOver(_PageMessage, frozen=True, tag="takeover"):
     """Request to take the lease over from its holder."""
 
     wants = TAKEOVER
 
 
-class SendGoal(_Said, frozen=True, tag="goal"):
-    """Goal to forward: the button of a named pose, of a typed one, or of a step has been pressed."""
+class SendGoal(_PageMessage, frozen=True, tag="goal"):
+    """Request to send a goal: the button of a named pose, of a typed one, or of a step was pressed."""
 
     wants = GOAL
 
@@ -86,7 +86,7 @@ class SendGoal(_Said, frozen=True, tag="goal"):
     """Stamp of the newest state that the page has drawn, if the goal is relative to it."""
 
 
-class CheckPose(_Said, frozen=True, tag="check"):
+class CheckPose(_PageMessage, frozen=True, tag="check"):
     """Request to check whether a pose is reachable, without motion."""
 
     goal: PoseGoal
@@ -95,7 +95,7 @@ class CheckPose(_Said, frozen=True, tag="check"):
     """Number that the answer repeats."""
 
 
-class CheckPath(_Said, frozen=True, tag="check path"):
+class CheckPath(_PageMessage, frozen=True, tag="check path"):
     """Request to check whether the path in a file can be followed, without motion."""
 
     name: str
@@ -108,7 +108,7 @@ class CheckPath(_Said, frozen=True, tag="check path"):
     """Whether to slow a path that is too fast."""
 
 
-class Follow(_Said, frozen=True, tag="follow"):
+class Follow(_PageMessage, frozen=True, tag="follow"):
     """Request to follow the path in a file from its first point."""
 
     wants = GOAL
@@ -121,7 +121,7 @@ class Follow(_Said, frozen=True, tag="follow"):
     """Whether to slow a path that is too fast."""
 
 
-class Teach(_Said, frozen=True, tag="teach"):
+class Teach(_PageMessage, frozen=True, tag="teach"):
     """Request to save the robot's current position as a pose."""
 
     wants = POSES
@@ -130,7 +130,7 @@ class Teach(_Said, frozen=True, tag="teach"):
     """Name of the pose."""
 
 
-class Forget(_Said, frozen=True, tag="forget"):
+class Forget(_PageMessage, frozen=True, tag="forget"):
     """Request to remove a taught pose."""
 
     wants = POSES
@@ -139,6 +139,6 @@ class Forget(_Said, frozen=True, tag="forget"):
     """Name of the pose."""
 
 
-Asked = Tell | TakeOver | SendGoal | Follow | Teach | Forget
+ServiceRequest = SendCommand | TakeOver | SendGoal | Follow | Teach | Forget
 """Requests to the service, except held jogs."""
-FromPage = Seen | Hold | Release | CheckPose | CheckPath | Asked
+AnyPageMessage = StateDrawn | JogHeld | JogReleased | CheckPose | CheckPath | ServiceRequest

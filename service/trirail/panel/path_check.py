@@ -15,14 +15,14 @@ from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.runs import centre_motion, nominal_motion, rest, tool_motion
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames, rotated
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import Tool, TrajectoryGoal
 from trirail.wire.packed_trajectory import packed
 from trirail.workspace.violations import violations
 
-LOOKS = 40
+CHECKED_POSES = 40
 """Number of poses checked on the line in pose space, from its end."""
-DRAWN = 200
+DRAWN_POINTS = 200
 """Number of points drawn of a path, evenly spaced in time."""
 
 
@@ -41,12 +41,29 @@ class Obstacle(Struct, frozen=True, omit_defaults=True):
     unit: str = ""
 
 
-def problem(robot: ShownRobot, start: Triple, end: Triple, tool: Tool | None, frame: str) -> Obstacle | None:
-    """Return an obstacle on the line in pose space from one pose to another; None if none is known.
+def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | None, frame: str) -> Obstacle | None:
+    """Check CHECKED_POSES poses on the straight line of the tool in pose space.
 
-    `start` is the pose of the centre in the base frame, `end` that of the tool in a frame of the robot, x, y [m] and
-    phi [rad]; the tool moves in a straight line. Checked are positions, passive travel and the singular margin, at
-    LOOKS places; the service judges speeds and the planner's findings between them.
+    The check covers positions, passive travel and the singularity margin. The service checks the speeds, and the path
+    between these poses.
+
+    Parameters
+    ----------
+    robot
+        Robot, with its limits.
+    start
+        Pose of the platform's centre in the base frame: x, y [m], phi [rad].
+    end
+        Pose of the tool in `frame`.
+    tool
+        Tool, by name or by its point; None for the centre.
+    frame
+        Name of a work frame.
+
+    Returns
+    -------
+    Obstacle | None
+        Obstacle nearest to the end; None if the check finds none.
     """
     names = NamedFrames(robot.frames)
     try:
@@ -55,14 +72,14 @@ def problem(robot: ShownRobot, start: Triple, end: Triple, tool: Tool | None, fr
         return Obstacle(str(error), code=error.code)
     u, v = rotated(end[0], end[1], angle)
     first, last = np.array(tool_motion(rest(start), point).pose), np.array((x + u, y + v, angle + end[2]))
-    for share in np.linspace(1.0, 0.0, LOOKS, endpoint=False):
+    for share in np.linspace(1.0, 0.0, CHECKED_POSES, endpoint=False):
         pose = centre_motion(rest((share * last + (1.0 - share) * first).tolist()), point).pose
         try:
-            found = violations(robot.geometry, robot.limits, np.asarray(pose))
+            exceeded = violations(robot.geometry, robot.limits, np.asarray(pose))
         except KinematicsError as error:
             return Obstacle(str(error), bool(share < 1.0), "unreachable", error.leg)
-        if found:
-            least = found[0]
+        if exceeded:
+            least = exceeded[0]
             code = least.quantity.replace(" ", "_")
             return Obstacle(str(least), bool(share < 1.0), code, least.label, least.value, least.limit, least.unit)
     return None
@@ -83,8 +100,8 @@ class CheckedPath(Struct, frozen=True, omit_defaults=True):
     """Ratio of that duration to the requested one."""
 
 
-def checked_path(robot: ShownRobot, name: str, text: str, stretch: bool) -> CheckedPath:
-    """Parse a trajectory and plan it from its first point as the service would, which checks the whole path."""
+def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> CheckedPath:
+    """Parse a trajectory and plan it from its first point, as the service does, which checks the whole path."""
     line: list[Triple] = []
     try:
         points = tuple(trajectory.parse(name, text))
@@ -97,6 +114,6 @@ def checked_path(robot: ShownRobot, name: str, text: str, stretch: bool) -> Chec
         code = error.code if isinstance(error, RefusedError) else "unreadable"
         return CheckedPath(str(error), code, line)
     path = planned.run.path
-    poses = [nominal_motion(path, float(s)).pose for s in np.linspace(0.0, path.duration, DRAWN)]
+    poses = [nominal_motion(path, float(s)).pose for s in np.linspace(0.0, path.duration, DRAWN_POINTS)]
     drawn = [(float(x), float(y), float(phi)) for x, y, phi in poses]
     return CheckedPath(line=drawn, duration=planned.duration, slowed=planned.reply.slowed)

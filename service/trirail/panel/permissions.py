@@ -1,4 +1,4 @@
-"""Permissions of a role on the page, which offers and forwards nothing else. The service checks them again."""
+"""Permissions of a role on the page; the page offers nothing else, and the service checks them again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from trirail.wire import access
 from trirail.wire.vocabulary import Command, Role
 
 GOAL, POSES, TAKEOVER = "goal", "poses", "takeover"
-"""Permissions other than those of commands (named like them): to move, to teach poses, to take the lease over."""
+"""Permissions to move, to teach poses and to take the lease over; those of commands have the commands' names."""
 
 
 def permissions(role: Role | None, takeover: Role) -> frozenset[str]:
@@ -14,4 +14,4 @@ def permissions(role: Role | None, takeover: Role) -> frozenset[str]:
     least = {GOAL: access.GOAL_ROLE, POSES: access.POSE_ROLE, TAKEOVER: takeover} | {
         each.value: each.role for each in Command
     }
-    return frozenset(what for what, needed in least.items() if role is not None and role.includes(needed))
+    return frozenset(name for name, needed in least.items() if role is not None and role.includes(needed))

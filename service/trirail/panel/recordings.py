@@ -1,4 +1,4 @@
-"""Recordings of the service, if their folder is on the panel's machine: a list, files to download, reports."""
+"""Recordings of the service, if their folder is on the panel's machine: list, downloads and reports."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from websockets.sync.server import ServerConnection
 from trirail.telemetry.sessions import RecordedSession
 from trirail.wire.decoding import decoded, prepare
 
-LISTED = 100
+MAX_SESSIONS = 100
 """Maximum number of sessions listed, the newest ones."""
-SHOWABLE = re.compile(r"[\w.-]+\.rrd", re.ASCII)
+RECORDING_NAME = re.compile(r"[\w.-]+\.rrd", re.ASCII)
 """Names of recordings that fit into a header."""
-REPORTED_WITHIN = 300.0
+REPORT_TIMEOUT_S = 300.0
 """Time limit of a report, and of reading recordings for the list [s]."""
 
 
@@ -34,7 +34,7 @@ def _open_here(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
-class Sent(Response):
+class AlreadySent(Response):
     """Response that has been sent already."""
 
     def serialize(self) -> bytes:
@@ -42,13 +42,13 @@ class Sent(Response):
         return b""
 
 
-class _Listed(msgspec.Struct):
+class _SessionList(msgspec.Struct):
     """Output of `trirail sessions --json`, limited to the fields used here."""
 
     sessions: list[RecordedSession]
 
 
-prepare(_Listed)
+prepare(_SessionList)
 
 
 class Recordings:
@@ -61,11 +61,11 @@ class Recordings:
 
     def listed(self) -> dict[str, Any]:
         """Return the folder, whether it is on this machine, and its sessions, newest first, ready to encode."""
-        return {"folder": str(self._folder), "here": self._here, "sessions": self._sessions()[: -LISTED - 1 : -1]}
+        return {"folder": str(self._folder), "here": self._here, "sessions": self._sessions()[: -MAX_SESSIONS - 1 : -1]}
 
     def send_file(self, opened: ServerConnection, name: str, headers: dict[str, str]) -> Response | None:
         """Send a recording of any size as a download; return None if it is not a regular file of the folder."""
-        if not self._here or SHOWABLE.fullmatch(name) is None:
+        if not self._here or RECORDING_NAME.fullmatch(name) is None:
             return None
         try:
             file = open(self._folder / name, "rb", opener=_open_here)  # noqa: SIM115
@@ -82,7 +82,7 @@ class Recordings:
                 opened.socket.sendall(Response(status.value, status.phrase, Headers(own | headers)).serialize())
                 if size:
                     opened.socket.sendfile(file, count=size)  # a file still being written: its current part
-        return Sent(status.value, status.phrase, Headers())
+        return AlreadySent(status.value, status.phrase, Headers())
 
     def report(self, session: str) -> str | None:
         """Return the output of `trirail report` for a session, from a separate process; None if it does not exist."""
@@ -101,11 +101,11 @@ class Recordings:
         if not self._here:
             return []
         done = self._run("sessions", ".", "--robot", self._robot, "--last", "0", "--json")
-        return decoded(done.stdout, _Listed).sessions if done.returncode == 0 else []
+        return decoded(done.stdout, _SessionList).sessions if done.returncode == 0 else []
 
     def _run(self, *command: str) -> subprocess.CompletedProcess[bytes]:
         """Run a `trirail` command in the folder, niced, because the page moves a robot while it reads recordings."""
         return subprocess.run(
             ["nice", sys.executable, "-m", "trirail", *command], cwd=self._folder, capture_output=True,
-            timeout=REPORTED_WITHIN, check=False, env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
+            timeout=REPORT_TIMEOUT_S, check=False, env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Server of the panel: the page's files and a WebSocket per tab, on the loopback, for holders of the token."""
+"""Server of the panel: it serves the page's files and a WebSocket per tab on the loopback, to holders of the token."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from trirail.panel.recordings import Recordings
 from trirail.panel.tab import Tab
 from trirail.wire.sizes import MAX_FILE
 
-HOSTS = frozenset({"127.0.0.1", "localhost", "::1"})
-"""Names of the loopback. A foreign page whose name resolves to this machine (DNS rebinding) sends another."""
+LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
+"""Accepted host names: a foreign page whose name resolves to this machine (DNS rebinding) sends another one."""
 
 
 def refused(token: str, path: str, hosts: Sequence[str], origins: Sequence[str]) -> str | None:
@@ -41,28 +41,28 @@ def refused(token: str, path: str, hosts: Sequence[str], origins: Sequence[str])
         hostname = urlsplit(f"http://{host}").hostname
     except ValueError:
         hostname = None
-    if hostname not in HOSTS:
-        return "this page is for this machine alone: open it as 127.0.0.1 or localhost, from afar through ssh -L"
+    if hostname not in LOOPBACK_NAMES:
+        return "this page is for this machine only: open it as 127.0.0.1 or localhost, from elsewhere through ssh -L"
     if any(origin != f"http://{host}" for origin in origins):
-        return "asked by a page of another origin"
-    given = path.removeprefix("/").partition("/")[0]
-    if not hmac.compare_digest(given.encode(), token.encode()):
-        return "no such page: open the address that trirail panel has printed, with its token"
+        return "requested by a page of another origin"
+    path_token = path.removeprefix("/").partition("/")[0]
+    if not hmac.compare_digest(path_token.encode(), token.encode()):
+        return "no such page: open the address that trirail panel printed, with its token"
     return None
 
 
-HOST = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 PORT = 9880
 """Port of the page, if it is free and no other is requested."""
 SOCKET = "socket"
 """Name of the page's WebSocket below the token."""
-LONGEST = 3 * MAX_FILE
+MAX_MESSAGE = 3 * MAX_FILE
 """Maximum size of a message of the page: a file to follow, as a JSON string [bytes]."""
 LANGUAGES = "languages.json"
 """File with the page's languages: code, and name in the language itself."""
 SESSIONS, RECORDING, REPORT = "sessions", "recording", "report"
 """Names of the requests for recordings."""
-OPENING = 5.0
+REQUEST_TIMEOUT_S = 5.0
 """Time limit for receiving a request, which comes from this machine [s]."""
 TYPES = {
     "html": "text/html",
@@ -83,10 +83,24 @@ HEADERS = {
 
 
 class Panel:
-    """Page of one robot, served inside the context. Raises ServiceError if the port is taken or no service answers."""
+    """Page of one robot, served inside the context.
+
+    Parameters
+    ----------
+    robot
+        Robot to operate.
+    port
+        Port on the loopback; None for 9880, or any free port if that is in use.
+    token
+        Secret part of the address; None for a random one.
+
+    Raises
+    ------
+    ServiceError
+        The port is in use, or no service answers.
+    """
 
     def __init__(self, robot: AsyncRobot, port: int | None = None, token: str | None = None) -> None:
-        """Serve on a port of the loopback, by default 9880 or any; `token` is the secret part of the address."""
         self._robot = robot
         self._loop = LoopThread()
         with contextlib.ExitStack() as opened:
@@ -99,7 +113,7 @@ class Panel:
         self._token = token or secrets.token_urlsafe(16)
         self._files = dict(_files())
         self._recordings = Recordings(robot.name, self._feed.recordings)
-        self.url = f"http://{HOST}:{listening.getsockname()[1]}/{self._token}/"
+        self.url = f"http://{LOOPBACK}:{listening.getsockname()[1]}/{self._token}/"
         """Address to open; anyone with it can move the robot."""
         self._server: Server = serve(
             self._serve,
@@ -107,8 +121,8 @@ class Panel:
             process_request=self._answer,
             compression=None,  # latency matters more than size
             server_header=None,
-            max_size=LONGEST,
-            open_timeout=OPENING,
+            max_size=MAX_MESSAGE,
+            open_timeout=REQUEST_TIMEOUT_S,
             close_timeout=1.0,
         )
         refusal = _response(HTTPStatus.SERVICE_UNAVAILABLE, b"the panel has too many connections\n", "txt").serialize()
@@ -139,7 +153,7 @@ class Panel:
             return _response(HTTPStatus.FORBIDDEN, f"{why}\n".encode(), "txt")
         name = path.removeprefix(f"/{self._token}/") or "index.html"
         if name == SOCKET:
-            if self._connections.keep(opened.socket):
+            if self._connections.make_tab(opened.socket):
                 return None
             return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"the panel is open in too many tabs: close one\n", "txt")
         if name == SESSIONS:
@@ -171,10 +185,10 @@ def _response(status: HTTPStatus, body: bytes, suffix: str) -> Response:
 
 def _listen(port: int | None) -> socket.socket:
     """Listen on a port of the loopback: the requested one, or the default, or any if that is taken."""
-    wanted = PORT if port is None else port
-    if 0 <= wanted <= 65535:
+    requested = PORT if port is None else port
+    if 0 <= requested <= 65535:
         with contextlib.suppress(OSError):
-            return socket.create_server((HOST, wanted))
+            return socket.create_server((LOOPBACK, requested))
     if port is not None:
-        raise ServiceError(f"port {port} cannot be listened on: choose another of 1 to 65535, or 0 for any")
-    return socket.create_server((HOST, 0))
+        raise ServiceError(f"port {port}: cannot listen; choose another of 1 to 65535, or 0 for any free port")
+    return socket.create_server((LOOPBACK, 0))

@@ -1,4 +1,4 @@
-"""An open tab of the operator's page: execution of its requests, and transmission of the data to show."""
+"""Open tab of the operator's page: it handles the page's messages, and sends the data to show."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from trirail.client.blocking import GoalHandle, LoopThread
 from trirail.client.held_jog import HeldJog
 from trirail.errors import RefusalCode
 from trirail.panel.feed import Feed, now
-from trirail.panel.messages import CheckPath, CheckPose, FromPage, Hold, Release, Seen, Tell
-from trirail.panel.orders import FRESH, Orders, refusal
+from trirail.panel.messages import AnyPageMessage, CheckPath, CheckPose, JogHeld, JogReleased, SendCommand, StateDrawn
+from trirail.panel.tab_requests import MAX_STATE_AGE_MS, TabRequests, refusal
 from trirail.wire.decoding import decoded, prepare
 from trirail.wire.goals import Goal
 
 
-class NewestAsked:
+class NewestTask:
     """Worker that runs only the newest submitted task; `name` is the name of its thread."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._changed = threading.Condition()
-        self._asked: Callable[[], None] | None = None
+        self._task: Callable[[], None] | None = None
         self._thread: threading.Thread | None = None
         self._closed = False
 
-    def submit(self, do: Callable[[], None]) -> None:
+    def submit(self, task: Callable[[], None]) -> None:
         """Submit a task, which replaces one that is still waiting."""
         with self._changed:
-            self._asked = do
+            self._task = task
             self._changed.notify()
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
@@ -51,26 +51,25 @@ class NewestAsked:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._asked is not None)
-                do, self._asked = self._asked, None
+                self._changed.wait_for(lambda: self._closed or self._task is not None)
+                do, self._task = self._task, None
                 if self._closed or do is None:
                     return
             do()
 
 
-AHEAD = 3
-"""Maximum number of states in transit to the page: a frozen tab or slow network gets no more, and none queues up."""
-UNSENT = 200
+MAX_STATES_IN_TRANSIT = 3
+"""Maximum number of states sent and not yet drawn: a frozen tab or a slow network gets no more, so none queue up."""
+MAX_ANSWERS = 200
 """Maximum number of answers kept for a tab that does not read; the oldest are dropped."""
 
-prepare(FromPage)
+prepare(AnyPageMessage)
 
 
 class Tab:
-    """Handler of one WebSocket until it is closed; then everything it held has been released.
+    """Handler of one WebSocket; when the socket closes, the tab releases its jog and its lease.
 
-    The service alone decides whether the robot moves: a message that is stalled or lost here, or on the way here,
-    does not renew a jog.
+    The service alone decides whether the robot moves: a message that is late or lost does not renew a jog.
     """
 
     def __init__(self, socket: ServerConnection, robot: AsyncRobot, loop: LoopThread, feed: Feed) -> None:
@@ -79,14 +78,14 @@ class Tab:
         self._robot = robot
         self._loop = loop
         self._jog = HeldJog(self._send_goal, self._on_jog_ended)
-        self._outbox: deque[bytes] = deque(maxlen=UNSENT)
-        self._unseen: deque[int] = deque()
-        self._orders = Orders(robot, loop, self._say)
-        self._poses, self._paths = NewestAsked("pose check"), NewestAsked("path check")
+        self._outbox: deque[bytes] = deque(maxlen=MAX_ANSWERS)
+        self._undrawn: deque[int] = deque()
+        self._requests = TabRequests(robot, loop, self._enqueue)
+        self._poses, self._paths = NewestTask("pose check"), NewestTask("path check")
         self._open = True
 
     def serve(self) -> None:
-        """Execute the page's messages until it is gone."""
+        """Handle the page's messages until its connection ends."""
         sender = threading.Thread(target=self._send, name="tab", daemon=True)
         sender.start()
         try:
@@ -100,37 +99,39 @@ class Tab:
             with self._feed.changed:
                 self._open = False
                 self._feed.changed.notify_all()
-            self._orders.close()
+            self._requests.close()
 
     def _on_message(self, text: str | bytes) -> None:
         try:
-            said: FromPage = decoded(text, FromPage)
+            message: AnyPageMessage = decoded(text, AnyPageMessage)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            self._say("refused", to="page", message=f"not a message of this page: {error}", code=RefusalCode.MALFORMED)
+            self._enqueue(
+                "refused", to="page", message=f"not a message of this page: {error}", code=RefusalCode.MALFORMED
+            )
             return
-        if said.needs is not None and said.needs not in self._feed.permissions:
-            message = f"your role does not allow {said.needs}"
-            self._say("refused", to=said.needs, message=message, code=RefusalCode.NOT_ALLOWED)
+        if message.required_permission is not None and message.required_permission not in self._feed.permissions:
+            words = f"your role does not allow {message.required_permission}"
+            self._enqueue("refused", to=message.required_permission, message=words, code=RefusalCode.NOT_ALLOWED)
             return
-        match said:
-            case Seen(stamp):
+        match message:
+            case StateDrawn(stamp):
                 with self._feed.changed:
-                    while self._unseen and self._unseen[0] <= stamp:
-                        self._unseen.popleft()
+                    while self._undrawn and self._undrawn[0] <= stamp:
+                        self._undrawn.popleft()
                     self._feed.changed.notify_all()
-            case Hold(velocity, seen, tool):
-                if now() - seen <= FRESH:
+            case JogHeld(velocity, seen, tool):
+                if now() - seen <= MAX_STATE_AGE_MS:
                     self._jog.hold(velocity, tool)
-            case Release():
+            case JogReleased():
                 self._jog.release()
             case CheckPose():
-                self._poses.submit(lambda: self._check_pose(said))
+                self._poses.submit(lambda: self._check_pose(message))
             case CheckPath():
-                self._paths.submit(lambda: self._check_path(said))
+                self._paths.submit(lambda: self._check_path(message))
             case _:
-                if isinstance(said, Tell) and said.name.stops:
+                if isinstance(message, SendCommand) and message.name.stops:
                     self._jog.release()
-                self._orders.begin(said)
+                self._requests.begin(message)
 
     def _send_goal(self, make: Callable[[str], Goal], goal_id: str) -> GoalHandle:
         goal = self._loop.call(self._robot.send(make, goal_id))
@@ -138,34 +139,34 @@ class Tab:
 
     def _on_jog_ended(self, why: str) -> None:
         error = self._jog.error
-        self._say("ended", **(refusal(error) if error is not None else {}) | {"message": why})
+        self._enqueue("ended", **(refusal(error) if error is not None else {}) | {"message": why})
 
-    def _check_pose(self, said: CheckPose) -> None:
-        self._say("checked", number=said.number, obstacle=self._feed.problem(said.goal))
+    def _check_pose(self, message: CheckPose) -> None:
+        self._enqueue("checked", number=message.number, obstacle=self._feed.find_obstacle(message.goal))
 
-    def _check_path(self, said: CheckPath) -> None:
-        found = self._feed.checked_path(said.name, said.text, said.stretch)
-        self._say("path", number=said.number, found=found)
+    def _check_path(self, message: CheckPath) -> None:
+        result = self._feed.check_path(message.name, message.text, message.stretch)
+        self._enqueue("path", number=message.number, found=result)
 
-    # ------------------------------------------------------------------ showing
+    # ------------------------------------------------------------------ output
 
-    def _say(self, tell: str, /, **content: Any) -> None:
+    def _enqueue(self, tell: str, /, **content: Any) -> None:
         with self._feed.changed:
             self._outbox.append(msgspec.json.encode({"tell": tell, **content}))
             self._feed.changed.notify_all()
 
     def _send(self) -> None:
         """Send all pending messages once, and states only as fast as the page draws them."""
-        shown: dict[str, bytes] = {}
+        sent: dict[str, bytes] = {}
         event, stamp, silent = 0, 0, False
         feed = self._feed
         while True:
             due: list[bytes] = []
             with feed.changed:
-                for name, content in feed.told.items():
-                    if shown.get(name) != content:
+                for name, content in feed.messages.items():
+                    if sent.get(name) != content:
                         due.append(content)
-                        shown[name] = content
+                        sent[name] = content
                 for number, content in feed.events(event):
                     event = number
                     due.append(content)
@@ -175,9 +176,9 @@ class Tab:
                     if not silent:
                         due.append(b'{"tell":"silent"}')
                     silent = True
-                elif feed.stamp != stamp and len(self._unseen) < AHEAD:
+                elif feed.stamp != stamp and len(self._undrawn) < MAX_STATES_IN_TRANSIT:
                     stamp, silent = feed.stamp, False
-                    self._unseen.append(stamp)
+                    self._undrawn.append(stamp)
                     due.append(feed.state)
                 if not self._open:
                     return

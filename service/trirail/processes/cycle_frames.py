@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 from trirail_drivers.bus.can_frame import CAN_FRAME, DATA_AT
 from trirail_drivers.bus.frames import BITS
-from trirail_drivers.driver.axis_row import AXIS, NOWHERE
+from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET
 from trirail_drivers.driver.cyclic import EXPECTED, MOST_FRAMES, TIMES
 from trirail_drivers.driver.scaling import INT32_MAX
 
@@ -172,25 +172,25 @@ def take_frames(
     """
     for i in range(number):
         frame = frames[i]
-        identifier, length, known = _number(frame, 0, 4), frame[LENGTH_AT], NOWHERE
+        identifier, length, known = _number(frame, 0, 4), frame[LENGTH_AT], NO_OFFSET
         for k in range(len(expected)):
             if expected[k].identifier == identifier and expected[k].length == length:
                 known = k
-        if known == NOWHERE:
+        if known == NO_OFFSET:
             return i
         row = expected[known]
         for k in range(length):
             if frame[DATA_AT + k] & row.mask[k] != row.data[k]:
                 return i
         axis = axes[row.axis]
-        if row.position_at != NOWHERE:
+        if row.position_at != NO_OFFSET:
             at = DATA_AT + row.position_at
             if axis.floats:
                 if not _take_turns(axis, float(frames[i, at : at + 4].view(np.float32)[0])):
                     return i
             elif not _take_position(axis, _signed(_number(frame, at, 4)), now):
                 return i
-        if row.status_at != NOWHERE:
+        if row.status_at != NO_OFFSET:
             axis.statusword = _number(frame, DATA_AT + row.status_at, 2)
             axis.seen_clear |= ~axis.statusword
             axis.status_heard = now
@@ -263,7 +263,7 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
                 return False
             axis.target, axis.offset = np.int64(counts), 0
             _put(frames[i], axis.position_at, axis.target, 4)
-        if axis.velocity_at != NOWHERE:
+        if axis.velocity_at != NO_OFFSET:
             offset = np.rint(axis.velocity_per_metre * sent[1, i] / axis.velocity_step)
             if not abs(offset) <= (1 << (8 * axis.velocity_bytes - 1)) - 1:
                 return False

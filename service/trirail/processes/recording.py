@@ -20,7 +20,7 @@ from trirail.processes.loop_death import LoopDeath
 from trirail.processes.monitoring import TOLD_EVERY, RecorderMeasured
 from trirail.processes.realtime import give_back
 from trirail.telemetry.blackbox import BlackBox
-from trirail.telemetry.readout import Standing
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.links import LinkClosed, PacketLink
@@ -111,12 +111,12 @@ class Intake:
                 recorder.control_input(said)
                 box.control_input(said)
             case Status():
-                standing = Standing(said.goal, said.target, said.override, said.fault)
-                recorder.stands(standing)
-                box.stands("stands", standing)
+                standing = ReadoutState(said.goal, said.target, said.override, said.fault)
+                recorder.update_state(standing)
+                box.latch("update_state", standing)
             case Welcome():
                 recorder.bus_load(said.bus_load)
-                box.stands("bus_load", said.bus_load)
+                box.latch("bus_load", said.bus_load)
                 path = str(recorder.path)
                 self._announce("info", coded(f"recording to {path}", EventCode.RECORDING, file=path))
                 self._ready({"recording": str(recorder.path), "live": recorder.live_url})

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from trirail.telemetry import curves, journal, readout, shown_alignment
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.workspace.part_positions import Points
 
 WINDOW = 8.0
@@ -19,17 +19,17 @@ MARGIN = 0.09
 """Margin around the robot, as a share of its size."""
 
 
-class Shown(NamedTuple):
-    """A robot in a view."""
+class RobotView(NamedTuple):
+    """Robot in a view."""
 
-    robot: ShownRobot
+    robot: DrawnRobot
     bounds: Points
     """Bounds of its parts, (2, 2): lowest and highest x and y [m]."""
     root: str = ""
-    """Entity above all of its entities; "" for the root of all."""
+    """Entity above all of its entities; empty for the root of the recording."""
 
 
-def layout(shown: Shown) -> rrb.Blueprint:
+def layout(shown: RobotView) -> rrb.Blueprint:
     """Return the layout for one robot."""
     window = rrb.TimeAxis(view_range=_last(WINDOW))
     sliders = rrb.Vertical(
@@ -49,10 +49,10 @@ def layout(shown: Shown) -> rrb.Blueprint:
         row_shares=[18, 19, 25, 20],
     )
     left = rrb.Vertical(*_situation(shown, window, "t"), row_shares=[53, 23, 11, 21])
-    return _whole(rrb.Horizontal(left, sliders, platform, column_shares=[8, 6, 6]), "t")
+    return _blueprint(rrb.Horizontal(left, sliders, platform, column_shares=[8, 6, 6]), "t")
 
 
-def side_by_side(several: Sequence[Shown]) -> rrb.Blueprint:
+def side_by_side(several: Sequence[RobotView]) -> rrb.Blueprint:
     """Return the layout for several robots, a column each, by the wall clock, since each loop has its own `t`."""
     window = rrb.TimeAxis(view_range=_last(WINDOW))
     columns = [
@@ -65,10 +65,10 @@ def side_by_side(several: Sequence[Shown]) -> rrb.Blueprint:
         )
         for shown in several
     ]
-    return _whole(rrb.Horizontal(*columns), "wall")
+    return _blueprint(rrb.Horizontal(*columns), "wall")
 
 
-def _whole(views: rrb.Horizontal, timeline: str) -> rrb.Blueprint:
+def _blueprint(views: rrb.Horizontal, timeline: str) -> rrb.Blueprint:
     return rrb.Blueprint(
         views,
         rrb.TimePanel(state="collapsed", timeline=timeline, play_state="Following"),
@@ -77,7 +77,7 @@ def _whole(views: rrb.Horizontal, timeline: str) -> rrb.Blueprint:
     )
 
 
-def _situation(shown: Shown, window: rrb.TimeAxis, timeline: str) -> list[rrb.View | rrb.Tabs]:
+def _situation(shown: RobotView, window: rrb.TimeAxis, timeline: str) -> list[rrb.View | rrb.Tabs]:
     """Return the views of the robot, its numbers, its mode and its events."""
     events = rrb.TextLogView(
         name="Events",
@@ -96,7 +96,7 @@ def _situation(shown: Shown, window: rrb.TimeAxis, timeline: str) -> list[rrb.Vi
     ]
 
 
-def _robot(shown: Shown, timeline: str) -> rrb.Spatial2DView:
+def _robot(shown: RobotView, timeline: str) -> rrb.Spatial2DView:
     low, high = shown.bounds + MARGIN * np.ptp(shown.bounds) * np.array([[-1.0], [1.0]])
     trace = rrb.VisibleTimeRanges(timeline=timeline, range=_last(WINDOW))
     return rrb.Spatial2DView(
@@ -108,7 +108,7 @@ def _robot(shown: Shown, timeline: str) -> rrb.Spatial2DView:
     )
 
 
-def _error(shown: Shown, window: rrb.TimeAxis) -> rrb.TimeSeriesView:
+def _error(shown: RobotView, window: rrb.TimeAxis) -> rrb.TimeSeriesView:
     error_mm = shown.robot.limits.slider.following_error * 1e3
     return _plot(f"Following error  [µm], limit ±{error_mm:g} mm", f"{shown.root}{curves.ERROR}", window)
 

@@ -11,14 +11,15 @@ from typing import Literal
 
 from trirail_drivers.bus.can_frame import CAN_FRAME, CAPTURED, ERROR, EXTENDED, EXTENDED_BITS, REMOTE, STANDARD_BITS
 
-from trirail.telemetry.sinks import RESERVE, identity, no_room
+from trirail.telemetry.sinks import RESERVE, disk_shortage, identity
 from trirail.wire.event_codes import EventCode, EventText, coded
 
 
 class CandumpLog:
-    """A log of one bus's frames. It leaves RESERVE bytes of the disk free, and continues when there is space again.
+    """Log of one bus's frames.
 
-    A deleted file is begun again, and `warn` receives a message.
+    It leaves RESERVE bytes of the disk free, and continues when there is space again. It recreates a deleted file,
+    and reports that to `warn`.
     """
 
     def __init__(self, path: Path, channel: str, warn: Callable[[EventText], None] = lambda _: None) -> None:
@@ -37,15 +38,17 @@ class CandumpLog:
         self.lost += bool(self.trouble)
 
     def _append(self, batch: bytes) -> str:
-        """Append a batch, whole or not at all; return the reason of a failure, else ""."""
+        """Append a batch completely or not at all; return the reason of a failure, else ""."""
         if identity(self._path) != self._identity:
             try:
-                self._begin_anew()
+                self._recreate()
             except OSError as error:
-                return f"{self._path} has been deleted or moved, and cannot be begun anew: {error.strerror}"
-        if full := no_room(self._path.parent, RESERVE):
+                return f"{self._path} has been deleted or moved, and cannot be created again: {error.strerror}"
+        if full := disk_shortage(self._path.parent, RESERVE):
             return full
-        lines = "".join(f"({t:.6f}) {self._channel} {_written(frame)}\n" for t, frame in CAPTURED.iter_unpack(batch))
+        lines = "".join(
+            f"({t:.6f}) {self._channel} {_format_frame(frame)}\n" for t, frame in CAPTURED.iter_unpack(batch)
+        )
         content = lines.encode()
         try:
             written = self._file.write(content)
@@ -58,7 +61,7 @@ class CandumpLog:
         with contextlib.suppress(OSError):  # half a line would spoil the next one
             self._file.truncate(self._size)
             self._file.seek(self._size)
-        return f"{self._path} takes no more: {reason}"
+        return f"{self._path} cannot be written: {reason}"
 
     def close(self) -> None:
         """Close the file."""
@@ -68,16 +71,16 @@ class CandumpLog:
         self._file, self._size = self._path.open(mode, buffering=0), 0
         self._identity = identity(self._path)
 
-    def _begin_anew(self) -> None:
+    def _recreate(self) -> None:
         deleted = self._file
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._begin("xb")  # another file of its name belongs to somebody else
+        self._begin("xb")  # a new file of this name belongs to another process: do not overwrite it
         deleted.close()
-        words = f"{self._path} has been deleted or moved: it is begun anew"
+        words = f"{self._path} has been deleted or moved; created again"
         self._warn(coded(words, EventCode.CAPTURE_MOVED, file=str(self._path)))
 
 
-def _written(frame: bytes) -> str:
+def _format_frame(frame: bytes) -> str:
     """Format a `struct can_frame` as candump: 3 digits of an 11-bit identifier, 8 of others and of error frames."""
     identifier, length, data = CAN_FRAME.unpack(frame)
     if identifier & ERROR:

@@ -31,7 +31,7 @@ class Timelines:
         self._rate_hz = rate_hz
         self._wall_offset_ns = wall_offset_ns
 
-    def of(self, records: NDArray[np.void]) -> dict[str, pa.Array]:
+    def for_records(self, records: NDArray[np.void]) -> dict[str, pa.Array]:
         """Return the times of records. Steps of `t` are exact if the period is a whole number of nanoseconds."""
         t = records["cycle"] * SECOND // self._rate_hz
         return times(t, records["deadline_ns"] + self._wall_offset_ns)

@@ -26,7 +26,7 @@ STAMP = "%Y%m%d-%H%M%S"
 
 
 class FaultEntry(msgspec.Struct):
-    """A fault."""
+    """Fault in a recording."""
 
     time: float
     """Time of the fault [s since 1970]."""
@@ -76,16 +76,16 @@ class Contents(msgspec.Struct):
         self.cycles += count
 
     def event(self, event: Event) -> None:
-        """Take an event."""
+        """Count an event's goal or fault."""
         if event.outcome is not None:
             ended = self.goals.setdefault(event.user or "", {})
             ended[event.outcome] = ended.get(event.outcome, 0) + 1
         if event.kind == "fault":
             self.faults.append(FaultEntry(event.time, event.fault or FaultDetail(""), event.message))
 
-    def control_input(self, what: ControlInput) -> None:
-        """Take an input of the control."""
-        match what.given:
+    def control_input(self, item: ControlInput) -> None:
+        """Add the user of an input of the control."""
+        match item.given:
             case GoalRequest(user=user) | CommandRequest(user=user) if user:
                 self.users.add(user)
             case Announcement(notice=Notice(kind="refused" | "alignment", user=str(user))) if user:
@@ -111,38 +111,38 @@ def load(recording: Path) -> Contents | None:
     return contents
 
 
-def of_file(path: Path) -> Contents:
+def read_contents(path: Path) -> Contents:
     """Read the contents of a recording; for an unreadable one, return the reason in `trouble`."""
     from trirail.telemetry import provenance  # imports Rerun, which takes most of the start-up time
     from trirail.telemetry.reading import read
 
-    found = Contents(path.name, "")
+    contents = Contents(path.name, "")
     try:
         recording = read(path)
         config = provenance.configuration(recording.texts)
     except EmptyRecordingError:
-        return found
+        return contents
     except (ServiceError, ConfigError, OSError) as error:
-        found.trouble = str(error)
-        return found
-    found.robot = config.robot.name if config is not None else ""
+        contents.trouble = str(error)
+        return contents
+    contents.robot = config.robot.name if config is not None else ""
     began, ended = (float(wall.astype("datetime64[ns]").astype(int)) * 1e-9 for wall in recording.wall[[0, -1]])
-    found.add_cycles(began, ended, len(recording.records))
+    contents.add_cycles(began, ended, len(recording.records))
     for line in recording.events:
         if line.event is not None:
-            found.event(line.event)
-    for what in recording.requests:
-        found.control_input(what)
+            contents.event(line.event)
+    for item in recording.requests:
+        contents.control_input(item)
     if path.name.startswith(BLACK_BOX):
-        found.reason = _reason(found)
-    return found
+        contents.reason = _reason(contents)
+    return contents
 
 
-def _reason(found: Contents) -> str | None:
-    """Return the message of the fault whose time a black box has in its name; without one, of its last."""
-    for entry in (entry for entry in found.faults if box_name(entry.time) in found.name):
+def _reason(contents: Contents) -> str | None:
+    """Return the message of the fault whose time is in the name of a black box, else of the last fault."""
+    for entry in (entry for entry in contents.faults if box_name(entry.time) in contents.name):
         return entry.message
-    return found.faults[-1].message if found.faults else None
+    return contents.faults[-1].message if contents.faults else None
 
 
 def box_name(fault_time: float) -> str:

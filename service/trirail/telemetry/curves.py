@@ -11,27 +11,27 @@ from numpy.typing import NDArray
 from trirail.config import Range
 from trirail.naming import Labels
 from trirail.telemetry import palette
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.palette import Colour
-from trirail.telemetry.shown_robot import ShownRobot
 
 POSITION, VELOCITY, ACCELERATION = "/sliders/position", "/sliders/velocity", "/sliders/acceleration"
 ERROR = "/sliders/following_error"
 CENTRE, PHI, SINGULARITY = "/pose/centre", "/pose/phi", "/pose/singularity"
 TIMING = "/loop/timing"
 
-NEAR = 0.7
-"""Share of a limit from which it is drawn: else it would flatten the curves."""
+DRAWN_FROM = 0.7
+"""Share of a limit from which it is drawn: a distant limit would flatten the curves."""
 
 
 class Curve(NamedTuple):
-    """A moving line."""
+    """Line of a measured or commanded value."""
 
     name: str
     colour: Colour
 
 
 class Limit(NamedTuple):
-    """A constant line."""
+    """Line at a constant value."""
 
     name: str
     value: float
@@ -43,11 +43,11 @@ class Lines(NamedTuple):
 
     moving: tuple[Curve, ...]
     still: tuple[Limit, ...] = ()
-    near: float = 0.0
+    drawn_from: float = 0.0
     """Share of a limit from which it is drawn; 0 for always."""
 
 
-def plots(robot: ShownRobot) -> dict[str, Lines]:
+def plots(robot: DrawnRobot) -> dict[str, Lines]:
     """Return the lines of each plot, by entity, in the units of the curves."""
     slider, platform, names = robot.limits.slider, robot.limits.platform, robot.geometry.labels
     error = slider.following_error * 1e6
@@ -57,7 +57,7 @@ def plots(robot: ShownRobot) -> dict[str, Lines]:
         VELOCITY: _sliders(names, _either_way(slider.velocities, 1e3)),
         ACCELERATION: _sliders(names, _either_way(slider.accelerations, 1.0)),
         ERROR: _sliders(names, np.tile((-error, error), (3, 1))),
-        CENTRE: Lines((Curve("x", palette.X), Curve("y", palette.Y)), _window(platform.x, platform.y), NEAR),
+        CENTRE: Lines((Curve("x", palette.X), Curve("y", palette.Y)), _window(platform.x, platform.y), DRAWN_FROM),
         PHI: Lines((Curve("φ", palette.PHI),)),
         SINGULARITY: Lines((Curve("distance", palette.SINGULARITY),), (Limit("margin", margin),)),
         TIMING: timing(robot.rate_hz, float("nan")),
@@ -105,7 +105,7 @@ def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64
     table = np.empty((rows, count + len(limits)))
     table[:, :count] = moving
     highest = np.where(limits > 0.0, moving.max(initial=0.0), -moving.min(initial=0.0))
-    table[:, count:] = np.where(highest >= lines.near * np.abs(limits), limits, np.nan)
+    table[:, count:] = np.where(highest >= lines.drawn_from * np.abs(limits), limits, np.nan)
     return table
 
 
@@ -131,4 +131,4 @@ def _sliders(names: Labels, ends: NDArray[np.float64]) -> Lines:
         for name, own in named
         for end, value in zip(("min", "max"), own, strict=True)
     )
-    return Lines(lines, limits, NEAR)
+    return Lines(lines, limits, DRAWN_FROM)

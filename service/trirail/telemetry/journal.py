@@ -1,6 +1,6 @@
 """Logs in a recording, beside the records: the inputs of the control, and the events of the service.
 
-Both consist of lines for people that carry the message itself as JSON, for programs.
+Each line has a text for people, and the message itself as JSON for programs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
 class Entry(NamedTuple):
-    """A line of a log."""
+    """Line to write to a log."""
 
     log: str
     """EVENTS or REQUESTS."""
@@ -53,7 +53,7 @@ class Entry(NamedTuple):
 
 
 class Line(NamedTuple):
-    """A line of the log that was read: an event of the service, or a message of the recorder."""
+    """Line read from a log: an event of the service, or a message of the recorder."""
 
     t: float
     """Nominal time since the loop's start [s]."""
@@ -65,15 +65,15 @@ class Line(NamedTuple):
     """The event itself; None for a message of the recorder."""
 
 
-def said(event: Event) -> Entry:
+def event_entry(event: Event) -> Entry:
     """Return the entry of an event of the service."""
     return Entry(EVENTS, event.t, event.time, event.message, event.level, event)
 
 
-def control_input(what: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
+def input_entry(item: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
     """Return the entry of an input of the control, at the nominal time of its cycle."""
-    wall = (what.now_ns + wall_offset_ns) / SECOND
-    return Entry(REQUESTS, what.cycle / rate_hz, wall, _words(what), message=what)
+    wall = (item.now_ns + wall_offset_ns) / SECOND
+    return Entry(REQUESTS, item.cycle / rate_hz, wall, _input_text(item), message=item)
 
 
 def chunks(entries: Sequence[Entry]) -> list[Chunk]:
@@ -104,8 +104,8 @@ def _nanoseconds(seconds: Iterable[float]) -> np.ndarray[tuple[int], np.dtype[np
     return np.array([round(value * SECOND) for value in seconds])
 
 
-def _words(what: ControlInput) -> str:
-    match what.given:
+def _input_text(item: ControlInput) -> str:
+    match item.given:
         case GoalRequest(id=name, user=user, goal=goal):
             return f"goal {name} of {user}: {kind_name(goal)}"
         case CommandRequest(name=name, user=user):
@@ -117,7 +117,7 @@ def _words(what: ControlInput) -> str:
         case Planned(number=number, run=run):
             return f"plan {number}: a motion of {len(run.path.knots) // 8 - 1} pieces"
         case Extended(number=number, s=s):
-            return f"plan {number}: a motion that follows the one before it, {s:.3f} s along its path"
+            return f"plan {number}: a motion blended into the previous one, {s:.3f} s along its path"
         case NotPlanned(number=number, message=message):
             return f"plan {number}: {message}"
         case PlannerLost(reason=reason):

@@ -54,31 +54,31 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
 
 
-def texts(config: Config) -> dict[str, str]:
+def text_documents(config: Config) -> dict[str, str]:
     """Return the text documents of a recording, by entity path."""
     described = msgspec.json.format(msgspec.json.encode(software()), indent=2)
     return {CONFIGURATION: toml(config), SOFTWARE: described.decode()}
 
 
-def configuration(found: Mapping[str, str]) -> Config | None:
+def configuration(documents: Mapping[str, str]) -> Config | None:
     """Return the configuration in a recording's texts; None where there is none. Raises ConfigError."""
-    text = found.get(CONFIGURATION)
+    text = documents.get(CONFIGURATION)
     return parse(text) if text is not None else None
 
 
-def labels(found: Mapping[str, str]) -> Labels:
+def labels(documents: Mapping[str, str]) -> Labels:
     """Return the labels of the sliders in a recording's texts; their letters where there are none."""
     try:
-        config = configuration(found)
+        config = configuration(documents)
     except ConfigError:
         config = None
     return config.geometry.labels if config else NAMES
 
 
-def recorded_by(found: Mapping[str, str]) -> Software | None:
+def recorded_by(documents: Mapping[str, str]) -> Software | None:
     """Return the software in a recording's texts; None where it is missing or cannot be decoded."""
     try:
-        return decoded(found.get(SOFTWARE, ""), Software)
+        return decoded(documents.get(SOFTWARE, ""), Software)
     except msgspec.DecodeError:
         return None
 
@@ -99,9 +99,9 @@ def toml_lines(tables: Tables, other: Tables, base: str, path: str = "") -> Iter
     for key, value in plain.items():
         was = other.get(key)
         if value is not None:
-            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {base}: {_said(was)}")
+            yield f"{key} = {_literal(value)}" + ("" if value == was else f"  # {base}: {_format_value(was)}")
         elif was is not None:
-            yield f"# no {key}; {base}: {_said(was)}"
+            yield f"# no {key}; {base}: {_format_value(was)}"
     for key, value in inner.items():
         name, was = f"{path}.{key}" if path else key, other.get(key)
         if isinstance(value, dict):
@@ -123,7 +123,7 @@ def _literal(value: object) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _said(value: object) -> str:
+def _format_value(value: object) -> str:
     return "none" if value is None else _literal(value)
 
 

@@ -49,7 +49,7 @@ _END = 0
 
 _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
-_KEPT = (RECORD, EVENTS, REQUESTS)
+_READ_ENTITIES = (RECORD, EVENTS, REQUESTS)
 T = TypeVar("T", bound=msgspec.Struct)
 prepare(Event)
 BY_CYCLE = "cycle"
@@ -63,23 +63,33 @@ class OlderRecordingWarning(UserWarning):
 
 
 def read(path: str | os.PathLike[str]) -> Recording:
-    """Read a recording; of one that was cut off, or is still being written, all complete messages.
+    """Read a recording (.rrd), without changing the file.
 
-    Rerun's own format (.rrd); the file is not changed. Fields, units and frames of the records are those of
-    trirail.wire.records.FIELDS: SI units and radians, sliders in the order A, B, C, poses in the base frame.
-    Fields that an older version did not write are NaN, or 0 where they are not floats, with one OlderRecordingWarning.
-    Raises ServiceError if the file cannot be read, is not a recording, or is of another version; its subclass
-    EmptyRecordingError if it holds no records.
+    Fields, units and frames of the records are those of trirail.wire.records.FIELDS: SI units and radians, sliders in
+    the order A, B, C, poses in the base frame. From a file that was cut off, or is still being written, all complete
+    messages are read.
+
+    Raises
+    ------
+    ServiceError
+        The file cannot be read, is not a recording, or is of another version.
+    EmptyRecordingError
+        The recording holds no records.
+
+    Warns
+    -----
+    OlderRecordingWarning
+        The recording is older than some fields: they are NaN, or 0 where they are not floats.
     """
     path = Path(path)
     size = path.stat().st_size if path.is_file() else 0
     try:
-        with _whole(path) as whole:
+        with _without_partial_message(path) as whole:
             chunks = _chunks(whole, path)
     except ServiceError:
         if not path.is_file() or path.stat().st_size == size:
             raise
-        with _whole(path, growing=True) as whole:  # it was being written while Rerun read it
+        with _without_partial_message(path, growing=True) as whole:  # it was being written while Rerun read it
             chunks = _chunks(whole, path)
     texts = _static(chunks, _DOCUMENT)
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
@@ -103,8 +113,8 @@ def join(parts: Sequence[Recording]) -> Recording:
     for other in others:
         if (other.name, other.texts) != (first.name, first.texts):
             raise ServiceError(
-                f"{other.name!r} is not of the same session as {first.name!r}: give the parts of one, "
-                "which have one name but for -part2 and on"
+                f"{other.name!r} is not of the same session as {first.name!r}: "
+                "join files whose names differ only in -part2 and so on"
             )
     _, rows = np.unique(np.concatenate([part.records["cycle"] for part in parts]), return_index=True)
     return Recording(
@@ -114,18 +124,18 @@ def join(parts: Sequence[Recording]) -> Recording:
         wall=np.concatenate([part.wall for part in parts])[rows],
         events=sorted((line for part in parts for line in part.events), key=lambda line: line.t),
         texts=first.texts,
-        requests=tuple(sorted((given for part in parts for given in part.requests), key=lambda given: given.seq)),
+        requests=tuple(sorted((item for part in parts for item in part.requests), key=lambda item: item.seq)),
     )
 
 
 @contextmanager
-def _whole(path: Path, *, growing: bool = False) -> Iterator[Path]:
-    """Yield the file itself or, if its last message was cut off, a copy without it: Rerun would read none of it.
+def _without_partial_message(path: Path, *, growing: bool = False) -> Iterator[Path]:
+    """Yield the file itself or, if its last message was cut off, a copy without that message.
 
-    For a `growing` file, always yield a copy.
+    Rerun reads nothing of a file with a partial message. For a `growing` file, always yield a copy.
     """
     try:
-        size, length = path.stat().st_size, _whole_length(path)
+        size, length = path.stat().st_size, _complete_length(path)
     except FileError as error:
         raise ServiceError(str(error)) from error
     except OSError as error:
@@ -142,8 +152,8 @@ def _whole(path: Path, *, growing: bool = False) -> Iterator[Path]:
         yield copy
 
 
-def _whole_length(path: Path) -> int:
-    """Return the length of a file up to its last whole message [bytes]; all of a closed file."""
+def _complete_length(path: Path) -> int:
+    """Return the length of a file up to its last complete message [bytes]; all of a closed file."""
     with files.open_regular(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
@@ -167,7 +177,7 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
             reader = RrdReader(whole)
         if not reader.recordings():
             raise ServiceError(f"{path}: holds no recording")
-        return [chunk for chunk in reader.stream() if chunk.is_static or chunk.entity_path in _KEPT]
+        return [chunk for chunk in reader.stream() if chunk.is_static or chunk.entity_path in _READ_ENTITIES]
     except (RuntimeError, ValueError) as error:
         raise ServiceError(f"{path}: cannot be read as a recording: {error}") from error
 
@@ -206,7 +216,7 @@ def _check_layout(kind: pa.StructType, path: Path) -> None:
             raise ServiceError(f"{path}: written by another version: its records have no {BY_CYCLE}")
         warnings.warn(
             f"{path}: written by an older version: its records have no {', '.join(missing)}; read as NaN, or 0 where "
-            "that is none",
+            "the field is not a float",
             OlderRecordingWarning,
             stacklevel=4,
         )
@@ -239,8 +249,8 @@ def _events(chunks: list[Chunk], path: Path) -> list[Line]:
     for batch in (chunk.to_record_batch() for chunk in chunks):
         t, wall = _times([batch])
         levels, texts = (_texts(batch, name, path, "events") for name in (_LEVEL, WORDS.component))
-        spoken = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
-        events = [_decoded(content[0], _event, path, "events") if content else None for content in spoken]
+        messages = batch.column(JSON.component).to_pylist() if JSON.component in batch.schema.names else [None] * len(t)
+        events = [_decoded(content[0], _event, path, "events") if content else None for content in messages]
         lines += map(Line, t.tolist(), wall, levels, texts, events)
     return sorted(lines, key=lambda line: line.t)
 
@@ -251,8 +261,8 @@ def _event(text: str) -> Event:
 
 def _requests(chunks: list[Chunk], path: Path) -> tuple[ControlInput, ...]:
     rows = [row for chunk in chunks for row in _texts(chunk.to_record_batch(), JSON.component, path, "requests")]
-    found = (_decoded(row, decode_input, path, "requests") for row in rows)
-    return tuple(sorted(found, key=lambda given: given.seq))
+    inputs = (_decoded(row, decode_input, path, "requests") for row in rows)
+    return tuple(sorted(inputs, key=lambda item: item.seq))
 
 
 def _texts(batch: pa.RecordBatch, component: str, path: Path, what: str) -> list[str]:

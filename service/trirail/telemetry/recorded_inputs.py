@@ -26,7 +26,7 @@ class _RecordedNotice(NamedTuple):
     fields: dict[str, str]
     """Recorded name of each field, by its name in the notice."""
     constants: dict[str, str]
-    """Values of the fields that are not recorded, since they follow from the kind."""
+    """Values of the fields that are not recorded, because the kind determines them."""
 
 
 _CODED = {"message": "message", "event_code": "event_code", "params": "params"}

@@ -1,4 +1,4 @@
-"""The recorder, which writes records, events and frames to the file and to the live view."""
+"""The recorder: it writes records, events and frames to the file and to the live view."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from trirail.errors import ServiceError
 from trirail.telemetry import contents, provenance, retention
 from trirail.telemetry.candump import CandumpLog
 from trirail.telemetry.contents import STAMP, Contents
-from trirail.telemetry.readout import Standing
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.rotation import RotatedFiles, claim
-from trirail.telemetry.shown_robot import ShownRobot
 from trirail.telemetry.sinks import RESERVE, Relay, is_watched, live_relay, live_server
 from trirail.telemetry.streams import LIVE_HZ, REPORT_EVERY, Batches, Streams
 from trirail.wire.event_codes import EventCode, EventText, coded
@@ -33,7 +33,7 @@ RECORDS_HZ = 5
 """Least number of batches of whole records a second to the file."""
 DRAWING_HZ = 1
 """Batches of drawings a second to the file: fewer take less space, and records suffice to draw them again."""
-LOOKS_HZ = 1
+CHECKS_HZ = 1
 """Checks a second of files, folder, log and live view."""
 TIDY_EVERY = 10.0
 """Interval of checking the folder, and of writing the newest file's sidecar [s]."""
@@ -41,15 +41,35 @@ MB = 1e6
 
 
 class Recorder:
-    """One recording, from start to close.
+    """Writer of one recording.
 
-    Its files are `path` or `<robot>-<date>-<time>.rrd` in `directory`, and when rotated the same with `-part2` and
-    so on; with telemetry.capture_can, all CAN frames are written to a .log file beside the first. A black box, given
-    its `name` and `reason` and not a path, is one file, which may fill the disk. With `sidecars`, the contents of each
-    file are written beside it, for `trirail sessions`.
+    With telemetry.capture_can, it also writes all CAN frames to a .log file beside the first.
 
-    `warn` receives reports of missing data; without it they are in the log alone. Raises ServiceError if the file
-    cannot be written or the live port is taken, FileError if `path` is no regular file.
+    Parameters
+    ----------
+    config
+        Configuration of the robot.
+    directory
+        Folder of the files `<robot>-<date>-<time>.rrd`; rotated files also have `-part2` and so on in their names.
+    path
+        File to write instead of one in `directory`.
+    name, reason
+        Name and reason of a black box, which has one file and may fill the disk.
+    sidecars
+        Whether to write the contents of each file beside it, for `trirail sessions`.
+    live
+        Whether to serve the live view.
+    warn
+        Receives reports of missing data; if it is None, they are in the log only.
+    wall_ns, monotonic_ns
+        Clocks [ns].
+
+    Raises
+    ------
+    ServiceError
+        The file cannot be written, or the live port is in use.
+    FileError
+        `path` is not a regular file.
     """
 
     def __init__(
@@ -72,8 +92,8 @@ class Recorder:
         self._own_folder = directory if path is None and name is None else None
         session = name or f"{config.robot.name}-{datetime.fromtimestamp(started_ns * 1e-9).astimezone():{STAMP}}"
         telemetry = config.telemetry
-        self._streams = streams = Streams(ShownRobot.configured(config), session, started_ns - monotonic_ns())
-        self._warn = warn or (lambda text: streams.say("warning", text.text))
+        self._streams = streams = Streams(DrawnRobot.from_config(config), session, started_ns - monotonic_ns())
+        self._warn = warn or (lambda text: streams.log("warning", text.text))
         server = live_server(telemetry.live_port, telemetry.live_mb) if live and telemetry.live_port else None
         try:
             first = claim(directory, session) if path is None else _overwrite(path)
@@ -88,8 +108,8 @@ class Recorder:
         self._frames_cause = ""
         self._sidecars, self._reason, self._wall_offset_ns = sidecars, reason, started_ns - monotonic_ns()
         self._contents: Contents | None = None
-        self._unwritten = ""
-        """Reason why the last sidecar could not be written; empty if it was."""
+        self._sidecar_error = ""
+        """Reason why the last sidecar is missing; empty if it was written."""
         reserve = 0 if self._is_black_box else RESERVE
         self._first, self._own_files = first, first.parent
         self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9, self._warn)
@@ -103,16 +123,16 @@ class Recorder:
             streams.attach(self._live, LIVE_HZ)
             self.live_url = server.uri
         self._last: int | None = None
-        self._absent = 0
+        self._missed_cycles = 0
         self._reported = (0, 0, 0)
-        self._next_look = 0
+        self._next_check = 0
         self._next_report = 0.0
         self._next_tidy = 0.0
         self._next_entry = 0.0
-        self._untidy = ""
-        self._troubled = ""
-        """Reported loss: data that is written to no file; empty for none."""
-        self._well_at = 0.0
+        self._tidy_error = ""
+        self._reported_trouble = ""
+        """Reported loss, as in `unrecorded`; empty for none."""
+        self._recovered_at = 0.0
         """Time at which the end of the loss may be reported [s]."""
 
     @property
@@ -132,7 +152,7 @@ class Recorder:
 
     @property
     def unrecorded(self) -> tuple[str, str]:
-        """Data that is currently written to no file, and the reason; empty while all is written."""
+        """Data that currently reaches no file, and the reason; both empty while everything is written."""
         if self._files.trouble:
             return "nothing is recorded", self._files.trouble
         if self._frames and self._frames.trouble:
@@ -141,23 +161,23 @@ class Recorder:
 
     @property
     def skipped(self) -> int:
-        """Number of batches that the live view was too slow for."""
+        """Number of batches dropped because the live view was too slow."""
         return self._live.skipped if self._live else 0
 
     @property
     def missing(self) -> tuple[int, int, int]:
-        """Numbers of missing batches in the file and in the live view, and of cycles that this recorder missed."""
-        return self.lost, self.skipped, self._absent
+        """Number of batches missing in the file and in the live view, and of cycles that this recorder missed."""
+        return self.lost, self.skipped, self._missed_cycles
 
     def records(self, batch: bytes) -> None:
-        """Take packed records."""
+        """Write packed records."""
         last = last_cycle(batch)
         if self._last is not None:
-            self._absent += last - self._last - len(batch) // SIZE
+            self._missed_cycles += last - self._last - len(batch) // SIZE
         self._last = last
-        if last >= self._next_look:
-            self._next_look = last + self._config.loop.rate_hz // LOOKS_HZ
-            self._look_after()
+        if last >= self._next_check:
+            self._next_check = last + self._config.loop.rate_hz // CHECKS_HZ
+            self._run_checks()
         self._records.add(batch)
         self._streams.records(batch)
         if self._contents is not None:
@@ -166,41 +186,41 @@ class Recorder:
             self._contents.add_cycles(began, ended, len(rows))
 
     def save(self) -> None:
-        """Write all records and log lines taken until now, so that they outlive this process."""
+        """Write all records and log lines received until now, so that they outlive this process."""
         self._records.flush()
         self._streams.save()
 
     def event(self, event: Event) -> None:
-        """Take an event."""
+        """Write an event."""
         self._streams.event(event)
         if self._contents is not None:
             self._contents.event(event)
 
-    def control_input(self, what: ControlInput) -> None:
-        """Take an input of the control."""
-        self._streams.control_input(what)
+    def control_input(self, item: ControlInput) -> None:
+        """Write an input of the control."""
+        self._streams.control_input(item)
         if self._contents is not None:
-            self._contents.control_input(what)
+            self._contents.control_input(item)
 
-    def stands(self, standing: Standing) -> None:
-        """Take the state, beside the records, that holds from now on."""
-        self._streams.stands(standing)
+    def update_state(self, standing: ReadoutState) -> None:
+        """Set the state of the readout, which holds from now on."""
+        self._streams.update_state(standing)
 
     def bus_load(self, share: float) -> None:
-        """Take the load of the bus, 1 for a full one."""
+        """Set the load of the bus, 1 for a full bus."""
         self._streams.bus_load(share)
 
     def frames(self, batch: bytes) -> None:
-        """Take captured CAN frames, packed as trirail_drivers.bus.capture.FRAME."""
+        """Write captured CAN frames, packed as trirail_drivers.bus.capture.FRAME."""
         if self._frames:
             self._frames.write(batch)
             self._frames_cause = self._frames.trouble or self._frames_cause
 
     def close(self) -> None:
-        """Write the rest and complete the file; wait a few seconds at most for a stuck disk or viewer."""
+        """Write the rest and complete the file; wait at most a few seconds for a stuck disk or viewer."""
         self._flush()
-        if words := self._missing():
-            self._streams.say("warning", words)
+        if words := self._missing_text():
+            self._streams.log("warning", words)
             self._streams.save()
         self._files.close()
         self._write_sidecar()
@@ -210,13 +230,13 @@ class Recorder:
             self._live.close()
 
     def _open(self, path: Path) -> rr.RecordingStream:
-        """Begin a file, with all that is needed to view it by itself."""
+        """Begin a file with everything needed to view it alone."""
         self._write_sidecar()
         self._contents = Contents(path.name, self._config.robot.name, reason=self._reason)
         stream = self._streams.open(rr.FileSink(path))
-        for entity, text in provenance.texts(self._config).items():
+        for entity, text in provenance.text_documents(self._config).items():
             stream.log(entity, rr.TextDocument(text), static=True)
-        self._streams.begin_anew()
+        self._streams.resend_state()
         return stream
 
     def _write_sidecar(self, *, running: bool = False) -> None:
@@ -231,9 +251,9 @@ class Recorder:
             retention.sidecar(recording).unlink(missing_ok=True)
         except OSError as error:
             words = f"{retention.sidecar(recording)} cannot be written, trirail sessions reads the recording: {error}"
-            if words != self._unwritten:
+            if words != self._sidecar_error:
                 self._warn(coded(words, EventCode.NOT_INDEXED, error=str(error)))
-        self._unwritten = words
+        self._sidecar_error = words
 
     def _record(self, records: NDArray[np.void]) -> None:
         self._files.write_chunks(self._streams.scene.complete(records))
@@ -242,12 +262,12 @@ class Recorder:
         self._records.flush()
         self._streams.flush()
 
-    def _look_after(self) -> None:
-        """Rotate the file, tidy the folder and report missing data, each if it is due."""
+    def _run_checks(self) -> None:
+        """Rotate the file, tidy the folder and report missing data, each when it is due."""
         t = self._streams.t
         if not self._is_black_box:
             self._rotate()
-        if self._live:  # where nobody watches, it shares the file's drawings
+        if self._live:  # without a viewer it shares the file's drawings, which costs nothing
             self._streams.attach(self._live, LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ)
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
@@ -256,27 +276,27 @@ class Recorder:
             self._next_entry = t + TIDY_EVERY
             if not self._files.trouble:
                 self._write_sidecar(running=True)
-        if not self._tell_trouble(t) and t >= self._next_report and (words := self._missing()):
+        if not self._report_trouble(t) and t >= self._next_report and (words := self._missing_text()):
             self._next_report = t + REPORT_EVERY
             lost, skipped, absent = self.missing
             self._warn(coded(words, EventCode.RECORDING_INCOMPLETE, lost=lost, skipped=skipped, absent=absent))
 
-    def _tell_trouble(self, t: float) -> bool:
-        """Report once when data is written to no file, and once when it is again; return whether a loss is reported.
+    def _report_trouble(self, t: float) -> bool:
+        """Report the begin and the end of a loss once each; return whether a loss is being reported.
 
-        The end of a loss is reported after REPORT_EVERY without one, since a disk may be full intermittently.
+        The end is reported after REPORT_EVERY without a loss, because a full disk may have space intermittently.
         """
-        what, why = self.unrecorded
-        if what:
-            self._well_at = t + REPORT_EVERY
-            if what != self._troubled:
+        problem, why = self.unrecorded
+        if problem:
+            self._recovered_at = t + REPORT_EVERY
+            if problem != self._reported_trouble:
                 code = EventCode.NOT_RECORDED if self._files.trouble else EventCode.NOT_CAPTURED
-                self._warn(coded(f"{what}: {why}", code, error=why))
-            self._troubled = what
-        elif self._troubled and t >= self._well_at:
-            self._troubled = ""
-            self._warn(coded(f"recorded again; {self._missing()}", EventCode.RECORDED_AGAIN))
-        return bool(self._troubled)
+                self._warn(coded(f"{problem}: {why}", code, error=why))
+            self._reported_trouble = problem
+        elif self._reported_trouble and t >= self._recovered_at:
+            self._reported_trouble = ""
+            self._warn(coded(f"recorded again; {self._missing_text()}", EventCode.RECORDED_AGAIN))
+        return bool(self._reported_trouble)
 
     def _rotate(self) -> None:
         """Continue in another file if it is due, but not on a full disk, which has no space for it."""
@@ -295,27 +315,27 @@ class Recorder:
                 self._warn(coded(words, EventCode.RECORDINGS_DELETED, keep_mb=at_most / MB, files=names))
         except OSError as error:
             words = f"cannot delete old recordings: {error}"
-            if words != self._untidy:
-                self._untidy = words
+            if words != self._tidy_error:
+                self._tidy_error = words
                 self._warn(coded(words, EventCode.RECORDINGS_KEPT, error=str(error)))
 
-    def _missing(self) -> str:
+    def _missing_text(self) -> str:
         """Return a text about missing data if there is more than last reported, else ""."""
         if self.missing == self._reported:
             return ""
         self._reported = self.missing
         because = f" ({self.cause})" if self.cause else ""
         return (
-            f"missing so far: {self.lost} batches in the file{because}, {self.skipped} in the live view, "
-            f"{self._absent} cycles that the recorder was too slow for"
+            f"missing data: {self.lost} batches in the file{because}, {self.skipped} in the live view, "
+            f"{self._missed_cycles} cycles (recorder too slow)"
         )
 
 
 def _remedy(error: OSError) -> str:
-    """Return a hint for when no file can be begun."""
+    """Return the next step after a file could not be created."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "make room on that disk; telemetry.keep_mb bounds what recordings take of it"
-    return "telemetry.directory must be a folder that can be written"
+        return "free some space on that disk; telemetry.keep_mb limits the size of all recordings"
+    return "set telemetry.directory to a folder that can be written"
 
 
 def _overwrite(path: Path) -> Path:

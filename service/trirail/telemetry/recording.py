@@ -33,7 +33,7 @@ _ROUNDING = 1e-6
 
 
 class RecordedAlignment(NamedTuple):
-    """Looks that a client reported of one alignment, calibration or check."""
+    """Looks of one alignment, calibration or check, as its client reported them."""
 
     id: str
     """Prefix of the ids of its goals."""
@@ -97,10 +97,26 @@ class Recording(NamedTuple):
         goal: str | None = None,
         every: float | None = None,
     ) -> Recording:
-        """Return a part: from `begin` to `end` in `t` [s], during the `goal` of this id, one row `every` [s].
+        """Return a part of the recording.
 
-        Of the rows of each interval the first is taken, not a mean. All requests are kept, for looking up goals.
-        Raises ServiceError where nothing is left, or there is no such goal.
+        Parameters
+        ----------
+        begin, end
+            First and last time `t` [s].
+        goal
+            Id of a goal: its cycles alone.
+        every
+            Interval of the rows [s]: the first row of each, not a mean.
+
+        Returns
+        -------
+        Recording
+            The part, with all requests, which are needed to look up goals.
+
+        Raises
+        ------
+        ServiceError
+            No row is left, or the goal is not in the recording.
         """
         t = self.t
         chosen = np.ones(len(t), np.bool)
@@ -118,7 +134,7 @@ class Recording(NamedTuple):
             raise ServiceError(f"{self.name}: no cycles {asked}: it has those from {t[0]:.3f} to {t[-1]:.3f} s")
         if every is not None:
             if not every > 0.0:
-                raise ServiceError(f"a row every {every:g} s: a positive time was expected, as 10ms")
+                raise ServiceError(f"a row every {every:g} s: not positive; expected a time such as 10ms")
             number = np.floor((t[rows] - t[rows[0]]) / every + _ROUNDING)
             rows = rows[np.concatenate([[True], np.diff(number) > 0])]
         first, last = t[rows[0]], t[rows[-1]]
@@ -135,10 +151,20 @@ class Recording(NamedTuple):
         return _alignments(self.events)
 
     def table(self, every: float | str | None = None, columns: Sequence[str] = ()) -> pd.DataFrame:
-        """Return the records as a DataFrame of pandas, by `t` [s], one row `every` number of seconds, or as "10ms".
+        """Return the records as a DataFrame of pandas, indexed by `t` [s], in SI units and radians.
 
-        SI units and radians; `columns` are names of fields, or words in names, as pose or error; all if absent. Columns
-        of poses end in _x, _y, _phi, those of sliders in _a, _b, _c. Raises ServiceError for an unknown column.
+        Parameters
+        ----------
+        every
+            Interval of the rows, in seconds or as a text such as "10ms"; None for all rows.
+        columns
+            Names of fields, or words in names, such as pose or error; all fields if empty. Columns of poses end in
+            _x, _y, _phi, those of sliders in _a, _b, _c.
+
+        Raises
+        ------
+        ServiceError
+            Unknown column, or pandas is not installed.
         """
         try:
             import pandas as pd
@@ -149,7 +175,8 @@ class Recording(NamedTuple):
             try:
                 seconds = pd.Timedelta(every).total_seconds() if isinstance(every, str) else every
             except ValueError as error:
-                raise ServiceError(f"a row every {quoted(str(every))}: a time was expected, as 10ms") from error
+                words = f"a row every {quoted(str(every))}: not a time; expected one such as 10ms"
+                raise ServiceError(words) from error
             recording = self.part(every=seconds)
         made: pd.DataFrame = table(recording, columns).to_pandas().set_index("t")
         return made
@@ -159,33 +186,33 @@ def table(recording: Recording, columns: Sequence[str] = ()) -> pa.Table:
     """Return the records as a table: t [s], wall (UTC), mode by its name, then the fields of wire.records.FIELDS.
 
     SI units and radians. Columns of sliders end in _a, _b, _c, of poses in _x, _y, _phi, of the parts of a cycle in
-    their names. `columns` selects fields, behind t: each is a field's name, or a word in several names, as error or
+    their names. `columns` selects fields after t, each by its name, or by a word in several names, such as error or
     commanded. Raises ServiceError for an unknown column.
     """
     fields = chosen(columns)
-    found: dict[str, pa.Array] = {"t": pa.array(recording.t)}
+    table_columns: dict[str, pa.Array] = {"t": pa.array(recording.t)}
     if "wall" in fields:
-        found["wall"] = pa.array(recording.wall)
+        table_columns["wall"] = pa.array(recording.wall)
     for name in fields:
         if name in FIELD_NAMES:
-            found |= dict(_columns(name, recording.records[name]))
-    return pa.table(found)
+            table_columns |= dict(_columns(name, recording.records[name]))
+    return pa.table(table_columns)
 
 
 def chosen(columns: Sequence[str]) -> tuple[str, ...]:
     """Return the requested fields, each once, or all without a request. Raises ServiceError for an unknown word."""
     everything = ("wall", "mode", *(name for name in FIELD_NAMES if name != "mode"))
-    found: list[str] = []
+    fields: list[str] = []
     for column in columns:
         exact = [name for name in (*TIMES, *everything) if name == column]
-        meant = exact or [name for name in everything if column in name.split("_")]
-        if not meant:
+        matches = exact or [name for name in everything if column in name.split("_")]
+        if not matches:
             words = dict.fromkeys(word for name in everything for word in (name, *name.split("_")))
             close = difflib.get_close_matches(column, words, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"a word of these was expected: {', '.join(everything)}"
+            hint = f"did you mean {close[0]}?" if close else f"expected one of, or a word in: {', '.join(everything)}"
             raise ServiceError(f"no column {quoted(column)}: {hint}")
-        found += meant
-    return tuple(dict.fromkeys(found)) if columns else everything
+        fields += matches
+    return tuple(dict.fromkeys(fields)) if columns else everything
 
 
 def _columns(name: str, values: NDArray[np.void]) -> Iterator[tuple[str, pa.Array]]:
@@ -202,21 +229,23 @@ def _columns(name: str, values: NDArray[np.void]) -> Iterator[tuple[str, pa.Arra
 
 def _goal(recording: Recording, goal: str) -> tuple[int, float]:
     """Return the cycle that took a goal, and the time of its end [s]; infinite where that is not recorded."""
-    given = {what.given.id: what.cycle for what in reversed(recording.requests) if isinstance(what.given, GoalRequest)}
+    taken_at = {
+        item.given.id: item.cycle for item in reversed(recording.requests) if isinstance(item.given, GoalRequest)
+    }
     ended = {line.event.id: line.t for line in recording.events if line.event is not None and line.event.kind == "goal"}
-    if goal not in given:
-        last = ", ".join(list(given)[:5]) or "none at all"
+    if goal not in taken_at:
+        last = ", ".join(list(taken_at)[:5]) or "none at all"
         raise ServiceError(f"{recording.name}: no goal {quoted(goal)} in it; the newest: {last}")
-    return given[goal], ended.get(goal, np.inf)
+    return taken_at[goal], ended.get(goal, np.inf)
 
 
 def _alignments(events: Iterable[Line]) -> list[RecordedAlignment]:
     """Return the alignments in a log, in the order of their first looks."""
-    found: dict[tuple[str, str, str], list[tuple[float, AlignmentLook]]] = {}
+    looks_of: dict[tuple[str, str, str], list[tuple[float, AlignmentLook]]] = {}
     for line in events:
         if line.event is not None and (look := line.event.alignment) is not None:
-            found.setdefault((look.id, line.event.user or "", look.purpose), []).append((line.t, look))
+            looks_of.setdefault((look.id, line.event.user or "", look.purpose), []).append((line.t, look))
     return [
-        RecordedAlignment(*name, tuple(t for t, _ in told), tuple(look for _, look in told))
-        for name, told in found.items()
+        RecordedAlignment(*name, tuple(t for t, _ in reported), tuple(look for _, look in reported))
+        for name, reported in looks_of.items()
     ]

@@ -1,7 +1,7 @@
-"""Retention of recordings: the search of their folder, and deletion of the oldest when they take too much space.
+"""Retention of recordings: deletion of the oldest when all together take too much space.
 
-No clock decides here. A machine without a battery clock dates files years ahead, until it has the network's time. A
-file that is being written is known by its lock, and the order of files by the dates and numbers in their names.
+No file time decides here: a machine without a battery clock dates files years off until it has the network's time.
+A file that is being written is locked, and the dates and numbers in the names give the order of files.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def sidecar(recording: Path) -> Path:
     return recording.with_name(f"{recording.name}.json")
 
 
-class _Kept(NamedTuple):
+class _StoredRecording(NamedTuple):
     path: Path
     size: int
     order: tuple[bool, bool, str, str, int, int]
@@ -73,13 +73,13 @@ def is_being_written(path: Path) -> bool:
 def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
     """Delete the oldest recordings until all together take no more than `at_most` bytes; return the deleted ones.
 
-    Recordings of the running `session` are deleted after all others, regardless of dates, and black boxes last, when
-    nothing else is left; files that are being written stay. Raises OSError if a file cannot be deleted.
+    Recordings of the running `session` are deleted after all others, regardless of dates, and black boxes last. Files
+    that are being written stay. Raises OSError if a file cannot be deleted.
     """
-    found = sorted(_recordings(directory, session), key=lambda kept: kept.order)
-    total = sum(kept.size for kept in found)
+    recordings = sorted(_recordings(directory, session), key=lambda kept: kept.order)
+    total = sum(kept.size for kept in recordings)
     deleted: list[Path] = []
-    for kept in found:
+    for kept in recordings:
         if total <= at_most:
             break
         try:
@@ -87,7 +87,7 @@ def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
                 continue
             for path in kept.files:
                 path.unlink()
-        except FileNotFoundError:  # somebody else deleted it just now
+        except FileNotFoundError:  # another process deleted it just now
             pass
         else:
             deleted.append(kept.path)
@@ -95,7 +95,7 @@ def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
     return deleted
 
 
-def _recordings(directory: Path, session: str) -> Iterator[_Kept]:
+def _recordings(directory: Path, session: str) -> Iterator[_StoredRecording]:
     for path in directory.glob("*.rrd"):
         match = _NAME.fullmatch(path.name)
         if match is None:
@@ -107,4 +107,4 @@ def _recordings(directory: Path, session: str) -> Iterator[_Kept]:
             continue
         name, date, part, again = match["name"], match["date"], int(match["part"] or 1), int(match["again"] or 1)
         own = session != "" and path.stem.startswith(session)
-        yield _Kept(path, size, (f"{name}-" == BLACK_BOX, own, date, name, part, again))
+        yield _StoredRecording(path, size, (f"{name}-" == BLACK_BOX, own, date, name, part, again))

@@ -17,16 +17,16 @@ from trirail.wire.event_codes import EventCode, EventText, coded
 SOON, RETRY = 1.0, 10.0
 """Delay from the failure of a file to the first attempt with another one, and interval of further attempts [s]."""
 TRIAL = 1 << 19
-"""Test data that a new file must take [bytes]: more than its first content, whose writing is not checked."""
+"""Size of the test data written to a new file [bytes]: more than its first content, whose writing is not checked."""
 
 Open = Callable[[Path], rr.RecordingStream]
 Close = Callable[[rr.RecordingStream], None]
 
 
 class RotatedFiles:
-    """Writer of batches into the newest file; another one begins on `turn`, or if the newest fails or is deleted.
+    """Writer of batches into the newest of several files.
 
-    `warn` receives a message on the latter.
+    Another file begins on `turn`, or when the newest one fails or is deleted; `warn` receives a report of a deletion.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class RotatedFiles:
         if self._archive.gone and (self._retry is None or now >= self._retry):
             self._retry, deleted = now + RETRY, self.path
             if self.turn():
-                words = f"{deleted} has been deleted or moved: the recording goes on in {self.path}"
+                words = f"{deleted} has been deleted or moved; the recording continues in {self.path}"
                 self._warn(coded(words, EventCode.RECORDING_MOVED, file=str(deleted), next=str(self.path)))
         self._archive.write_chunks(chunks)
         self.cause = self.trouble or self.cause

@@ -20,9 +20,9 @@ from trirail.kinematics.geometry import Geometry
 from trirail.naming import Labels
 from trirail.telemetry import columns, curves, palette, readout, shown_alignment
 from trirail.telemetry.columns import FIELDS, RECORD, Column
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.palette import Colour
-from trirail.telemetry.readout import Standing
-from trirail.telemetry.shown_robot import ShownRobot
+from trirail.telemetry.readout import ReadoutState
 from trirail.wire.vocabulary import MODES
 from trirail.workspace import part_positions
 from trirail.workspace.part_positions import Points, RobotParts
@@ -34,7 +34,7 @@ POSITIONS = rr.Points2D.descriptor_positions()
 STRIPS = rr.LineStrips2D.descriptor_strips()
 TRANSLATION = rr.Transform3D.descriptor_translation()
 QUATERNION = rr.Transform3D.descriptor_quaternion()
-_CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
+_ORIGIN_CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]]))
 
 
 def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tuple[str, rr.AsComponents]]:
@@ -47,7 +47,7 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
     yield "/robot/anchors", _labelled(parts.anchors, zeros, [palette.ANCHORS], 6.0, order=13)
     yield "/robot/names", _labelled(parts.names, list(names), palette.SLIDERS, 0.0, order=13)
     cross = ORIGIN * np.ptp(parts.bounds)
-    yield "/robot/origin", _lines([axis * cross for axis in _CROSS], [palette.ARMS], 0.8, order=14)
+    yield "/robot/origin", _lines([axis * cross for axis in _ORIGIN_CROSS], [palette.ARMS], 0.8, order=14)
     yield from _named(frames, cross)
     yield "/robot/commanded/outline", _lines(parts.outline, [palette.COMMANDED], 4.5, order=20)
     yield "/robot/platform/arms", _lines(parts.arms, [palette.ARMS], 0.8, order=21)
@@ -91,7 +91,7 @@ def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
     """Return the platform at the goal's pose, with a cross at its centre; nothing without a goal."""
     if pose is None:
         return Column("/robot/goal", STRIPS, columns.ragged([[]]))
-    cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _CROSS]
+    cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _ORIGIN_CROSS]
     lines = part_positions.transform_lines([*parts.outline, *cross], pose)
     return Column("/robot/goal", STRIPS, columns.ragged([lines]))
 
@@ -158,7 +158,7 @@ STATE = rr.StateChange.descriptor_state()
 class Scene:
     """A robot for Rerun. `wall_offset_ns` is the wall clock less the monotonic one."""
 
-    def __init__(self, robot: ShownRobot, wall_offset_ns: int) -> None:
+    def __init__(self, robot: DrawnRobot, wall_offset_ns: int) -> None:
         self._rate_hz = robot.rate_hz
         self._timelines = columns.Timelines(self._rate_hz, wall_offset_ns)
         self._geometry, self._frames = robot.geometry, robot.frames
@@ -191,9 +191,9 @@ class Scene:
 
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return whole records, unchanged."""
-        return columns.chunks(self._timelines.of(records), [Column(RECORD, FIELDS, columns.structs(records))])
+        return columns.chunks(self._timelines.for_records(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
-    def drawn(self, records: NDArray[np.void], standing: Standing) -> list[Chunk]:
+    def drawn(self, records: NDArray[np.void], standing: ReadoutState) -> list[Chunk]:
         """Return the drawing of one or more records, in order. `standing` holds at the last of them."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         newest = records[ends]
@@ -202,16 +202,16 @@ class Scene:
         for path, values in curves.values(records, newest, starts, distance).items():
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
-        chunks = columns.chunks(self._timelines.of(newest), parts)
+        chunks = columns.chunks(self._timelines.for_records(newest), parts)
         return chunks + self._status(records) + self._readout(records[-1], standing)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
         """Return the drawing of the goal's pose from the time of `record` on; `pose` is None without a goal."""
-        return columns.chunks(self._timelines.of(record.reshape(1)), [goal(self._parts, pose)])
+        return columns.chunks(self._timelines.for_records(record.reshape(1)), [goal(self._parts, pose)])
 
-    def _readout(self, record: np.void, standing: Standing) -> list[Chunk]:
+    def _readout(self, record: np.void, standing: ReadoutState) -> list[Chunk]:
         text = pa.array([[readout.markdown(record, standing, self._geometry.labels)]])
-        return columns.chunks(self._timelines.of(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
+        return columns.chunks(self._timelines.for_records(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
 
     def _status(self, records: NDArray[np.void]) -> list[Chunk]:
         """Return mode and outline of the workspace at the first record, and at changes of the mode and of φ."""
@@ -224,7 +224,7 @@ class Scene:
         indices = self._reach.outline_indices(at["pose"][:, 2])
         outlines = columns.ragged([[self._reach.outline(index)] for index in indices])
         parts = [Column("/mode", STATE, modes), Column("/robot/workspace", STRIPS, outlines)]
-        return columns.chunks(self._timelines.of(at), parts)
+        return columns.chunks(self._timelines.for_records(at), parts)
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -1,4 +1,4 @@
-"""Sessions of a folder of recordings, found by the sidecars of the recordings."""
+"""Search for sessions in a folder of recordings, by the recordings' sidecars."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trirail.telemetry.contents import Contents
 from trirail.telemetry.retention import is_being_written
 
 
-class Wanted(NamedTuple):
+class SessionFilter(NamedTuple):
     """Filter of sessions; None for any."""
 
     robot: str | None = None
@@ -26,12 +26,12 @@ class Wanted(NamedTuple):
     fault: str | None = None
     """Part of a fault's cause, code as 0x8700, or message; case is ignored."""
     user: str | None = None
-    """User that sent something; with `outcome`, user whose goal ended so."""
+    """User that sent a goal or command; with `outcome`, user of a goal with that outcome."""
     outcome: str | None = None
 
 
 class RecordedSession(Struct):
-    """A session, of one file or, where its recording was rotated, several."""
+    """Session of one file, or of several if its recording was rotated."""
 
     session: str
     robot: str
@@ -56,10 +56,18 @@ class RecordedSession(Struct):
 def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], None] | None = None) -> list[Contents]:
     """Return the contents of each recording of a folder, in the order of their names.
 
-    A recording without a usable sidecar, or with `reread` any, is read after a call of `on_read` with it, and its
-    contents are written beside it. One that is being written is omitted until its recorder has written its sidecar.
+    A recording that is being written is omitted until its recorder has written its sidecar.
+
+    Parameters
+    ----------
+    folder
+        Folder of the recordings.
+    reread
+        Whether to read all recordings; otherwise only those without a usable sidecar. The sidecar is written again.
+    on_read
+        Called with each recording before it is read.
     """
-    found = []
+    listed = []
     for path in sorted(folder.glob("*.rrd"), key=lambda path: path.name):
         known = contents.load(path)
         if known is None or known.running or reread:
@@ -70,15 +78,15 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
             if not being_written:  # a recording that is still marked as running was cut off
                 if on_read is not None:
                     on_read(path)
-                known = contents.of_file(path)
+                known = contents.read_contents(path)
                 with contextlib.suppress(OSError):  # the folder is another user's: read it again the next time
                     contents.save(path, known)
         if known is not None:
-            found.append(known)
-    return found
+            listed.append(known)
+    return listed
 
 
-def find(files: Iterable[Contents], wanted: Wanted = Wanted()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
+def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
     """Return the sessions of files that match a filter, in the order of their begin."""
     parts_of: dict[str, list[Contents]] = {}
     for file in sorted(files, key=lambda file: (file.began or 0.0, file.name)):
@@ -113,7 +121,7 @@ def _joined(parts: list[Contents]) -> RecordedSession:
     )
 
 
-def _is_wanted(parts: list[Contents], wanted: Wanted) -> bool:
+def _is_wanted(parts: list[Contents], wanted: SessionFilter) -> bool:
     began = [part.began for part in parts if part.began is not None]
     ended = [part.ended for part in parts if part.ended is not None]
     if wanted.robot is not None and all(part.robot != wanted.robot for part in parts):

@@ -22,13 +22,13 @@ _SCALARS = rr.Scalars.descriptor_scalars()
 
 
 class ShownAlignment:
-    """The alignment under way, or the last one."""
+    """Drawing of the current alignment, or of the last one."""
 
     def __init__(self) -> None:
         self._looks: list[AlignmentLook] = []
 
     def drawing_of(self, event: Event, look: AlignmentLook) -> list[Chunk]:
-        """Take a look, and return its drawing."""
+        """Add a look, and return its drawing."""
         if self._looks and (self._looks[0].id, self._looks[0].purpose) != (look.id, look.purpose):
             self._looks.clear()
         self._looks = [*self._looks, look][-MOST_LOOKS:]

@@ -1,7 +1,7 @@
 """Sinks of a recording: a file for everything, and a live view that may be slow, frozen or absent.
 
-Rerun's sinks do not report their failures: they stop taking data, and then block every sender for ever.
-This module prevents that, and counts the data that a sink does not get.
+Rerun's sinks do not report their failures: they stop accepting data, and then block every sender for ever.
+This module prevents that, and counts the data that does not reach a sink.
 """
 
 from __future__ import annotations
@@ -20,40 +20,37 @@ from rerun.chunk import Chunk
 
 from trirail.errors import ServiceError
 
-HOST = "127.0.0.1"
+LOOPBACK = "127.0.0.1"
 BACKLOG = 20
 """Greatest number of batches that wait for the live view: 2 s."""
 RESERVE = 64 << 20
 """Space left free on the disk [bytes]: a file sink never recovers from a full disk."""
-PATIENCE = 2.0
+DISK_TIMEOUT_S = 2.0
 """Time-out for the disk, or for the end of a thread [s]."""
 
 
-def no_room(directory: Path, reserve: int) -> str:
-    """Return why nothing can be written there with `reserve` bytes left free; else ""."""
+def disk_shortage(directory: Path, reserve: int) -> str:
+    """Return why no data can be written to a folder while `reserve` bytes stay free; empty if it can."""
     try:
         free = shutil.disk_usage(directory).free
     except OSError as error:
         return f"{directory}: {error.strerror}"
     if free > reserve:
         return ""
-    return f"{directory} is full: {free / 1e6:.0f} MB are free, {reserve / 1e6:.0f} MB are to stay so"
+    return f"{directory} is full: {free / 1e6:.0f} MB are free, {reserve / 1e6:.0f} MB are reserved"
 
 
 def identity(path: Path) -> tuple[int, int] | None:
     """Return the device and inode, which distinguish a file from a later one of its name; None without a file."""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 class Archive:
-    """A recording file; each batch is passed to the operating system before the next.
-
-    It leaves `reserve` bytes of the disk free.
-    """
+    """Recording file; each batch reaches the operating system before the next, and `reserve` bytes stay free."""
 
     def __init__(self, stream: rr.RecordingStream, path: Path, reserve: int = RESERVE) -> None:
         self.lost = 0
@@ -79,24 +76,24 @@ class Archive:
 
     @property
     def stuck(self) -> bool:
-        """Whether the file takes no more data: Rerun's sink does not recover from a failed disk."""
+        """Whether the file accepts no more data: Rerun's sink does not recover from a failed disk."""
         return self._stuck
 
     def close(self) -> None:
         """Complete the file, unless the disk is stuck."""
-        if self._flushed(PATIENCE):
+        if self._flushed(DISK_TIMEOUT_S):
             self._stream.disconnect()
 
     def _write(self, chunks: list[Chunk]) -> str:
         """Write a batch; return the reason of a failure, else ""."""
         if self.gone:
-            return f"{self._path} has been deleted or moved, and no other file can be begun there"
-        if full := no_room(self._directory, self._reserve):
+            return f"{self._path} has been deleted or moved, and no other file can be created there"
+        if full := disk_shortage(self._directory, self._reserve):
             return full
         if not self._stuck or self._flushed(0.01):
             self._stream.send_chunks(chunks)
-            self._flushed(PATIENCE)
-        return f"{self._directory} takes no more: disk failing or read-only, or a quota" if self._stuck else ""
+            self._flushed(DISK_TIMEOUT_S)
+        return f"{self._directory} cannot be written: disk failing or read-only, or a quota" if self._stuck else ""
 
     def _flushed(self, within: float) -> bool:
         try:
@@ -109,7 +106,7 @@ class Archive:
 
 
 class Relay:
-    """Relay of batches in its own thread, which skips to the newest when the receiver falls behind."""
+    """Relay of batches in its own thread; when the receiver falls behind, it skips to the newest batch."""
 
     def __init__(self, deliver: Callable[[list[Chunk]], None], finish: Callable[[], None]) -> None:
         self.skipped = 0
@@ -136,7 +133,7 @@ class Relay:
         with self._changed:
             self._closing = True
             self._changed.notify()
-        self._thread.join(PATIENCE)
+        self._thread.join(DISK_TIMEOUT_S)
 
     def _run(self) -> None:
         while (chunks := self._next()) is not None:
@@ -152,7 +149,7 @@ class Relay:
 def free_port() -> int:
     """Return an unused port of the loopback."""
     with socket.socket() as probe:
-        probe.bind((HOST, 0))
+        probe.bind((LOOPBACK, 0))
         port: int = probe.getsockname()[1]
         return port
 
@@ -175,21 +172,21 @@ def _serves(descriptor: int, port: int) -> bool:
 
 
 def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
-    """Return a server for viewers on this machine, that keeps `memory_mb` of the past for those that connect late.
+    """Return a server for viewers on this machine; it keeps `memory_mb` of the past for viewers that connect late.
 
-    They get the newest data first: the present is shown immediately, and the past is filled in afterwards.
-    Raises ServiceError if the port is taken.
+    They receive the newest data first, so that they show the present immediately. Raises ServiceError if the port is
+    in use.
     """
     with socket.socket() as probe:  # the sink would only log a taken port, and discard all data
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((HOST, port))
+            probe.bind((LOOPBACK, port))
         except OSError as error:
             raise ServiceError(
-                f"live view: cannot listen on {HOST}:{port}: {error.strerror}; "
+                f"live view: cannot listen on {LOOPBACK}:{port}: {error.strerror}; "
                 "set telemetry.live_port to a free port, or to 0 for no live view"
             ) from error
-    return rr.GrpcServerSink(HOST, port, server_memory_limit=f"{memory_mb:.0f}MB", newest_first=True)
+    return rr.GrpcServerSink(LOOPBACK, port, server_memory_limit=f"{memory_mb:.0f}MB", newest_first=True)
 
 
 def live_relay(stream: rr.RecordingStream) -> Relay:

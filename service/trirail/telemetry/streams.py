@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
 from trirail.telemetry import blueprint, journal
-from trirail.telemetry.blueprint import Shown
+from trirail.telemetry.blueprint import RobotView
 from trirail.telemetry.columns import SECOND
+from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.telemetry.journal import EVENTS, Entry
-from trirail.telemetry.readout import Standing
+from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.scene import Scene
 from trirail.telemetry.shown_alignment import ShownAlignment
-from trirail.telemetry.shown_robot import ShownRobot
 from trirail.wire.messages import Event, Level
 from trirail.wire.packets import ControlInput
 from trirail.wire.records import DTYPE, unpack
@@ -32,21 +32,21 @@ REPORT_EVERY = 10.0
 
 
 class Sink(Protocol):
-    """Receiver of batches, which counts those that it cannot take."""
+    """Receiver of batches; it counts those that it cannot accept."""
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Take a batch without a long wait."""
+        """Write a batch without a long wait, or count it as lost."""
 
 
 class Streams:
-    """Recording of one robot, with its drawing and its layout, and its sinks.
+    """Recording of one robot, with its drawing, its layout and its sinks.
 
-    All its entities are below the entity `root`, if given: other robots may be in the same recording.
+    All entities are below the entity `root`: other robots may be in the same recording.
     """
 
-    def __init__(self, robot: ShownRobot, name: str, wall_offset_ns: int, root: str = "") -> None:
+    def __init__(self, robot: DrawnRobot, name: str, wall_offset_ns: int, root: str = "") -> None:
         self.scene = Scene(robot, wall_offset_ns)
-        self.shown = Shown(robot, self.scene.bounds, root)
+        self.shown = RobotView(robot, self.scene.bounds, root)
         """Data of the robot for a layout."""
         self._name = name
         self._rate_hz = robot.rate_hz
@@ -55,10 +55,10 @@ class Streams:
         self._streams: list[rr.RecordingStream] = []
         self._waiting: list[Chunk] = []
         self._entries: list[Entry] = []
-        self._paces: dict[Sink, int] = {}
+        self._rates: dict[Sink, int] = {}
         self._batches: dict[int, Batches] = {}
         self._newest = bytes(DTYPE.itemsize)
-        self._standing = Standing()
+        self._state = ReadoutState()
         self._goal_drawn = True
         self._alignment = ShownAlignment()
 
@@ -81,11 +81,11 @@ class Streams:
 
         Another call changes the rate. Sinks of the same rate share their drawings, since drawing costs the most.
         """
-        if self._paces.get(sink) == drawing_hz:
+        if self._rates.get(sink) == drawing_hz:
             return
         self.flush()
-        self._paces[sink] = drawing_hz
-        self._batches = {hz: Batches(self._rate_hz // hz, partial(self._draw, hz)) for hz in set(self._paces.values())}
+        self._rates[sink] = drawing_hz
+        self._batches = {hz: Batches(self._rate_hz // hz, partial(self._draw, hz)) for hz in set(self._rates.values())}
 
     @property
     def t(self) -> float:
@@ -93,58 +93,58 @@ class Streams:
         return float(self._record["cycle"]) / self._rate_hz
 
     def records(self, batch: bytes) -> None:
-        """Take packed records."""
+        """Send packed records to the sinks."""
         if not self._goal_drawn:
             self._goal_drawn = True
-            self._waiting += self.scene.goal(unpack(batch)[0], self._standing.target)
+            self._waiting += self.scene.goal(unpack(batch)[0], self._state.target)
         for batches in self._batches.values():
             batches.add(batch)
         self._newest = batch[-DTYPE.itemsize :]
 
-    def stands(self, standing: Standing) -> None:
-        """Take the state that holds from the next record on."""
-        self._goal_drawn = self._goal_drawn and standing.target == self._standing.target
-        self._standing = standing
+    def update_state(self, state: ReadoutState) -> None:
+        """Set the state of the readout from the next record on."""
+        self._goal_drawn = self._goal_drawn and state.target == self._state.target
+        self._state = state
 
     def bus_load(self, share: float) -> None:
-        """Take the load of the bus, 1 for a full one."""
+        """Set the load of the bus, 1 for a full bus."""
         for path, archetype in self.scene.bus_load(share):
             for stream in self._streams:
                 stream.log(f"{self.shown.root}{path}", archetype, static=True)
 
     def event(self, event: Event) -> None:
-        """Take an event."""
-        self._entries.append(journal.said(event))
+        """Add an event to the log."""
+        self._entries.append(journal.event_entry(event))
         if event.alignment is not None:
             self._waiting += self._alignment.drawing_of(event, event.alignment)
 
-    def control_input(self, what: ControlInput) -> None:
-        """Take an input of the control."""
-        self._entries.append(journal.control_input(what, self._rate_hz, self._wall_offset_ns))
+    def control_input(self, item: ControlInput) -> None:
+        """Add an input of the control to the log."""
+        self._entries.append(journal.input_entry(item, self._rate_hz, self._wall_offset_ns))
 
-    def say(self, level: Level, message: str) -> None:
-        """Write a line of the log at the time of the newest record."""
+    def log(self, level: Level, message: str) -> None:
+        """Add a line to the log at the time of the newest record."""
         wall = (int(self._record["deadline_ns"]) + self._wall_offset_ns) / SECOND
         self._entries.append(Entry(EVENTS, self.t, wall, message, level))
 
-    def begin_anew(self) -> None:
-        """Repeat with the next records the data that is otherwise sent only on change: a sink has begun a new file."""
-        self._goal_drawn = self._standing.target is None
+    def resend_state(self) -> None:
+        """Send data that is otherwise sent only on change with the next records, because a sink began a new file."""
+        self._goal_drawn = self._state.target is None
 
     def drop(self, stream: rr.RecordingStream) -> None:
         """Remove a complete stream."""
         self._streams.remove(stream)
 
     def save(self) -> None:
-        """Pass on the messages taken until now, together: a batch costs about the same with one line or ten."""
+        """Send all pending messages in one batch, which costs about the same with one line or ten."""
         chunks = self._placed(self._waiting + journal.chunks(self._entries))
         self._waiting, self._entries = [], []
         if chunks:
-            for sink in self._paces:
+            for sink in self._rates:
                 sink.write_chunks(chunks)
 
     def flush(self) -> None:
-        """Pass on all messages and records."""
+        """Send all messages and records."""
         self.save()
         for batches in self._batches.values():
             batches.flush()
@@ -155,8 +155,8 @@ class Streams:
         return newest
 
     def _draw(self, hz: int, records: NDArray[np.void]) -> None:
-        chunks = self._placed(self.scene.drawn(records, self._standing))
-        for sink, pace in self._paces.items():
+        chunks = self._placed(self.scene.drawn(records, self._state))
+        for sink, pace in self._rates.items():
             if pace == hz:
                 sink.write_chunks(chunks)
 
@@ -175,40 +175,40 @@ def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.
     return stream
 
 
-class Shortfall:
-    """Report of missing data in the log, when there is more than last reported, and not too often."""
+class MissingDataReport:
+    """Report of missing data in the log, at most every REPORT_EVERY seconds, when more is missing than before."""
 
     def __init__(self, streams: Streams, words: str, counts: Callable[[], tuple[int, ...]]) -> None:
         self._streams = streams
         self._words = words
         self._counts = counts
-        self._said = counts()
+        self._reported = counts()
         self._next = 0.0
 
     def check(self) -> None:
         """Write the report if it is due."""
         missing = self._counts()
-        if missing != self._said and self._streams.t >= self._next:
-            self._said, self._next = missing, self._streams.t + REPORT_EVERY
-            self._streams.say("warning", self._words.format(*missing))
+        if missing != self._reported and self._streams.t >= self._next:
+            self._reported, self._next = missing, self._streams.t + REPORT_EVERY
+            self._streams.log("warning", self._words.format(*missing))
 
 
 class Batches:
-    """Records, collected until there are enough to pass on."""
+    """Collector of records into batches."""
 
     def __init__(self, size: int, deliver: Callable[[NDArray[np.void]], None]) -> None:
-        self._enough = max(1, size) * DTYPE.itemsize
+        self._batch_bytes = max(1, size) * DTYPE.itemsize
         self._deliver = deliver
         self._pending = bytearray()
 
     def add(self, batch: bytes) -> None:
-        """Add packed records; pass all on if there are enough."""
+        """Add packed records; deliver all when there are enough for a batch."""
         self._pending += batch
-        if len(self._pending) >= self._enough:
+        if len(self._pending) >= self._batch_bytes:
             self.flush()
 
     def flush(self) -> None:
-        """Pass on the collected records."""
+        """Deliver the collected records."""
         if self._pending:
             records = unpack(bytes(self._pending))
             self._pending.clear()

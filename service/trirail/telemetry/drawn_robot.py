@@ -15,7 +15,7 @@ prepare(GeometryTable)
 
 
 @dataclass(frozen=True, slots=True)
-class ShownRobot:
+class DrawnRobot:
     """Data of a robot for its drawing."""
 
     name: str
@@ -25,7 +25,7 @@ class ShownRobot:
     frames: FramesTable
 
     @classmethod
-    def configured(cls, settings: Config) -> ShownRobot:
+    def from_config(cls, settings: Config) -> DrawnRobot:
         """Return the robot of a configuration."""
         return cls(
             settings.robot.name,
@@ -36,8 +36,8 @@ class ShownRobot:
         )
 
     @classmethod
-    def of_info(cls, info: Info) -> ShownRobot:
-        """Return the robot of a service's answer. Raises msgspec.ValidationError or ConfigError for other versions."""
+    def from_info(cls, info: Info) -> DrawnRobot:
+        """Return the robot of a service. Raises msgspec.ValidationError or ConfigError if its version differs."""
         each = [_leg(leg) for leg in info.geometry]
         legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
         limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)

@@ -1,4 +1,4 @@
-"""Requests of a tab to the service, each in a task of its own, so that STOP never waits."""
+"""Requests of a tab to the service, each in its own task, so that STOP never waits."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from trirail.client.goal import AsyncGoalHandle
 from trirail.client.lease import AsyncLease
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.panel.feed import now
-from trirail.panel.messages import Asked, Follow, Forget, SendGoal, TakeOver, Teach, Tell
+from trirail.panel.messages import Follow, Forget, SendCommand, SendGoal, ServiceRequest, TakeOver, Teach
 from trirail.wire.goals import kind_name
 from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
 
-FRESH = 500
+MAX_STATE_AGE_MS = 500
 """Maximum age of the page's newest state for a jog; if it is older, the page or its connection has stalled [ms]."""
-UNDER_WAY = 8
-"""Maximum number of unanswered commands of a tab; commands that stop the robot have the same limit of their own."""
+MAX_PENDING = 8
+"""Maximum number of unanswered commands of a tab; commands that stop the robot have the same limit separately."""
 
 
-class Say(Protocol):
+class MessageSender(Protocol):
     """Sender of messages to the page; `to` is a word of the page's languages, `name` that of its object, if any."""
 
     def __call__(self, tell: str, /, **content: Any) -> None:
         """Send a message of kind `tell`."""
 
 
-class Orders:
-    """Requests of one tab, answered by `say`, and the lease while the tab holds it."""
+class TabRequests:
+    """Sender of one tab's requests, and holder of its lease; `send` sends the replies to the page."""
 
-    def __init__(self, robot: AsyncRobot, loop: LoopThread, say: Say) -> None:
+    def __init__(self, robot: AsyncRobot, loop: LoopThread, send: MessageSender) -> None:
         self._robot = robot
         self._loop = loop
-        self._say = say
-        self._under_way: Counter[str] = Counter()
+        self._reply = send
+        self._pending: Counter[str] = Counter()
         self._lease: AsyncLease | None = None
         self._open = True
 
@@ -48,64 +48,64 @@ class Orders:
         """Release the lease, even if an acquisition is still in progress."""
         self._open = False
         with contextlib.suppress(ServiceError):  # the connection is closed: the lease ends by its time-out
-            self._loop.call(self._give_back())
+            self._loop.call(self._release())
 
-    def begin(self, said: Asked) -> None:
-        """Send a request in parallel with pending ones; drop a command that is pending already."""
-        match said:
-            case Tell(name, content):
-                asked = lambda: self._command(name, bytes(content) or None)  # noqa: E731
-                self._loop.start(self._answer(asked, name))
+    def begin(self, request: ServiceRequest) -> None:
+        """Send a request in parallel with pending ones; drop a command that is already pending."""
+        match request:
+            case SendCommand(name, content):
+                send = lambda: self._command(name, bytes(content) or None)  # noqa: E731
+                self._loop.start(self._answer(send, name))
             case TakeOver():
                 self._loop.start(self._answer(lambda: self._acquire(force=True), "takeover"))
             case SendGoal(goal, seen):
-                if seen is None or now() - seen <= FRESH:
+                if seen is None or now() - seen <= MAX_STATE_AGE_MS:
                     name = str(getattr(goal, "name", ""))
                     self._loop.start(self._answer(lambda: self._robot.send(goal), kind_name(goal), name))
             case Follow(name):
-                self._loop.start(self._answer(lambda: self._follow(said), "follow", name))
+                self._loop.start(self._answer(lambda: self._follow(request), "follow", name))
             case Teach(name):
                 self._loop.start(self._answer(lambda: self._robot.teach(name), "teach", name))
             case Forget(name):
                 self._loop.start(self._answer(lambda: self._robot.forget(name), "forget", name))
 
-    async def _answer(self, ask: Callable[[], Awaitable[object]], what: str, name: str = "") -> None:
+    async def _answer(self, send_request: Callable[[], Awaitable[object]], kind: str, name: str = "") -> None:
         """Send a request and report its result; commands that stop the robot never wait and have their own places."""
-        stops = isinstance(what, Command) and what.stops
-        repeats = isinstance(what, Command) and not stops and what is not Command.SET_OUTPUT  # it is of one output
-        if repeats and self._under_way[what]:
+        stops = isinstance(kind, Command) and kind.stops
+        repeats = isinstance(kind, Command) and not stops and kind is not Command.SET_OUTPUT  # it is of one output
+        if repeats and self._pending[kind]:
             return
         place = "stops" if stops else "others"
-        if self._under_way[place] >= UNDER_WAY:
-            message = f"{UNDER_WAY} commands of this page wait for their answers already"
-            self._say("refused", to=what, name=name, message=message, code=RefusalCode.BUSY)
+        if self._pending[place] >= MAX_PENDING:
+            message = f"{MAX_PENDING} commands of this page are already waiting for replies"
+            self._reply("refused", to=kind, name=name, message=message, code=RefusalCode.BUSY)
             return
-        self._under_way.update((place, what))
+        self._pending.update((place, kind))
         try:
-            done = await ask()
+            done = await send_request()
         except TrirailError as error:
-            self._say("refused", to=what, name=name, **refusal(error))
+            self._reply("refused", to=kind, name=name, **refusal(error))
         else:
             if isinstance(done, AsyncGoalHandle):
-                self._say("accepted", to=what, name=name, id=done.id)
+                self._reply("accepted", to=kind, name=name, id=done.id)
             else:
                 seq = done.seq if isinstance(done, CommandReply) else 0
-                self._say("done", to=what, name=name, seq=seq)
+                self._reply("done", to=kind, name=name, seq=seq)
         finally:
-            self._under_way.subtract((place, what))
+            self._pending.subtract((place, kind))
 
     async def _command(self, name: Command, content: bytes | None) -> CommandReply | None:
         if name is Command.ACQUIRE:
             await self._acquire()
         elif name is Command.RELEASE and self._lease is not None:
-            await self._give_back()
+            await self._release()
         else:
             return await self._robot.command(name, content)
         return None
 
-    async def _follow(self, said: Follow) -> AsyncGoalHandle:
-        points = await asyncio.to_thread(trajectory.parse, said.name, said.text)
-        return await self._robot.follow(points, stretch=said.stretch)
+    async def _follow(self, request: Follow) -> AsyncGoalHandle:
+        points = await asyncio.to_thread(trajectory.parse, request.name, request.text)
+        return await self._robot.follow(points, stretch=request.stretch)
 
     async def _acquire(self, *, force: bool = False) -> None:
         """Acquire the lease and hold it while this tab is open: its keep-alives end with the tab."""
@@ -114,9 +114,9 @@ class Orders:
             await lease.__aenter__()
             self._lease = lease
         if not self._open:
-            await self._give_back()
+            await self._release()
 
-    async def _give_back(self) -> None:
+    async def _release(self) -> None:
         lease, self._lease = self._lease, None
         if lease is not None:
             await lease.__aexit__()
