@@ -14,12 +14,12 @@ from contextlib import aclosing
 import msgspec
 from trirail_drivers.interface import Triple
 
+from trirail.client import path_check
 from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import LoopThread
+from trirail.client.path_check import CheckedPath, Obstacle
 from trirail.errors import TrirailError
-from trirail.panel import path_check
 from trirail.panel.description import describe, shown
-from trirail.panel.path_check import CheckedPath, Obstacle
 from trirail.panel.permissions import permissions
 from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
