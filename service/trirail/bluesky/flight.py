@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from bluesky.protocols import EventCollectable, Flyable, Reading
 from event_model import DataKey, PartialEvent
@@ -49,7 +49,7 @@ class Flight(Device, Flyable, EventCollectable):
         name: str,
         first: Mapping[int, float] | None = None,
     ) -> None:
-        self._stage = stage
+        self.parent = stage
         self._send = send
         self._has_marks = has_marks
         self._first = first
@@ -58,6 +58,10 @@ class Flight(Device, Flyable, EventCollectable):
         self._samples: list[dict[str, Reading[Any]]] = []
         self._interrupted = self._stopped = False
         super().__init__(name)
+
+    @property
+    def _stage(self) -> Stage:
+        return cast("Stage", self.parent)
 
     async def connect(self, *_: object, **__: object) -> None:
         """Connect the stage."""

@@ -6,7 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import AsyncIterator, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 from bluesky.protocols import HasHints, Hints, Location, Reading
@@ -53,10 +53,10 @@ class Stage(Device, AsyncReadable, HasHints):
     def __init__(self, robot: Robot, name: str = "") -> None:
         self._robot = robot
         self._linking: asyncio.Task[Link] | None = None
-        self.x = Axis(self, 0)
-        self.y = Axis(self, 1)
-        self.phi = Axis(self, 2)
-        self.pose = PoseAxis(self)
+        self.x = Axis(0)
+        self.y = Axis(1)
+        self.phi = Axis(2)
+        self.pose = PoseAxis()
         super().__init__(name)
 
     @property
@@ -166,15 +166,20 @@ class Stage(Device, AsyncReadable, HasHints):
 class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
     """Axes of a stage that one value sets."""
 
-    def __init__(self, stage: Stage, coordinate: str) -> None:
-        self._stage = stage
+    def __init__(self, coordinate: str) -> None:
         self._coordinate = coordinate
         super().__init__()
 
     @property
+    def _stage(self) -> Stage:
+        return cast(Stage, self.parent)  # set by Device, where a stage gets its axes
+
+    @property
     def name(self) -> str:
         """Key of its reading."""
-        return self._name or self._stage.key(self._coordinate)
+        if self._name or self.parent is None:
+            return self._name
+        return self._stage.key(self._coordinate)
 
     @property
     def hints(self) -> Hints:
@@ -233,9 +238,9 @@ class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
 class Axis(_Movable[float]):
     """One coordinate of the platform's centre: x, y [m] or phi [rad]."""
 
-    def __init__(self, stage: Stage, index: int) -> None:
+    def __init__(self, index: int) -> None:
         self._index = index
-        super().__init__(stage, COORDINATES[index])
+        super().__init__(COORDINATES[index])
 
     async def check_value(self, value: float) -> None:
         """Check the path to a value with the other coordinates as they are; see Stage.check."""
@@ -253,8 +258,8 @@ class Axis(_Movable[float]):
 class PoseAxis(_Movable[NDArray[np.float64]]):
     """The whole pose of the platform's centre: x, y [m] and phi [rad]."""
 
-    def __init__(self, stage: Stage) -> None:
-        super().__init__(stage, "pose")
+    def __init__(self) -> None:
+        super().__init__("pose")
 
     async def check_value(self, value: Sequence[float] | NDArray[np.float64]) -> None:
         """Check the path to a pose; see Stage.check."""
