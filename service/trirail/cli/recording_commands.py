@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 from rich.text import Text
 
 from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.options import Flag, Json
-from trirail.errors import ServiceError
+from trirail.errors import ServiceError, TrirailError
 from trirail.naming import Labels, label
 from trirail.telemetry import palette
 
@@ -91,6 +91,10 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
     return 0
 
 
+export_app = App(name="export", help="Write a recorded session as a table, CSV or Parquet, or as MCAP.")
+
+
+@export_app.default
 def export(
     *file: Recordings,
     out: Path | None = None,
@@ -99,19 +103,20 @@ def export(
     every: notation.Time | None = None,
     columns: str = "",
     goal: str | None = None,
+    format: Literal["csv", "parquet", "mcap"] | None = None,  # noqa: A002 - the option's name
     json: Json = False,
 ) -> int:
-    """Write a recorded session as a table, CSV or Parquet.
+    """Write a recorded session as a table, CSV or Parquet, or as MCAP.
 
-    A row a cycle, in SI units.
+    A row per cycle, in SI units. MCAP has messages of ROS 2, for Foxglove, PlotJuggler and ros2 bag.
 
     Parameters
     ----------
     file
         Recording, or all files of one that was rotated.
     out
-        File to write, never over one that exists; its suffix is its format: .csv, .parquet. Beside the recording, as
-        CSV, if absent.
+        File to write, never over one that exists; its suffix is its format: .csv, .parquet, .mcap. Beside the
+        recording, as CSV, if absent.
     begin
         First time, since the start of the service's loop, as report shows times: 12.5s.
     end
@@ -122,17 +127,75 @@ def export(
         Names of columns, or words of names, with commas between: pose,error. All if absent.
     goal
         From when a goal of this id was given until it ended.
+    format
+        Format of the file; that of the suffix of --out if absent.
     """
+    path = out or file[0].with_suffix(f".{format or 'csv'}")
+    if format is not None and path.suffix != f".{format}":
+        raise TrirailError(f"{path}: the name of a file of format {format} must end in .{format}")
+    wanted = [column.strip() for column in columns.split(",") if column.strip()]
+    if path.suffix == ".mcap" and wanted:
+        raise TrirailError("--columns selects columns of a table: MCAP has messages with all of them")
+    recording = _read(file).part(begin, end, goal=goal, every=every)
+    unit, count = (
+        ("messages", _write_mcap(recording, path))
+        if path.suffix == ".mcap"
+        else ("rows", _write_table(recording, path, wanted))
+    )
+    if json:
+        terminal.json({"file": str(path), unit: count})
+    else:
+        terminal.print_line(f"{count} {unit} written to {path}")
+    return 0
+
+
+@export_app.command
+def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json = False) -> int:
+    """Write the mechanism as URDF, with the joints of exported recordings.
+
+    Parameters
+    ----------
+    config
+        Configuration of the robot; that of the simulated one if absent.
+    out
+        File to write, never over one that exists; standard output if absent.
+    """
+    from trirail.analysis.urdf import document
+    from trirail.config import SIM, geometry, load
+
+    settings = load(config or SIM)
+    text = document(settings.robot.name, geometry(settings.geometry), settings.limits)
+    if out is not None:
+        try:
+            with out.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except FileExistsError as error:
+            raise ServiceError(f"{out} exists already: name another file") from error
+        except OSError as error:
+            raise ServiceError(f"cannot write {out}: {error.strerror or error}") from error
+    if json:
+        terminal.json({"file": str(out) if out else None, "urdf": text})
+    elif out is not None:
+        terminal.print_line(f"URDF written to {out}")
+    else:
+        terminal.print_line(text.rstrip())
+    return 0
+
+
+def _write_mcap(recording: Recording, path: Path) -> int:
+    try:
+        from trirail.analysis import mcap
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "rosbags":
+            raise
+        raise TrirailError("MCAP needs rosbags: pip install 'trirail[mcap]'") from error
+    return mcap.write(recording, path)
+
+
+def _write_table(recording: Recording, path: Path, columns: list[str]) -> int:
     from trirail.analysis.export import write
 
-    path = out or file[0].with_suffix(".csv")
-    wanted = [column.strip() for column in columns.split(",") if column.strip()]
-    rows = write(_read(file).part(begin, end, goal=goal, every=every), path, wanted)
-    if json:
-        terminal.json({"file": str(path), "rows": rows})
-    else:
-        terminal.print_line(f"{rows} rows written to {path}")
-    return 0
+    return write(recording, path, columns)
 
 
 def _read(files: tuple[Path, ...]) -> Recording:
