@@ -7,9 +7,9 @@ import math
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from trirail.client.path_check import CheckedPath, checked_path, problem
 from trirail.config import SIM, FramesTable, load
 from trirail.motion.runs import centre_motion, rest
-from trirail.client.path_check import CheckedPath, checked_path, problem
 from trirail.telemetry.shown_robot import ShownRobot
 from trirail.workspace.violations import violations
 

@@ -167,7 +167,7 @@ def _turn(angle: float) -> Any:
 
 
 def _nanoseconds(walls: NDArray[np.datetime64]) -> list[int]:
-    return walls.astype("datetime64[ns]").astype(np.int64).tolist()
+    return [int(wall) for wall in walls.astype("datetime64[ns]").astype(np.int64)]
 
 
 def _wall(line: Line) -> int:

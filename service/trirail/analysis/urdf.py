@@ -81,7 +81,7 @@ def _add_joint(
     angle: float,
     limit: tuple[float, float, float] | None = None,
 ) -> None:
-    """Add a joint from one link to another, at a place and direction in the first; `limit` is low, high and velocity."""
+    """Add a joint between two links, at a place and direction in the first; `limit` is low, high and velocity."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=links[0])
     ET.SubElement(joint, "child", link=links[1])
@@ -106,5 +106,5 @@ def _box(x: float, y: float, z: float) -> dict[str, str]:
 def _draw(link: ET.Element, shape: str, size: dict[str, str], xy: Vector, angle: float, colour: str) -> None:
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=f"{xy[0]:.9g} {xy[1]:.9g} 0", rpy=f"0 0 {angle:.9g}")
-    ET.SubElement(ET.SubElement(visual, "geometry"), shape, **size)
+    ET.SubElement(ET.SubElement(visual, "geometry"), shape, size)
     ET.SubElement(visual, "material", name=colour)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -178,7 +179,7 @@ def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json =
     elif out is not None:
         terminal.print_line(f"URDF written to {out}")
     else:
-        terminal.print_line(text.rstrip())
+        sys.stdout.write(text)
     return 0
 
 
