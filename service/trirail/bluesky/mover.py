@@ -67,6 +67,11 @@ class _Motion:
     interrupted: bool = False
     """Whether its stop was requested, and is no failure."""
 
+    def finish(self, result: Result) -> None:
+        """End its sets as the goal has ended."""
+        failed = result.outcome != "done" and not self.interrupted
+        end_all(self.moves, UnfinishedError(result) if failed else None)
+
 
 class Mover:
     """Sends one goal for the sets that arrive together, and ends them with it; all in one event loop.
@@ -155,23 +160,29 @@ class Mover:
                 self._motion = None  # nobody knows whether it is still under way
             end_all(motion.moves, error)
             return
-        failed = result.outcome != "done" and not motion.interrupted
-        end_all(motion.moves, UnfinishedError(result) if failed else None)
+        motion.finish(result)
 
     async def _send_goal(self, moves: list[AxisMove], before: _Motion | None) -> _Motion:
         """Send the goal of sets, and of those under way whose axes they leave alone."""
+        carried: list[AxisMove] = []
+        pose = (await self._robot.state()).commanded.pose
         if before is not None and before.goal.result is None:
+            # Taken over before the goal is sent: its acceptance ends the goal before, and the sets left with that.
             carried = [old for old in before.moves if not any(old.shares_axis(new) for new in moves)]
+            before.moves = [old for old in before.moves if old not in carried]
             pose = before.target
-        else:
-            carried, pose = [], (await self._robot.state()).commanded.pose
         target = list(pose)
         for move in moves:
             for axis, value in move.targets.items():
                 target[axis] = value
-        goal = await self._robot.move_to(*target)
-        if before is not None:  # only now: where the goal is refused, the one before continues
-            before.moves = [old for old in before.moves if old not in carried]
+        try:
+            goal = await self._robot.move_to(*target)
+        except BaseException:
+            if before is not None:
+                before.moves += carried
+                if before.goal.result is not None:
+                    before.finish(before.goal.result)
+            raise
         return _Motion(Pose(*target), goal, [*carried, *moves])
 
     async def _watch(self) -> ServiceError:

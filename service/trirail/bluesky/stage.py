@@ -28,7 +28,7 @@ from trirail.wire.state import Pose, State
 COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 UNNAMED = "stage"
-"""Prefix of the keys of a stage without a name."""
+"""Name of a stage that is used without one."""
 T = TypeVar("T", float, NDArray[np.float64])
 Keys = dict[str, DataKey]
 Readings = dict[str, Reading[Any]]
@@ -70,6 +70,8 @@ class Stage(Device, AsyncReadable, HasHints):
 
     async def link(self) -> Link:
         """Return the connection in the running event loop, made at the first call."""
+        if not self.name:
+            self.set_name(UNNAMED)  # documents need a name; init_devices would have given that of the variable
         loop = asyncio.get_running_loop()
         task = self._linking
         failed = task is not None and task.done() and (task.cancelled() or task.exception() is not None)
