@@ -15,7 +15,7 @@ from trirail.kinematics.leg import AnyLeg
 
 BASE, PLATFORM = "base", "platform"
 RAIL_M, CARRIAGE_M, SLIDE_M, PLATFORM_M = 0.006, 0.02, 0.005, 0.008
-"""Thickness of what is drawn [m]."""
+"""Thicknesses in the drawing [m]."""
 COLOURS = {"rail": "0.5 0.5 0.5 1", "a": "0.82 0.29 0.36 1", "b": "0.18 0.55 0.34 1", "c": "0.18 0.44 0.70 1"}
 Vector = tuple[float, float]
 

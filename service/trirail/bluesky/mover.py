@@ -94,7 +94,7 @@ class Mover:
         move = AxisMove(targets, asyncio.get_running_loop().create_future())
         move.end.add_done_callback(lambda end: end.cancelled() or end.exception())  # a set need not be waited for
         if any(move.shares_axis(other) for other in self._gathered):
-            self._start_task()  # what was gathered so far is sent before
+            self._start_task()  # a goal of the earlier sets goes first
         self._gathered.append(move)
         if len(self._gathered) == 1:
             self._start_task(GATHERING_S)
@@ -209,7 +209,7 @@ async def cancel(goal: AsyncGoalHandle) -> None:
     except RefusedError as error:
         if error.code != RefusalCode.NO_GOAL:
             raise
-    with contextlib.suppress(TimeoutError):  # its end is reported with the standstill, or by whoever waits for it
+    with contextlib.suppress(TimeoutError):  # its end is reported with the standstill
         await goal.wait(SILENCE_S)
 
 

@@ -34,7 +34,7 @@ Keys = dict[str, DataKey]
 Readings = dict[str, Reading[Any]]
 
 
-class Link(NamedTuple):
+class StageLink(NamedTuple):
     """Connection of a stage within one event loop."""
 
     loop: asyncio.AbstractEventLoop
@@ -46,17 +46,17 @@ class Link(NamedTuple):
 class Stage(Device, AsyncReadable, HasHints):
     """A robot as a device of Bluesky, with the movable axes `x`, `y`, `phi`, and `pose` for all three together.
 
-    Lengths are in metres, angles in radians. A reading is of one state, published after everything that this client
-    has been told: after a move it is of the place where the move ended. The stage neither enables nor homes the robot.
+    Lengths are in metres, angles in radians. A reading is of one state, published after every event that this client
+    has received: after a move, it is of the place where the move ended. The stage neither enables nor homes the robot.
     """
 
     def __init__(self, robot: Robot, name: str = "") -> None:
         self._robot = robot
-        self._linking: asyncio.Task[Link] | None = None
-        self.x = Axis(0)
-        self.y = Axis(1)
-        self.phi = Axis(2)
-        self.pose = PoseAxis()
+        self._linking: asyncio.Task[StageLink] | None = None
+        self.x = MovableAxis(0)
+        self.y = MovableAxis(1)
+        self.phi = MovableAxis(2)
+        self.pose = MovablePose()
         super().__init__(name)
 
     @property
@@ -68,7 +68,7 @@ class Stage(Device, AsyncReadable, HasHints):
         """Ask the service for geometry and limits, in the running event loop. Raises ServiceError if nobody answers."""
         await self.link()
 
-    async def link(self) -> Link:
+    async def link(self) -> StageLink:
         """Return the connection in the running event loop, made at the first call."""
         if not self.name:
             self.set_name(UNNAMED)  # documents need a name; init_devices would have given that of the variable
@@ -159,10 +159,10 @@ class Stage(Device, AsyncReadable, HasHints):
             "limits": {"control": {"low": low, "high": high}},
         }
 
-    async def _connect(self, loop: asyncio.AbstractEventLoop) -> Link:
+    async def _connect(self, loop: asyncio.AbstractEventLoop) -> StageLink:
         robot = await self._robot.for_running_loop()
         shown = ShownRobot.of_info(await robot.info())
-        return Link(loop, robot, shown, Mover(robot))
+        return StageLink(loop, robot, shown, Mover(robot))
 
 
 class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
@@ -237,7 +237,7 @@ class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
         raise NotImplementedError
 
 
-class Axis(_Movable[float]):
+class MovableAxis(_Movable[float]):
     """One coordinate of the platform's centre: x, y [m] or phi [rad]."""
 
     def __init__(self, index: int) -> None:
@@ -257,7 +257,7 @@ class Axis(_Movable[float]):
         return pose[self._index]
 
 
-class PoseAxis(_Movable[NDArray[np.float64]]):
+class MovablePose(_Movable[NDArray[np.float64]]):
     """The whole pose of the platform's centre: x, y [m] and phi [rad]."""
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ from trirail.wire.goals import PoseGoal, Tool, TrajectoryGoal
 from trirail.wire.packed_trajectory import packed
 from trirail.workspace.violations import violations
 
-LOOKS = 40
+CHECKED_POSES = 40
 """Number of poses checked on the line in pose space, from its end."""
 DRAWN = 200
 """Number of points drawn of a path, evenly spaced in time."""
@@ -46,7 +46,7 @@ def problem(robot: ShownRobot, start: Triple, end: Triple, tool: Tool | None, fr
 
     `start` is the pose of the centre in the base frame, `end` that of the tool in a frame of the robot, x, y [m] and
     phi [rad]; the tool moves in a straight line. Checked are positions, passive travel and the singular margin, at
-    LOOKS places; the service judges speeds and the planner's findings between them.
+    CHECKED_POSES places; the service judges speeds and the planner's findings between them.
     """
     names = NamedFrames(robot.frames)
     try:
@@ -55,14 +55,14 @@ def problem(robot: ShownRobot, start: Triple, end: Triple, tool: Tool | None, fr
         return Obstacle(str(error), code=error.code)
     u, v = rotated(end[0], end[1], angle)
     first, last = np.array(tool_motion(rest(start), point).pose), np.array((x + u, y + v, angle + end[2]))
-    for share in np.linspace(1.0, 0.0, LOOKS, endpoint=False):
+    for share in np.linspace(1.0, 0.0, CHECKED_POSES, endpoint=False):
         pose = centre_motion(rest((share * last + (1.0 - share) * first).tolist()), point).pose
         try:
-            found = violations(robot.geometry, robot.limits, np.asarray(pose))
+            exceeded = violations(robot.geometry, robot.limits, np.asarray(pose))
         except KinematicsError as error:
             return Obstacle(str(error), bool(share < 1.0), "unreachable", error.leg)
-        if found:
-            least = found[0]
+        if exceeded:
+            least = exceeded[0]
             code = least.quantity.replace(" ", "_")
             return Obstacle(str(least), bool(share < 1.0), code, least.label, least.value, least.limit, least.unit)
     return None
