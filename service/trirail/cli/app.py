@@ -218,7 +218,7 @@ app.command(math_commands.fk)
 app.command(math_commands.workspace)
 app.command(recording_commands.replay)
 app.command(recording_commands.report)
-app.command(recording_commands.export)
+app.command(recording_commands.export_app)
 app.command(sessions_command.sessions)
 
 

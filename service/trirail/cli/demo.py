@@ -23,7 +23,7 @@ from trirail.wire.state import State
 GOAL_TIMEOUT_S = 15.0
 
 
-class Stage(NamedTuple):
+class DemoMove(NamedTuple):
     """One goal of the tour: a name, x, y [m], phi [rad] and the speed."""
 
     name: str
@@ -35,41 +35,41 @@ class Stage(NamedTuple):
 
 CENTRE = (0.0, 0.0, 0.0)
 ALIGNMENT = (
-    Stage("1 mm along x", 0.001, 0.0, 0.0),
-    Stage("1 mm along y", 0.001, 0.001, 0.0),
-    Stage("1° to the left", 0.001, 0.001, math.radians(1.0)),
-    Stage("a part that lies askew", -0.0012, 0.0008, math.radians(-0.35)),
-    Stage("30 µm and 15 arcsec further", -0.00117, 0.00083, math.radians(-0.35 + 15.0 / 3600.0)),
-    Stage("4 mm and 3°", 0.004, -0.003, math.radians(3.0)),
-    Stage("the other way", -0.003, 0.004, math.radians(-2.5)),
-    Stage("back to the centre", *CENTRE),
+    DemoMove("1 mm along x", 0.001, 0.0, 0.0),
+    DemoMove("1 mm along y", 0.001, 0.001, 0.0),
+    DemoMove("1° to the left", 0.001, 0.001, math.radians(1.0)),
+    DemoMove("a part that lies askew", -0.0012, 0.0008, math.radians(-0.35)),
+    DemoMove("30 µm and 15 arcsec further", -0.00117, 0.00083, math.radians(-0.35 + 15.0 / 3600.0)),
+    DemoMove("4 mm and 3°", 0.004, -0.003, math.radians(3.0)),
+    DemoMove("the other way", -0.003, 0.004, math.radians(-2.5)),
+    DemoMove("back to the centre", *CENTRE),
 )
 """For stages of millimetres."""
 STAGE_RANGE_M = 0.02
 """The greatest |x| of a stage's table up to which it is one of millimetres [m]."""
 TOUR = (
-    Stage("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
-    Stage("back to the centre", *CENTRE),
-    Stage("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.13),
-    Stage("back to the centre", *CENTRE),
-    Stage("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.13),
-    Stage("back to the centre", *CENTRE),
-    Stage("tour: right, turned left", 0.06, 0.02, 0.35),
-    Stage("tour: top", 0.0, 0.07, -0.4),
-    Stage("tour: left, turned right", -0.06, 0.02, -0.7),
-    Stage("tour: bottom left", -0.04, -0.05, 0.2),
-    Stage("tour: bottom right, slowly", 0.04, -0.05, -0.2, 0.5),
-    Stage("tour: home", *CENTRE),
+    DemoMove("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
+    DemoMove("back to the centre", *CENTRE),
+    DemoMove("paper: 50 mm along x", 0.05, 0.0, 0.0, 0.13),
+    DemoMove("back to the centre", *CENTRE),
+    DemoMove("paper: 50 mm along y", 0.0, 0.05, 0.0, 0.13),
+    DemoMove("back to the centre", *CENTRE),
+    DemoMove("tour: right, turned left", 0.06, 0.02, 0.35),
+    DemoMove("tour: top", 0.0, 0.07, -0.4),
+    DemoMove("tour: left, turned right", -0.06, 0.02, -0.7),
+    DemoMove("tour: bottom left", -0.04, -0.05, 0.2),
+    DemoMove("tour: bottom right, slowly", 0.04, -0.05, -0.2, 0.5),
+    DemoMove("tour: home", *CENTRE),
 )
 
 
 class _Row(NamedTuple):
-    stage: Stage
+    stage: DemoMove
     result: Result
     seconds: float
 
 
-def tour(config: Config) -> tuple[Stage, ...]:
+def tour(config: Config) -> tuple[DemoMove, ...]:
     """Return the goals for a robot: the paper's and a round, or those of alignment."""
     return ALIGNMENT if max(map(abs, config.limits.platform.x)) <= STAGE_RANGE_M else TOUR
 
@@ -115,7 +115,7 @@ def run_align(record: Path | None) -> int:
     return demo_align.run(file, record or Path(load(file).telemetry.directory) / f"align-{stamp}.rrd")
 
 
-def _tour(robot: Robot, stages: Sequence[Stage]) -> Iterator[_Row]:
+def _tour(robot: Robot, stages: Sequence[DemoMove]) -> Iterator[_Row]:
     columns = TextColumn("{task.description:28}"), MofNCompleteColumn(), TextColumn("{task.fields[note]}")
     with Progress(*columns, console=out) as progress:
         task = progress.add_task("the tour", total=len(stages), note="")

@@ -104,6 +104,8 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
             "trirail export session.rrd --out session.parquet",
             "trirail export session.rrd --from 2s --to 5s --every 10ms --columns pose,error",
             "trirail export session.rrd --goal g-17",
+            "trirail export --format mcap session.rrd --every 10ms",
+            "trirail export urdf robot.toml --out robot.urdf",
         ),
         "replay": (
             "trirail replay session.rrd",

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 from rich.text import Text
 
 from trirail.cli import alignment_lines, notation, terminal
 from trirail.cli.options import Flag, Json
-from trirail.errors import ServiceError
+from trirail.errors import ServiceError, TrirailError
 from trirail.naming import Labels, label
 from trirail.telemetry import palette
 
@@ -91,6 +92,10 @@ def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Fl
     return 0
 
 
+export_app = App(name="export", help="Write a recorded session as a table, CSV or Parquet, or as MCAP.")
+
+
+@export_app.default
 def export(
     *file: Recordings,
     out: Path | None = None,
@@ -100,18 +105,19 @@ def export(
     columns: str = "",
     goal: str | None = None,
     switches: Annotated[bool, Flag] = False,
+    format: Literal["csv", "parquet", "npy", "mcap"] | None = None,  # noqa: A002 - the option's name
     json: Json = False,
 ) -> int:
-    """Write a recorded session as a table: CSV, Parquet or numpy.
+    """Write a recorded session as a table, CSV, Parquet or numpy, or as MCAP.
 
-    One row per cycle, in SI units.
+    A row per cycle, in SI units. MCAP has messages of ROS 2, for Foxglove, PlotJuggler and ros2 bag.
 
     Parameters
     ----------
     file
         Recording, or all files of one that was rotated.
     out
-        File to write, never over one that exists; its suffix is its format: .csv, .parquet, .npy. Beside the
+        File to write, never over one that exists; its suffix is its format: .csv, .parquet, .npy, .mcap. Beside the
         recording, as CSV, if absent.
     begin
         First time, since the start of the service's loop, as report shows times: 12.5s.
@@ -125,20 +131,76 @@ def export(
         From when a goal of this id was given until it ended.
     switches
         One row per switch of an output on a path instead, with the cycle and both poses.
+    format
+        Format of the file; that of the suffix of --out if absent.
     """
+    path = out or file[0].with_suffix(f".{format or 'csv'}")
+    if format is not None and path.suffix != f".{format}":
+        raise TrirailError(f"{path}: the name of a file of format {format} must end in .{format}")
+    wanted = [column.strip() for column in columns.split(",") if column.strip()]
+    if path.suffix == ".mcap" and wanted:
+        raise TrirailError("--columns selects columns of a table: MCAP has messages with all of them")
+    if switches and (every is not None or wanted or path.suffix == ".mcap"):
+        raise ServiceError("--switches writes a table with a row per switch: leave --every, --columns and MCAP out")
+    recording = _read(file).part(begin, end, goal=goal, every=every)
+    if path.suffix == ".mcap":
+        unit, count = "messages", _write_mcap(recording, path)
+    else:
+        unit, count = "rows", _write_table(recording, path, wanted, switches=switches)
+    if json:
+        terminal.json({"file": str(path), unit: count})
+    else:
+        terminal.print_line(f"{count} {unit} written to {path}")
+    return 0
+
+
+@export_app.command
+def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json = False) -> int:
+    """Write the mechanism as URDF, with the joints of exported recordings.
+
+    Parameters
+    ----------
+    config
+        Configuration of the robot; that of the simulated one if absent.
+    out
+        File to write, never over one that exists; standard output if absent.
+    """
+    from trirail.analysis.urdf import document
+    from trirail.config import SIM, geometry, load
+
+    settings = load(config or SIM)
+    text = document(settings.robot.name, geometry(settings.geometry), settings.limits)
+    if out is not None:
+        try:
+            with out.open("x", encoding="utf-8") as file:
+                file.write(text)
+        except FileExistsError as error:
+            raise ServiceError(f"{out} exists already: name another file") from error
+        except OSError as error:
+            raise ServiceError(f"cannot write {out}: {error.strerror or error}") from error
+    if json:
+        terminal.json({"file": str(out) if out else None, "urdf": text})
+    elif out is not None:
+        terminal.print_line(f"URDF written to {out}")
+    else:
+        sys.stdout.write(text)
+    return 0
+
+
+def _write_mcap(recording: Recording, path: Path) -> int:
+    try:
+        from trirail.analysis import mcap
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "rosbags":
+            raise
+        raise TrirailError("MCAP needs rosbags: pip install 'trirail[mcap]'") from error
+    return mcap.write(recording, path)
+
+
+def _write_table(recording: Recording, path: Path, columns: list[str], *, switches: bool) -> int:
     from trirail.analysis.export import write, write_switches
 
-    path = out or file[0].with_suffix(".csv")
-    wanted = [column.strip() for column in columns.split(",") if column.strip()]
-    if switches and (every is not None or wanted):
-        raise ServiceError("--switches has a row for each switch: leave --every and --columns out")
-    recording = _read(file).part(begin, end, goal=goal, every=every)
-    rows = write_switches(recording, path) if switches else write(recording, path, wanted)
-    if json:
-        terminal.json({"file": str(path), "rows": rows})
-    else:
-        terminal.print_line(f"{rows} rows written to {path}")
-    return 0
+    return write_switches(recording, path) if switches else write(recording, path, columns)
 
 
 def _read(files: tuple[Path, ...]) -> Recording:

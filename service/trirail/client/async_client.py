@@ -102,6 +102,13 @@ class AsyncRobot:
         self._open = AsyncConnection(connection)
         self._opened.enter_context(self._open.subscribe_to_events(self._on_event, history=True))
 
+    async def _shared(self, connection: Connection) -> AsyncRobot:
+        """Return a robot with goals of its own by the same connection, in the running event loop."""
+        shared = copy.copy(self)
+        shared._opened, shared._goals = AsyncExitStack(), OpenGoals()
+        await shared._use(connection)
+        return shared
+
     async def _twin(self, connection: Connection) -> AsyncRobot:
         """Return a robot that sends commands by the same connection, in the running event loop."""
         twin = copy.copy(self)

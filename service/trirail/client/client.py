@@ -195,6 +195,10 @@ class Robot:
         self._loop.close()
         self._stop_loop.close()
 
+    async def for_running_loop(self) -> AsyncRobot:
+        """Return a robot for the running event loop that shares this connection, until either of them is closed."""
+        return await self._robot._shared(self._connection)
+
     @property
     def skipped(self) -> int:
         """Number of publications on this robot's keys that were not valid messages."""

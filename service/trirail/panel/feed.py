@@ -14,12 +14,12 @@ from contextlib import aclosing
 import msgspec
 from trirail_drivers.interface import Triple
 
+from trirail.client import path_check
 from trirail.client.async_client import AsyncRobot
 from trirail.client.blocking import LoopThread
+from trirail.client.path_check import CheckedPath, Obstacle
 from trirail.errors import TrirailError
-from trirail.panel import path_check
 from trirail.panel.description import describe, drawn_robot
-from trirail.panel.path_check import CheckedPath, Obstacle
 from trirail.panel.permissions import permissions
 from trirail.wire.goals import PoseGoal
 from trirail.wire.looks import AlignmentLook
@@ -78,7 +78,7 @@ class Feed:
         return [event for event in sorted({*self._alignment_events, *self._events}) if event[0] > after]
 
     def find_obstacle(self, goal: PoseGoal) -> Obstacle | None:
-        """Return the obstacle between the measured pose and a goal, like path_check.problem."""
+        """Return the obstacle between the measured pose and a goal, like path_check.find_obstacle."""
         if self._pose is None:
             return Obstacle("nobody knows where the robot is", code="unknown")
         end = (goal.x, goal.y, goal.phi)

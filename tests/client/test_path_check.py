@@ -7,9 +7,9 @@ import math
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from trirail.client.path_check import CheckedPath, check_path, find_obstacle
 from trirail.config import SIM, FramesTable, load
 from trirail.motion.runs import centre_motion, rest
-from trirail.panel.path_check import CheckedPath, check_path, find_obstacle
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.workspace.violations import violations
 

@@ -1,0 +1,174 @@
+"""Export of a recording as MCAP with messages of ROS 2, for Foxglove, PlotJuggler and `ros2 bag`. Needs rosbags."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from trirail import config
+from trirail.errors import ServiceError
+from trirail.kinematics.geometry import Geometry
+from trirail.kinematics.robot import inverse, jacobians
+from trirail.telemetry import provenance
+from trirail.telemetry.journal import Line
+from trirail.telemetry.recording import Recording
+from trirail.wire.vocabulary import MODES, Mode
+
+# The definitions of these messages are the same in Jazzy, Kilted and Lyrical.
+STORE = get_typestore(Stores.ROS2_JAZZY)
+Time, Header = STORE.types["builtin_interfaces/msg/Time"], STORE.types["std_msgs/msg/Header"]
+Point, Vector3 = STORE.types["geometry_msgs/msg/Point"], STORE.types["geometry_msgs/msg/Vector3"]
+Quaternion, PoseMessage = STORE.types["geometry_msgs/msg/Quaternion"], STORE.types["geometry_msgs/msg/Pose"]
+Transform = STORE.types["geometry_msgs/msg/Transform"]
+TransformStamped = STORE.types["geometry_msgs/msg/TransformStamped"]
+DiagnosticStatus = STORE.types["diagnostic_msgs/msg/DiagnosticStatus"]
+KeyValue = STORE.types["diagnostic_msgs/msg/KeyValue"]
+
+TOPICS = {
+    "/joint_states": "sensor_msgs/msg/JointState",
+    "/pose": "geometry_msgs/msg/PoseStamped",
+    "/commanded_pose": "geometry_msgs/msg/PoseStamped",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/events": "std_msgs/msg/String",
+}
+"""Type of the messages of each topic."""
+BASE, MEASURED, COMMANDED = "base", "platform_measured", "platform_commanded"
+"""Frames; the platform of the URDF is a link of its own, which joints move."""
+JOINTS = tuple(f"{joint}_{leg}" for joint in ("slider", "pivot", "cross") for leg in "abc")
+"""Joints of the URDF: sliders lambda_10, pivots, and cross slides lambda_32, of the legs A, B, C."""
+OK, WARN, ERROR = 0, 1, 2
+"""Levels of diagnostic_msgs/DiagnosticStatus."""
+Message = tuple[int, str, Any]
+"""Wall-clock time [ns], topic and message."""
+
+
+def write(recording: Recording, path: Path) -> int:
+    """Write a recording as one MCAP file; return the number of messages.
+
+    Each has the wall-clock time of its record. Raises ServiceError where the file exists or cannot be written, or the
+    recording has no configuration.
+    """
+    settings = provenance.configuration(recording.texts)
+    if settings is None:
+        raise ServiceError(f"{recording.name}: MCAP needs the configuration, which this recording does not contain")
+    geometry = config.geometry(settings.geometry)
+    try:
+        with path.open("xb"), tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as folder:
+            count = _write_bag(Path(folder, "bag"), messages(recording, geometry))
+            Path(folder, "bag/bag.mcap").replace(path)
+    except FileExistsError as error:
+        raise ServiceError(f"{path} exists already: name another file") from error
+    except OSError as error:
+        raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
+    return count
+
+
+def messages(recording: Recording, geometry: Geometry) -> list[Message]:
+    """Return the messages of a recording in order of time."""
+    made = [*_motion(recording, geometry), *_log(recording), *_diagnostics(recording)]
+    return sorted(made, key=lambda message: message[0])
+
+
+def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return positions and velocities of all JOINTS, (N, 9) [m, rad, m/s, rad/s].
+
+    Those of the sliders are measured; the passive joints follow from them by the kinematics, at the measured pose.
+    """
+    sliders, velocity, pose = records["position"] - records["backlash"], records["velocity"], records["pose"]
+    J1, J2 = jacobians(geometry, pose)
+    twist = np.linalg.solve(J2, J1 @ velocity[:, :, np.newaxis])[:, :, 0]
+    passive = inverse(geometry, pose, twist)
+    pivots, turning = np.repeat(pose[:, 2:], 3, axis=1), np.repeat(twist[:, 2:], 3, axis=1)
+    return (
+        np.concatenate([sliders, pivots, passive.passive_position], axis=1),
+        np.concatenate([velocity, turning, passive.passive_velocity], axis=1),
+    )
+
+
+def _write_bag(folder: Path, made: list[Message]) -> int:
+    """Write messages as a bag of rosbag2, which is a folder around one file."""
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connections = {topic: bag.add_connection(topic, kind, typestore=STORE) for topic, kind in TOPICS.items()}
+        for wall, topic, message in made:
+            bag.write(connections[topic], wall, STORE.serialize_cdr(message, TOPICS[topic]))
+    return len(made)
+
+
+def _motion(recording: Recording, geometry: Geometry) -> Iterator[Message]:
+    records = recording.records
+    positions, velocities = joint_motion(records, geometry)
+    joint_state, pose_stamped = STORE.types["sensor_msgs/msg/JointState"], STORE.types["geometry_msgs/msg/PoseStamped"]
+    tf_message, names, no_effort = STORE.types["tf2_msgs/msg/TFMessage"], list(JOINTS), np.zeros(0)
+    poses = zip(records["pose"].tolist(), records["commanded_pose"].tolist(), strict=True)
+    walls = _nanoseconds(recording.wall)
+    for wall, position, velocity, (measured, commanded) in zip(walls, positions, velocities, poses, strict=True):
+        header = _header(wall, BASE)
+        yield wall, "/joint_states", joint_state(_header(wall, ""), names, position, velocity, no_effort)
+        yield wall, "/pose", pose_stamped(header, PoseMessage(Point(*measured[:2], 0.0), _turn(measured[2])))
+        yield (
+            wall,
+            "/commanded_pose",
+            pose_stamped(header, PoseMessage(Point(*commanded[:2], 0.0), _turn(commanded[2]))),
+        )
+        transforms = [
+            TransformStamped(header, frame, Transform(Vector3(*pose[:2], 0.0), _turn(pose[2])))
+            for frame, pose in ((MEASURED, measured), (COMMANDED, commanded))
+        ]
+        yield wall, "/tf", tf_message(transforms)
+
+
+def _log(recording: Recording) -> Iterator[Message]:
+    """Yield the lines of the log: events as JSON, as the service publishes them, and texts of the recorder."""
+    string = STORE.types["std_msgs/msg/String"]
+    for line in recording.events:
+        content = line.event if line.event is not None else {"level": line.level, "message": line.text}
+        yield _wall(line), "/events", string(msgspec.json.encode(content).decode())
+
+
+def _diagnostics(recording: Recording) -> Iterator[Message]:
+    """Yield the mode at each of its changes, and each fault."""
+    modes = recording.records["mode"]
+    changes = np.flatnonzero(np.diff(modes, prepend=np.uint8(255)))  # no mode has this number
+    walls = _nanoseconds(recording.wall)
+    for row in changes.tolist():
+        mode = MODES[modes[row]]
+        level = ERROR if mode == Mode.FAULT else OK
+        yield _diagnosis(recording, walls[row], level, "mode", str(mode), {"t": repr(float(recording.t[row]))})
+    for line in recording.events:
+        if line.event is not None and line.event.kind == "fault":
+            detail = msgspec.to_builtins(line.event.fault) if line.event.fault is not None else {}
+            values = {name: str(value) for name, value in detail.items()} | {"t": repr(line.t)}
+            yield _diagnosis(recording, _wall(line), ERROR, "fault", line.event.message, values)
+
+
+def _diagnosis(recording: Recording, wall: int, level: int, name: str, text: str, values: dict[str, str]) -> Message:
+    array = STORE.types["diagnostic_msgs/msg/DiagnosticArray"]
+    pairs = [KeyValue(key, value) for key, value in values.items()]
+    status = DiagnosticStatus(level, f"trirail: {name}", text, recording.name, pairs)
+    return wall, "/diagnostics", array(_header(wall, ""), [status])
+
+
+def _header(wall: int, frame: str) -> Any:
+    return Header(Time(*divmod(wall, 1_000_000_000)), frame)
+
+
+def _turn(angle: float) -> Any:
+    """Return the quaternion of a turn about z."""
+    return Quaternion(0.0, 0.0, float(np.sin(angle / 2.0)), float(np.cos(angle / 2.0)))
+
+
+def _nanoseconds(walls: NDArray[np.datetime64]) -> list[int]:
+    return [int(wall) for wall in walls.astype("datetime64[ns]").astype(np.int64)]
+
+
+def _wall(line: Line) -> int:
+    return int(line.wall.astype("datetime64[ns]").astype(np.int64))

@@ -1,0 +1,146 @@
+"""A fly scan: a path that is followed without a stop, and the data that are collected on it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import aclosing
+from typing import TYPE_CHECKING, Any, cast
+
+from bluesky.protocols import EventCollectable, Flyable, Reading
+from event_model import DataKey, PartialEvent
+from ophyd_async.core import AsyncStatus, Device
+
+from trirail.bluesky.mover import cancel, check_done
+from trirail.client.async_client import AsyncRobot
+from trirail.client.goal import AsyncGoalHandle
+from trirail.errors import TrirailError
+from trirail.wire.marks import Switch, switch_rows
+
+if TYPE_CHECKING:
+    from trirail.bluesky.stage import Stage
+
+COLUMNS: dict[str, tuple[str, str]] = {
+    "goal": ("string", ""),
+    "mark": ("integer", ""),
+    "output": ("string", ""),
+    "value": ("boolean", ""),
+    "cycle": ("integer", ""),
+    "t": ("number", "s"),
+    "time": ("number", "s"),
+    "closed": ("boolean", ""),
+    **{f"{kind}_{axis}": ("number", unit) for kind in ("commanded", "measured")
+       for axis, unit in (("x", "m"), ("y", "m"), ("phi", "rad"))},
+}  # fmt: skip
+"""Type and unit of each column of the table of switches."""
+
+
+class Flight(Device, Flyable, EventCollectable):
+    """A fly scan of a stage: `kickoff` starts the path, `complete` is done with it, `collect` yields its data.
+
+    `send` sends its goal. `first` are the coordinates to which the robot moves before, by their index.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        send: Callable[[AsyncRobot], Awaitable[AsyncGoalHandle]],
+        has_marks: bool,
+        name: str,
+        first: Mapping[int, float] | None = None,
+    ) -> None:
+        self.parent = stage
+        self._send = send
+        self._has_marks = has_marks
+        self._first = first
+        self._goal: AsyncGoalHandle | None = None
+        self._sampling: asyncio.Task[None] | None = None
+        self._samples: list[dict[str, Reading[Any]]] = []
+        self._interrupted = self._stopped = False
+        super().__init__(name)
+
+    @property
+    def _stage(self) -> Stage:
+        return cast("Stage", self.parent)
+
+    async def connect(self, *_: object, **__: object) -> None:
+        """Connect the stage."""
+        await self._stage.link()
+
+    @AsyncStatus.wrap
+    async def kickoff(self) -> None:
+        """Move to the first point; done when the service has accepted the path."""
+        link = await self._stage.link()
+        self._goal, self._samples = None, []
+        self._interrupted = self._stopped = False
+        if self._first is not None:
+            await link.mover.start(self._first).end
+        if self._stopped:  # mypy cannot know that stop() runs meanwhile
+            raise TrirailError("stopped before its goal was sent")
+        if not self._has_marks:
+            self._sampling = asyncio.create_task(self._sample(link.robot))
+        try:
+            self._goal = await self._send(link.robot)
+        except BaseException:
+            self._end_sampling()
+            raise
+
+    @AsyncStatus.wrap
+    async def complete(self) -> None:
+        """Done when the robot is measured to be at the end; fails with the reason if the path ends otherwise."""
+        if self._goal is None:
+            raise TrirailError(f"{self.name}: complete before kickoff")
+        link = await self._stage.link()
+        try:
+            result = await link.mover.settle(self._goal)
+        finally:
+            self._end_sampling()
+        if not self._interrupted:
+            check_done(result)
+
+    async def stop(self, success: bool = True) -> None:
+        """Stop the path; return when the robot is at rest."""
+        self._stopped = True
+        await (await self._stage.link()).mover.stop(success)
+        if self._goal is not None and self._goal.result is None:
+            self._interrupted |= success
+            await cancel(self._goal)
+
+    async def describe_collect(self) -> dict[str, dict[str, DataKey]]:
+        """Return the columns of the collected data, in a stream of the flight's name."""
+        if not self._has_marks:
+            return {self.name: await self._stage.describe()}
+        source = f"trirail://{(await self._stage.link()).shown.name}/event"
+        return {self.name: {f"{self.name}-{name}": _key(source, *column) for name, column in COLUMNS.items()}}
+
+    async def collect(self) -> AsyncIterator[PartialEvent]:
+        """Yield a row per switch on the path; without marks, one per state."""
+        rows = self._switches() if self._has_marks else self._samples
+        for row in rows:
+            values = {name: reading["value"] for name, reading in row.items()}
+            stamps = {name: reading["timestamp"] for name, reading in row.items()}
+            yield {"time": next(iter(stamps.values())), "data": values, "timestamps": stamps}
+
+    def _switches(self) -> list[dict[str, Reading[Any]]]:
+        result = self._goal.result if self._goal is not None else None
+        switches: tuple[Switch, ...] = result.marks if result is not None else ()
+        return [
+            {f"{self.name}-{name}": {"value": value, "timestamp": row["time"]} for name, value in row.items()}
+            for row in switch_rows(switches)
+        ]
+
+    async def _sample(self, robot: AsyncRobot) -> None:
+        async with aclosing(robot.states()) as states:
+            async for state in states:
+                if self._goal is not None and state.goal is not None and state.goal.id == self._goal.id:
+                    self._samples.append(self._stage.readings(state))
+
+    def _end_sampling(self) -> None:
+        if self._sampling is not None:
+            self._sampling.cancel()
+            self._sampling = None
+
+
+def _key(source: str, dtype: Any, unit: str) -> DataKey:
+    key: DataKey = {"source": source, "dtype": dtype, "shape": []}
+    return {**key, "units": unit} if unit else key

@@ -1,0 +1,275 @@
+"""The stage: x, y, phi and pose as movable axes of Bluesky, and everything that a state has as readings."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator, Sequence
+from typing import Any, Generic, NamedTuple, TypeVar, cast
+
+import numpy as np
+from bluesky.protocols import HasHints, Hints, Location, Reading
+from event_model import DataKey
+from numpy.typing import NDArray
+from ophyd_async.core import AsyncLocatable, AsyncReadable, Device, WatchableAsyncStatus, WatcherUpdate
+
+from trirail.bluesky.flight import Flight
+from trirail.bluesky.mover import Mover
+from trirail.client.async_client import AsyncRobot
+from trirail.client.client import Robot
+from trirail.client.path_check import check_goal
+from trirail.client.trajectory import Points, points_of
+from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.wire.goals import PoseGoal
+from trirail.wire.marks import MarkLike, marks_of
+from trirail.wire.state import Pose, State
+
+COORDINATES = ("x", "y", "phi")
+UNITS = ("m", "m", "rad")
+UNNAMED = "stage"
+"""Name of a stage that is used without one."""
+T = TypeVar("T", float, NDArray[np.float64])
+Keys = dict[str, DataKey]
+Readings = dict[str, Reading[Any]]
+
+
+class StageLink(NamedTuple):
+    """Connection of a stage within one event loop."""
+
+    loop: asyncio.AbstractEventLoop
+    robot: AsyncRobot
+    shown: DrawnRobot
+    mover: Mover
+
+
+class Stage(Device, AsyncReadable, HasHints):
+    """A robot as a device of Bluesky, with the movable axes `x`, `y`, `phi`, and `pose` for all three together.
+
+    Lengths are in metres, angles in radians. A reading is of one state, published after every event that this client
+    has received: after a move, it is of the place where the move ended. The stage neither enables nor homes the robot.
+    """
+
+    def __init__(self, robot: Robot, name: str = "") -> None:
+        self._robot = robot
+        self._linking: asyncio.Task[StageLink] | None = None
+        self.x = MovableAxis(0)
+        self.y = MovableAxis(1)
+        self.phi = MovableAxis(2)
+        self.pose = MovablePose()
+        super().__init__(name)
+
+    @property
+    def hints(self) -> Hints:
+        """Keys that a table or a plot shows without a request."""
+        return {"fields": [self.x.name, self.y.name, self.phi.name]}
+
+    async def connect(self, *_: object, **__: object) -> None:
+        """Ask the service for geometry and limits, in the running event loop. Raises ServiceError if nobody answers."""
+        await self.link()
+
+    async def link(self) -> StageLink:
+        """Return the connection in the running event loop, made at the first call."""
+        if not self.name:
+            self.set_name(UNNAMED)  # documents need a name; init_devices would have given that of the variable
+        loop = asyncio.get_running_loop()
+        task = self._linking
+        failed = task is not None and task.done() and (task.cancelled() or task.exception() is not None)
+        if task is None or task.get_loop() is not loop or failed:
+            task = self._linking = asyncio.create_task(self._connect(loop))
+        return await asyncio.shield(task)
+
+    async def describe(self) -> Keys:
+        """Return units, limits and precision of every reading."""
+        shown = (await self.link()).shown
+        keys = [self._key(shown, axis) for axis in range(3)]
+        source = keys[0]["source"]
+        vector = DataKey(source=source, dtype="array", dtype_numpy="<f8", shape=[3], units="m")
+        return {
+            **{axis.name: key for axis, key in zip((self.x, self.y, self.phi), keys, strict=True)},
+            self.pose.name: DataKey({**vector, "units": "m, m, rad"}),
+            self.key("sliders"): vector,
+            self.key("following_error"): vector,
+            self.key("t"): DataKey(source=source, dtype="number", dtype_numpy="<f8", shape=[], units="s"),
+        }
+
+    async def read(self) -> Readings:
+        """Return measured pose, sliders [m] and following error [m] of the next state, and its nominal time [s]."""
+        return self.readings(await (await self.link()).robot.state())
+
+    async def stop(self, success: bool = True) -> None:
+        """Stop a goal of this stage's axes; return when the robot is at rest. Goals of others continue."""
+        await (await self.link()).mover.stop(success)
+
+    async def check(self, pose: Sequence[float]) -> None:
+        """Check the whole path to a pose against every limit, as the service does; nothing moves.
+
+        Raises RefusedError with the limit and the value where the service would refuse the pose.
+        """
+        link = await self.link()
+        start = (await link.robot.state()).commanded.pose
+        x, y, phi = (float(value) for value in pose)
+        await asyncio.to_thread(check_goal, link.shown, start, PoseGoal(x=x, y=y, phi=phi))
+
+    def follow(
+        self, points: Points, *, marks: Sequence[MarkLike] = (), stretch: bool = False, name: str = "flight"
+    ) -> Flight:
+        """Return a fly scan along timed points, as of Robot.follow, to the first of which the robot moves before.
+
+        Collected are the switches at its marks; without marks, the readings of every state on the way.
+        """
+        rows, places = points_of(points), marks_of(marks)
+        first = dict(enumerate((rows[0].x, rows[0].y, rows[0].phi)))
+        return Flight(self, lambda robot: robot.follow(rows, stretch=stretch, marks=places), bool(places), name, first)
+
+    def fly_to(
+        self, x: float, y: float, phi: float, *, marks: Sequence[MarkLike] = (), speed: float = 1, name: str = "flight"
+    ) -> Flight:
+        """Return a fly scan straight to a pose, as of Robot.move_to, with the data of `follow`."""
+        places = marks_of(marks)
+        return Flight(self, lambda robot: robot.move_to(x, y, phi, speed=speed, marks=places), bool(places), name)
+
+    def key(self, name: str) -> str:
+        """Return the key of a reading."""
+        return f"{self.name or UNNAMED}-{name}"
+
+    def readings(self, state: State) -> Readings:
+        """Return all readings of a state."""
+        now = time.time()  # a state has no wall clock of its own; t is its exact time
+        values: dict[str, Any] = {
+            **dict(zip((self.x.name, self.y.name, self.phi.name), state.pose, strict=True)),
+            self.pose.name: np.array(state.pose),
+            self.key("sliders"): np.array(state.sliders.position),
+            self.key("following_error"): np.array(state.sliders.following_error),
+            self.key("t"): state.t,
+        }
+        return {name: {"value": value, "timestamp": now} for name, value in values.items()}
+
+    def _key(self, shown: DrawnRobot, axis: int) -> DataKey:
+        limits, name = shown.limits, COORDINATES[axis]
+        low, high = getattr(limits.platform, name)
+        return {
+            "source": f"trirail://{shown.name}/state",
+            "dtype": "number",
+            "dtype_numpy": "<f8",
+            "shape": [],
+            "units": UNITS[axis],
+            # One digit more than the window within which a goal is done.
+            "precision": math.ceil(-math.log10(limits.in_position.pose[axis])) + 1,
+            "limits": {"control": {"low": low, "high": high}},
+        }
+
+    async def _connect(self, loop: asyncio.AbstractEventLoop) -> StageLink:
+        robot = await self._robot.for_running_loop()
+        shown = DrawnRobot.from_info(await robot.info())
+        return StageLink(loop, robot, shown, Mover(robot))
+
+
+class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
+    """Axes of a stage that one value sets."""
+
+    def __init__(self, coordinate: str) -> None:
+        self._coordinate = coordinate
+        super().__init__()
+
+    @property
+    def _stage(self) -> Stage:
+        return cast(Stage, self.parent)  # set by Device, where a stage gets its axes
+
+    @property
+    def name(self) -> str:
+        """Key of its reading."""
+        if self._name or self.parent is None:
+            return self._name
+        return self._stage.key(self._coordinate)
+
+    @property
+    def hints(self) -> Hints:
+        """Key that a table or a plot shows without a request."""
+        return {"fields": [self.name]}
+
+    async def connect(self, *_: object, **__: object) -> None:
+        """Connect the stage."""
+        await self._stage.link()
+
+    async def describe(self) -> Keys:
+        """Return units, limits and precision."""
+        return {self.name: (await self._stage.describe())[self.name]}
+
+    async def read(self) -> Readings:
+        """Return the measured value of the next state."""
+        return {self.name: (await self._stage.read())[self.name]}
+
+    async def locate(self) -> Location[T]:
+        """Return the target of the goal under way, or the commanded value at rest, and the measured value."""
+        state = await (await self._stage.link()).robot.state()
+        target = state.goal.target if state.goal is not None else None
+        return Location(setpoint=self._value(target or state.commanded.pose), readback=self._value(state.pose))
+
+    @WatchableAsyncStatus.wrap
+    async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:
+        """Move to a value; done when the robot is measured to be there.
+
+        Fails with the reason where the goal is refused, or ends otherwise than done. Sets of several axes within some
+        milliseconds are one straight move.
+        """
+        targets = self._targets(value)
+        mover = (await self._stage.link()).mover
+        move = mover.start(targets)
+        initial: T | None = None
+        key = (await self.describe())[self.name]
+        async for pose in mover.progress(move):
+            current = self._value(pose)
+            initial = current if initial is None else initial
+            yield WatcherUpdate(
+                current=current, initial=initial, target=value, name=self.name, unit=key.get("units"),
+                precision=key.get("precision"),
+            )  # fmt: skip
+
+    async def stop(self, success: bool = True) -> None:
+        """Stop the goal of the stage's axes; return when the robot is at rest."""
+        await self._stage.stop(success)
+
+    def _targets(self, value: T) -> dict[int, float]:
+        raise NotImplementedError
+
+    def _value(self, pose: Pose) -> T:
+        raise NotImplementedError
+
+
+class MovableAxis(_Movable[float]):
+    """One coordinate of the platform's centre: x, y [m] or phi [rad]."""
+
+    def __init__(self, index: int) -> None:
+        self._index = index
+        super().__init__(COORDINATES[index])
+
+    async def check_value(self, value: float) -> None:
+        """Check the path to a value with the other coordinates as they are; see Stage.check."""
+        pose = list((await (await self._stage.link()).robot.state()).commanded.pose)
+        pose[self._index] = float(value)
+        await self._stage.check(pose)
+
+    def _targets(self, value: float) -> dict[int, float]:
+        return {self._index: float(value)}
+
+    def _value(self, pose: Pose) -> float:
+        return pose[self._index]
+
+
+class MovablePose(_Movable[NDArray[np.float64]]):
+    """The whole pose of the platform's centre: x, y [m] and phi [rad]."""
+
+    def __init__(self) -> None:
+        super().__init__("pose")
+
+    async def check_value(self, value: Sequence[float] | NDArray[np.float64]) -> None:
+        """Check the path to a pose; see Stage.check."""
+        await self._stage.check([float(number) for number in value])
+
+    def _targets(self, value: NDArray[np.float64]) -> dict[int, float]:
+        x, y, phi = (float(number) for number in value)
+        return {0: x, 1: y, 2: phi}
+
+    def _value(self, pose: Pose) -> NDArray[np.float64]:
+        return np.array(pose)

@@ -1,0 +1,155 @@
+"""A recording as MCAP and its mechanism as URDF, read back by programs that are not ours."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import made
+import msgspec
+import numpy as np
+import pytest
+import yourdfpy
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import Reader
+from trirail import config
+from trirail.analysis import mcap
+from trirail.analysis.urdf import document
+from trirail.cli import recording_commands
+from trirail.config import SIM, load
+from trirail.errors import ServiceError, TrirailError
+from trirail.kinematics.robot import inverse
+from trirail.telemetry import journal
+from trirail.telemetry.reading import read
+from trirail.telemetry.recorder import Recorder
+from trirail.telemetry.recording import Recording
+from trirail.wire.messages import Event, FaultDetail
+
+SHIPPED = sorted(path for path in SIM.parent.glob("*.toml"))
+FAULT = Event("fault", "error", "drive B: EMCY 8611h", seq=1, t=0.4, cycle=400, time=0.0,
+              fault=FaultDetail("emcy", "B", 0x8611))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    path = tmp_path_factory.mktemp("mcap") / "made.rrd"
+    recorder = Recorder(load(SIM), path.parent, path=path, live=False)
+    recorder.records(made.records(0.5).tobytes())
+    recorder.close()
+    found = read(path)
+    line = journal.Line(FAULT.t, found.wall[400], "ERROR", FAULT.message, FAULT)
+    return found._replace(events=[*found.events, line])
+
+
+@pytest.fixture(scope="module")
+def exported(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("mcap") / "made.mcap"
+    assert mcap.write(recording, path) > 4 * len(recording.records)
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+    return path
+
+
+def by_mcap(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    return found
+
+
+def by_rosbags(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with Reader(path) as bag:
+        for connection, wall, data in bag.messages():
+            message = mcap.STORE.deserialize_cdr(data, connection.msgtype)
+            found.setdefault(connection.topic, []).append((wall, message))
+    return found
+
+
+@pytest.mark.parametrize("reader", [by_mcap, by_rosbags])
+def test_every_number_comes_back_to_the_last_bit(reader: Any, recording: Recording, exported: Path) -> None:
+    found = reader(exported)
+    assert set(found) == set(mcap.TOPICS)
+    records, walls = recording.records, recording.wall.astype("datetime64[ns]").astype(np.int64).tolist()
+    for topic in ("/joint_states", "/pose", "/commanded_pose", "/tf"):
+        assert [wall for wall, _ in found[topic]] == walls
+    stamps = [(m.header.stamp.sec, m.header.stamp.nanosec) for _, m in found["/pose"]]
+    assert [sec * 10**9 + nanosec for sec, nanosec in stamps] == walls
+    positions = np.array([m.position for _, m in found["/joint_states"]])
+    np.testing.assert_array_equal(positions[:, :3], records["position"] - records["backlash"])
+    np.testing.assert_array_equal([m.velocity[:3] for _, m in found["/joint_states"]], records["velocity"])
+    assert {tuple(m.name) for _, m in found["/joint_states"]} == {mcap.JOINTS}
+    for topic, field in (("/pose", "pose"), ("/commanded_pose", "commanded_pose")):
+        poses = [m.pose for _, m in found[topic]]
+        np.testing.assert_array_equal([(p.position.x, p.position.y) for p in poses], records[field][:, :2])
+        angles = [2.0 * math.atan2(p.orientation.z, p.orientation.w) for p in poses]
+        np.testing.assert_allclose(angles, records[field][:, 2], rtol=0.0, atol=1e-15)
+    frames = [[t.child_frame_id for t in m.transforms] for _, m in found["/tf"]]
+    assert frames == [[mcap.MEASURED, mcap.COMMANDED]] * len(records)
+    events = [json.loads(m.data) for _, m in found["/events"]]
+    assert msgspec.convert(events[-1], Event) == FAULT
+
+
+def test_modes_and_faults_are_diagnostics(recording: Recording, exported: Path) -> None:
+    statuses = [m.status[0] for _, m in by_mcap(exported)["/diagnostics"]]
+    assert [(s.name, s.message) for s in statuses] == [("trirail: mode", "moving"), ("trirail: fault", FAULT.message)]
+    assert {pair.key: pair.value for pair in statuses[1].values} == {
+        "cause": "emcy", "drive": "B", "code": str(0x8611), "t": "0.4",
+    }  # fmt: skip
+
+
+def test_velocities_are_those_of_the_positions(recording: Recording) -> None:
+    settings = load(SIM)
+    records = made.records(0.5)
+    records["position"], records["pose"] = records["commanded_position"], records["commanded_pose"]
+    records["velocity"], records["backlash"] = records["commanded_velocity"], 0.0
+    positions, velocities = mcap.joint_motion(records, config.geometry(settings.geometry))
+    slopes = np.gradient(positions, 1.0 / made.RATE_HZ, axis=0)
+    np.testing.assert_allclose(velocities[1:-1], slopes[1:-1], atol=1e-4)
+
+
+def test_a_file_is_never_written_over(recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "session.mcap"
+    path.write_text("mine")
+    with pytest.raises(ServiceError, match="exists already: name another file"):
+        mcap.write(recording, path)
+    assert path.read_text() == "mine"
+    with pytest.raises(ServiceError, match="needs the configuration"):
+        mcap.write(recording._replace(texts={}), tmp_path / "other.mcap")
+    with pytest.raises(TrirailError, match=r"must end in \.mcap"):
+        recording_commands.export(path, out=tmp_path / "a.csv", format="mcap")
+    with pytest.raises(TrirailError, match="--columns"):
+        recording_commands.export(path, columns="pose", format="mcap")
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_the_joints_of_a_pose_bring_every_leg_to_the_platform(path: Path) -> None:
+    settings = load(path)
+    geometry = config.geometry(settings.geometry)
+    robot = yourdfpy.URDF.load(io.StringIO(document("robot", geometry, settings.limits)), load_meshes=False)
+    assert robot.validate()
+    assert set(robot.actuated_joint_names) == set(mcap.JOINTS)
+    low, high = np.array([settings.limits.platform.x, settings.limits.platform.y, settings.limits.platform.phi]).T
+    for share in (0.0, 0.3, -0.2):
+        x, y, phi = share * np.where(share > 0.0, high, -low)
+        motion = inverse(geometry, (x, y, phi))
+        angles = dict(zip(mcap.JOINTS, [*motion.position, phi, phi, phi, *motion.passive_position], strict=True))
+        robot.update_cfg(angles)
+        c, s = math.cos(phi), math.sin(phi)
+        wanted = [[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        for link in ("platform", "centre_b", "centre_c"):
+            np.testing.assert_allclose(robot.get_transform(link, "base"), wanted, atol=1e-12)
+
+
+def test_urdf_goes_to_a_file_or_to_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "robot.urdf"
+    assert recording_commands.urdf(out=path) == 0
+    assert recording_commands.urdf() == 0
+    assert capsys.readouterr().out.endswith(path.read_text(encoding="utf-8"))
+    with pytest.raises(ServiceError, match="exists already"):
+        recording_commands.urdf(out=path)

@@ -1,0 +1,378 @@
+"""Plans of Bluesky on a whole simulated service, run by the real RunEngine."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bluesky import RunEngine, simulators
+from bluesky import plan_stubs as bps
+from bluesky import plans as bp
+from bluesky.utils import FailedStatus, RunEngineInterrupted
+from ophyd_async.core import init_devices
+from trirail import RefusedError, Robot, ServiceError, TrirailError
+from trirail.bluesky import Stage, UnfinishedError
+from trirail.bluesky import mover as mover_module
+from trirail.client import own_service
+from trirail.wire.messages import Event
+from waiting import WITHIN, wait_until
+
+pytestmark = pytest.mark.slow
+HALF_WINDOW = 1e-4
+"""Greatest error of x and y of a pose that is done [m]; that of phi is ten times as large [rad]."""
+Documents = list[tuple[str, dict[str, Any]]]
+
+
+@pytest.fixture(scope="module")
+def robot(locator: str) -> Iterator[Robot]:
+    with Robot("demo", locator) as robot:
+        yield robot
+
+
+@pytest.fixture(scope="module")
+def engine() -> Any:
+    return RunEngine({})
+
+
+@pytest.fixture(scope="module")
+def connected(robot: Robot, engine: Any) -> Stage:
+    return Stage(robot, "stage")
+
+
+@pytest.fixture
+def stage(connected: Stage, robot: Robot, engine: Any) -> Stage:
+    """The stage, powered and at its centre."""
+    if engine.state != "idle":
+        engine.halt()
+    robot.stop()
+    if robot.state().mode == "fault":
+        robot.reset()
+    robot.override(100.0)
+    robot.enable()
+    assert robot.move_to(0.0, 0.0, 0.0).wait(WITHIN).outcome == "done"
+    return connected
+
+
+@contextmanager
+def when(condition: Callable[[], bool], action: Callable[[], object]) -> Iterator[None]:
+    """Do something in another thread as soon as a condition holds."""
+
+    def wait() -> None:
+        wait_until(condition, "the condition of an action", 0.01)
+        action()
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    yield
+    thread.join()
+
+
+def run(engine: Any, plan: Any) -> Documents:
+    documents: Documents = []
+    engine(plan, lambda name, document: documents.append((name, document)))
+    return documents
+
+
+def scans(*arguments: Any, **options: Any) -> Any:
+    """Return a list_scan, whose types allow no movable behind the detectors."""
+    return bp.list_scan(*arguments, **options)
+
+
+def limits_of(plan: Any) -> Any:
+    """Return the check of a plan without running it, which has no types."""
+    check: Any = simulators.check_limits_async
+    return check(plan)
+
+
+def data(documents: Documents) -> list[dict[str, Any]]:
+    return [document["data"] for name, document in documents if name == "event"]
+
+
+def goal_events(robot: Robot, begin: int = 0) -> list[Event]:
+    return [e for e in robot.events(history=True, timeout=1.0) if e.kind == "goal" and e.seq > begin]
+
+
+def newest_event(robot: Robot) -> int:
+    return max(event.seq for event in robot.events(history=True, timeout=1.0))
+
+
+def at(row: dict[str, Any], x: float, y: float = 0.0, phi: float = 0.0) -> bool:
+    measured = np.array([row["stage-x"], row["stage-y"], row["stage-phi"]])
+    return bool(np.all(np.abs(measured - (x, y, phi)) <= (HALF_WINDOW, HALF_WINDOW, 10.0 * HALF_WINDOW)))
+
+
+def test_count_has_every_reading_with_its_unit_limits_and_precision(stage: Stage, engine: Any) -> None:
+    documents = run(engine, bp.count([stage], num=3))
+    keys = next(document["data_keys"] for name, document in documents if name == "descriptor")
+    assert {name: key["units"] for name, key in keys.items()} == {
+        "stage-x": "m", "stage-y": "m", "stage-phi": "rad", "stage-pose": "m, m, rad",
+        "stage-sliders": "m", "stage-following_error": "m", "stage-t": "s",
+    }  # fmt: skip
+    assert keys["stage-x"]["limits"] == {"control": {"low": -0.15, "high": 0.15}}
+    assert keys["stage-x"]["precision"] == 5
+    rows = data(documents)
+    assert len(rows) == 3
+    assert len({row["stage-t"] for row in rows}) == 3
+    assert all(at(row, 0.0) for row in rows)
+
+
+def test_axes_that_are_set_together_are_one_straight_move(stage: Stage, robot: Robot, engine: Any) -> None:
+    begin, poses = newest_event(robot), list[Any]()
+    with robot_poses(robot, poses):
+        run(engine, bps.mv(stage.x, 0.03, stage.y, 0.06, stage.phi, 0.15))
+    assert [event.outcome for event in goal_events(robot, begin)] == ["done"]
+    assert robot.state().commanded.pose == pytest.approx((0.03, 0.06, 0.15), abs=1e-12)
+    for x, y, phi in poses:
+        assert (y, phi) == pytest.approx((2.0 * x, 5.0 * x), abs=1e-9)
+
+
+@contextmanager
+def robot_poses(robot: Robot, poses: list[Any]) -> Iterator[None]:
+    """Keep commanded poses while the context lasts."""
+    over = threading.Event()
+
+    def keep() -> None:
+        for state in robot.states():
+            poses.append(state.commanded.pose)
+            if over.is_set():
+                return
+
+    thread = threading.Thread(target=keep)
+    thread.start()
+    yield
+    over.set()
+    thread.join()
+    assert poses
+
+
+def test_an_axis_that_is_set_later_leaves_the_others_their_targets(stage: Stage, robot: Robot, engine: Any) -> None:
+    def plan() -> Any:
+        yield from bps.abs_set(stage.x, 0.04, group="later")
+        yield from bps.sleep(0.1)
+        yield from bps.abs_set(stage.y, 0.02, group="later")
+        yield from bps.wait("later")
+
+    run(engine, plan())
+    assert robot.state().commanded.pose == pytest.approx((0.04, 0.02, 0.0), abs=1e-12)
+
+
+def test_scans_read_each_point_where_it_is(stage: Stage, engine: Any) -> None:
+    rows = data(run(engine, bp.scan([stage], stage.x, -0.01, 0.01, 5)))
+    assert [at(row, x) for row, x in zip(rows, np.linspace(-0.01, 0.01, 5), strict=True)] == [True] * 5
+    rows = data(run(engine, bp.rel_scan([stage], stage.x, 0.0, 0.01, 3)))
+    assert [at(row, 0.01 + x) for row, x in zip(rows, (0.0, 0.005, 0.01), strict=True)] == [True] * 3
+    rows = data(run(engine, scans([], stage.x, [0.0, 0.002], stage.phi, [0.1, -0.1])))
+    assert [sorted(row) for row in rows] == [["stage-phi", "stage-x"]] * 2
+    assert [round(row["stage-phi"], 3) for row in rows] == [0.1, -0.1]
+    poses = [(0.001, 0.002, 0.03), (-0.001, 0.0, -0.03)]
+    rows = data(run(engine, scans([stage], stage.pose, poses)))
+    assert [at(row, *pose) for row, pose in zip(rows, poses, strict=True)] == [True] * 2
+
+
+def test_each_of_two_hundred_readings_is_of_its_own_point(stage: Stage, engine: Any) -> None:
+    """Each point differs from every other by more than the window of `done`: the pose tells which one it is."""
+    step = 10.0 * HALF_WINDOW
+    rows = data(run(engine, bp.grid_scan([stage], stage.x, 0.0, 9 * step, 10, stage.y, 0.0, 19 * step, 20)))
+    places = [(round(row["stage-x"] / step), round(row["stage-y"] / step)) for row in rows]
+    assert places == [(x, y) for x in range(10) for y in range(20)]
+    assert all(at(row, x * step, y * step) for row, (x, y) in zip(rows, places, strict=True))
+    times = [row["stage-t"] for row in rows]
+    assert times == sorted(set(times))
+
+
+def test_a_refused_point_ends_the_plan_with_the_reason(stage: Stage, engine: Any) -> None:
+    documents: Documents = []
+    with pytest.raises(FailedStatus) as caught:
+        engine(bp.scan([stage], stage.x, 0.1, 0.2, 3), lambda name, document: documents.append((name, document)))
+    assert isinstance(caught.value.__cause__, RefusedError)
+    assert len(data(documents)) == 2
+    assert documents[-1][0] == "stop"
+    assert documents[-1][1]["exit_status"] == "fail"
+    assert "150 mm" in documents[-1][1]["reason"]
+
+
+def test_a_plan_is_checked_without_a_move(stage: Stage, robot: Robot, engine: Any) -> None:
+    begin = newest_event(robot)
+
+    def check(value: Any) -> None:
+        asyncio.run_coroutine_threadsafe(value, engine.loop).result(WITHIN)
+
+    check(stage.pose.check_value((0.02, 0.03, 0.1)))
+    with pytest.raises(RefusedError):
+        check(stage.pose.check_value((0.1, 0.1, 0.8)))
+    check(limits_of(bp.scan([stage], stage.x, -0.1, 0.1, 3)))
+    with pytest.raises(RefusedError, match="150 mm"):
+        check(limits_of(bp.scan([stage], stage.x, 0.1, 0.2, 3)))
+    assert goal_events(robot, begin) == []
+
+
+def test_a_paused_plan_stops_the_robot_and_resumes(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(10.0)
+    documents: Documents = []
+    plan = bp.scan([stage], stage.x, 0.02, 0.04, stage.y, 0.0, 0.01, num=2)
+    poses: list[Any] = []
+    with robot_poses(robot, poses):
+        with when(lambda: robot.state().pose.x > 0.005, engine.request_pause), pytest.raises(RunEngineInterrupted):
+            engine(plan, lambda name, document: documents.append((name, document)))
+        state = robot.state()
+        assert state.mode == "holding"
+        assert 0.0 < state.commanded.pose.x < 0.02
+        assert robot.state().commanded.pose == state.commanded.pose
+        robot.override(100.0)
+        engine.resume()
+    assert [at(row, x, y) for row, (x, y) in zip(data(documents), [(0.02, 0.0), (0.04, 0.01)], strict=True)] == [
+        True
+    ] * 2
+    assert np.abs(np.diff([pose.x for pose in poses])).max() < 0.02  # within 20 ms at full speed, or a few states lost
+    assert robot.state().faults == ()
+
+
+def test_ctrl_c_in_a_move_stops_the_robot(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(10.0)
+    begin = newest_event(robot)
+
+    def press_twice() -> None:  # the first asks for a pause at the next checkpoint, the second for one now
+        os.kill(os.getpid(), signal.SIGINT)
+        wait_until(lambda: engine._deferred_pause_requested, "the first Ctrl-C")
+        time.sleep(0.2)  # the engine takes two within 0.1 s as one
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with when(lambda: robot.state().pose.x > 0.005, press_twice), pytest.raises(RunEngineInterrupted):
+        run(engine, bp.scan([stage], stage.x, 0.03, 0.04, 2))
+    assert robot.state().mode == "holding"
+    assert robot.state().commanded.pose.x < 0.03
+    engine.abort()
+    assert [event.outcome for event in goal_events(robot, begin)] == ["stopped"]
+
+
+@pytest.mark.parametrize(
+    ("disturb", "outcome", "words"),
+    [
+        (lambda robot: robot.stop(), "stopped", "stop"),
+        (lambda robot: robot.quick_stop(), "faulted", "quick"),
+        (lambda robot: robot.move_to(0.0, 0.0, 0.0), "preempted", "preempted"),
+    ],
+    ids=["stop", "fault", "other goal"],
+)
+def test_what_ends_a_goal_ends_the_plan_with_its_message(
+    disturb: Callable[[Robot], object], outcome: str, words: str, stage: Stage, robot: Robot, engine: Any
+) -> None:
+    robot.override(10.0)
+    with (
+        when(lambda: robot.state().pose.x > 0.005, lambda: disturb(robot)),
+        pytest.raises(FailedStatus) as caught,
+    ):
+        run(engine, bp.scan([stage], stage.x, 0.03, 0.04, 2))
+    assert isinstance(caught.value.__cause__, UnfinishedError)
+    assert caught.value.__cause__.result.outcome == outcome
+    assert words in str(caught.value.__cause__)
+
+
+def test_the_end_of_a_plan_leaves_goals_of_others_alone(stage: Stage, robot: Robot, engine: Any) -> None:
+    run(engine, bps.mv(stage.x, 0.001))
+    robot.override(10.0)
+    goal = robot.move_to(0.02, 0.0, 0.0)
+    run(engine, bp.count([stage]))
+    asyncio.run_coroutine_threadsafe(stage.stop(), engine.loop).result(WITHIN)
+    robot.override(100.0)
+    assert goal.wait(WITHIN).outcome == "done"
+
+
+def pages(documents: Documents) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    for name, document in documents:
+        if name == "event_page":
+            for key, values in document["data"].items():
+                found.setdefault(key, []).extend(values)
+    return found
+
+
+def test_a_fly_scan_collects_every_state_on_the_way(stage: Stage, engine: Any) -> None:
+    points = [(0.0, 0.01, 0.0, 0.0), (1.0, 0.02, 0.01, 0.05), (2.0, 0.03, 0.0, 0.0)]
+    found = pages(run(engine, bp.fly([stage.follow(points)])))
+    assert len(found["stage-t"]) > 50
+    assert np.all(np.diff(found["stage-t"]) > 0.0)
+    assert found["stage-x"][0] == pytest.approx(0.01, abs=1e-3)
+    assert max(found["stage-y"]) == pytest.approx(0.01, abs=1e-3)
+
+
+def test_a_fly_scan_that_is_stopped_fails_with_the_reason(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(10.0)
+    with when(lambda: robot.state().pose.x > 0.005, robot.stop), pytest.raises(FailedStatus) as caught:
+        run(engine, bp.fly([stage.fly_to(0.03, 0.0, 0.0)]))
+    assert isinstance(caught.value.__cause__, UnfinishedError)
+    with pytest.raises(FailedStatus):
+        run(engine, bp.fly([stage.fly_to(0.3, 0.0, 0.0)]))
+
+
+def test_a_stage_is_named_after_its_variable_or_stage(stage: Stage, robot: Robot, engine: Any) -> None:
+    rows = data(run(engine, bp.scan([], Stage(robot).x, 0.0, 0.001, 2)))
+    assert [round(row["stage-x"], 3) for row in rows] == [0.0, 0.001]
+    with init_devices():
+        table = Stage(robot)
+    assert {"table-x", "table-pose", "table-t"} < set(data(run(engine, bp.count([table])))[0])
+
+
+def with_outputs(config: Path) -> None:
+    text = config.read_text(encoding="utf-8")
+    config.write_text(text + '\n[outputs.strobe]\ndrive = "A"\nbit = 16\n', encoding="utf-8")
+
+
+def test_a_fly_scan_with_marks_collects_the_table_of_switches(engine: Any, tmp_path: Path) -> None:
+    config, locator = own_service.private(tmp_path)
+    with_outputs(config)
+    with own_service.service(config, tmp_path / "session.rrd"), Robot("demo", locator) as robot:
+        with init_devices():
+            stage = Stage(robot)
+        robot.enable()
+        marks = [{"output": "strobe", "start": 0.002, "end": 0.018, "increment": 0.002, "pulse_width": 0.003}]
+        flight = stage.fly_to(0.02, 0.0, 0.0, marks=marks, speed=0.3, name="strobes")
+        found = pages(run(engine, bp.fly([flight])))
+    on = [x for x, value in zip(found["strobes-commanded_x"], found["strobes-value"], strict=True) if value]
+    assert on == pytest.approx(np.arange(1, 10) * 0.002, abs=5e-4)
+    assert set(found["strobes-output"]) == {"strobe"}
+
+
+def test_a_service_that_is_killed_ends_the_plan_and_the_next_one_works(
+    engine: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mover_module, "SILENCE_S", 2.0)
+    config, locator = own_service.private(tmp_path)
+    with (tmp_path / "log").open("wb") as log:
+        first = own_service.start(config, log)
+        try:
+            with Robot("demo", locator) as robot:
+                with init_devices():
+                    stage = Stage(robot)
+                robot.enable()
+                robot.override(1.0)
+
+                def kill() -> None:
+                    os.killpg(first.pid, signal.SIGKILL)
+
+                with when(lambda: robot.state().mode == "moving", kill), pytest.raises(FailedStatus) as caught:
+                    run(engine, bps.mv(stage.x, 0.03))
+                assert isinstance(caught.value.__cause__, ServiceError | UnfinishedError)
+                with pytest.raises((FailedStatus, TrirailError)):
+                    run(engine, bps.mv(stage.x, 0.03))
+                first.wait(WITHIN)
+                second = own_service.start(config, log)
+                try:
+                    robot.enable()
+                    run(engine, bps.mv(stage.x, 0.03))
+                    assert robot.state().pose.x == pytest.approx(0.03, abs=HALF_WINDOW)
+                finally:
+                    own_service.end(second)
+        finally:
+            if first.poll() is None:
+                os.killpg(first.pid, signal.SIGKILL)
+                first.wait(WITHIN)
