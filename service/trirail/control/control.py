@@ -299,7 +299,7 @@ class Control:
         self._report_switches(all_=True)
 
     def _report_switches(self, *, all_: bool = False) -> None:
-        for switches in self.outputs.take_switches(self.modes.cycle, all_=all_):
+        for switches in self.outputs.pop_switches(self.modes.cycle, all_=all_):
             goal, number = switches[-1].goal, len(switches)
             text = coded(f"{number} outputs switched", EventCode.OUTPUTS_SWITCHED, goal=goal, number=number)
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))

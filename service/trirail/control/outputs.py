@@ -357,7 +357,7 @@ class Outputs:
                 self.logged += 1
             row["goal"] = row["until"] = 0
 
-    def take_switches(self, cycle: int, *, all_: bool = False) -> list[tuple[Switch, ...]]:
+    def pop_switches(self, cycle: int, *, all_: bool = False) -> list[tuple[Switch, ...]]:
         """Return the switches to report now, in tables for one message each, without their wall clock."""
         due = all_ or self.logged >= TABLE_LENGTH or (cycle - self._reported) * self._period >= TABLE_DELAY
         if self.logged and not due:

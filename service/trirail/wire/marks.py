@@ -15,7 +15,7 @@ from trirail.wire.sizes import MAX_NAME
 Length = Annotated[float, Meta(ge=0.0, le=1e3)]
 Duration = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 OutputName = Annotated[str, Meta(pattern=rf"^[A-Za-z][A-Za-z0-9_-]{{0,{MAX_NAME - 1}}}$")]
-PLACES = ("after_start", "after_start_s", "before_target", "before_target_s", "at_path_fraction", "at", "start")
+PLACE_FIELDS = ("after_start", "after_start_s", "before_target", "before_target_s", "at_path_fraction", "at", "start")
 """Fields that say where a mark is: a mark has exactly one of them."""
 
 
@@ -76,10 +76,10 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
             number = getattr(self, name)
             if isinstance(number, float) and not math.isfinite(number):
                 raise ValueError(f"{name} is {number}: it must be a finite number")
-        given = [name for name in PLACES if getattr(self, name) is not None]
-        if len(given) != 1:
-            has = " and ".join(given) if given else "none"
-            raise ValueError(f"a mark of {self.output!r} has {has}: exactly one of {', '.join(PLACES)} is needed")
+        set_fields = [name for name in PLACE_FIELDS if getattr(self, name) is not None]
+        if len(set_fields) != 1:
+            has = " and ".join(set_fields) if set_fields else "none"
+            raise ValueError(f"a mark of {self.output!r} has {has}: exactly one of {', '.join(PLACE_FIELDS)} is needed")
         if self.start is None and (self.end is not None or self.increment is not None):
             raise ValueError(f"a mark of {self.output!r} has an end or increment without a start")
         if self.increment is not None and self.pulse_width is None:
