@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bluesky import RunEngine
+from bluesky import RunEngine, simulators
 from bluesky import plan_stubs as bps
 from bluesky import plans as bp
-from bluesky import simulators
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 from ophyd_async.core import init_devices
 from trirail import RefusedError, Robot, ServiceError, TrirailError

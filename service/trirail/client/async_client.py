@@ -147,8 +147,8 @@ class AsyncRobot:
         With a `tool`, a point of the platform in its own frame, (u, v) [m], or a name of [frames.tool], this point
         moves to x, y, straight and within the platform's limits, while the platform turns. `frame` is one of
         [frames.work] in which x, y and phi are given.
-        At `marks` on the path outputs switch: trirail.Mark, or dicts of its fields; the result has the table of what
-        has switched. At the edge `stop_at` of an input it ends, by a controlled stop: trirail.StopAt, or a dict.
+        At `marks` on the path outputs switch: trirail.Mark, or dicts of its fields; the result has the table of
+        switches. At the edge `stop_at` of an input it ends, by a controlled stop: trirail.StopAt, or a dict.
         The `id` must be new; one is made if absent. Raises RefusedError: out of reach, not enabled, stopping, ….
         """
         return await self.send(
