@@ -238,6 +238,21 @@ for axes in (axes for number in plt.get_fignums() for axes in plt.figure(number)
 
 
 @pytest.mark.slow
+def test_a_scan_with_bluesky(service: Service) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(cells("bluesky.ipynb"))],
+        env=os.environ | {"ROBOT": "demo", "LOCATOR": service.locator},
+        capture_output=True, text=True, timeout=WITHIN, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert [line for line in lines if line.startswith("refused: ") and "150 mm" in line]
+    assert lines[-1].endswith("readings, x from 0.10 to 0.00 m") or lines[-1].endswith("to -0.00 m")
+    assert sum(line.startswith("|") and ":" in line for line in lines) == 9
+    assert pose(service) == pytest.approx((0.0, 0.0, 0.1), abs=1e-9)
+
+
+@pytest.mark.slow
 def test_zenoh_and_json_alone_are_enough(service: Service) -> None:
     lines = run("plain_zenoh.py", "demo", service.locator)
     assert lines[-1].startswith("done goal")
