@@ -440,7 +440,7 @@ def test_ctrl_c_stops_the_goal_that_is_waited_for() -> None:
 
 def test_a_second_ctrl_c_leaves_and_says_that_the_goal_goes_on() -> None:
     goal: Any = Interrupted(presses=2, heard=False)
-    with pytest.raises(ServiceError, match="goal g-1 goes on"):
+    with pytest.raises(ServiceError, match="goal g-1 may still be running"):
         terminal.follow(goal, goal, "away", show=False)
     assert goal.cancelled.wait(60.0)
 

@@ -30,7 +30,7 @@ def run(most: int) -> Any:
     with (
         patch("trirail.cli.panel_command.wait_for_robot"),
         patch("trirail.client.async_client.AsyncRobot", Connected),
-        patch("trirail.panel.server.OPENING", HOURS),
+        patch("trirail.panel.server.REQUEST_TIMEOUT_S", HOURS),
     ):
         return main()
 
