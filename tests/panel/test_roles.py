@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from trirail.panel.permissions import permissions
 from trirail.panel.server import Panel
-from trirail.wire.vocabulary import Command, Role
+from trirail.wire.vocabulary import Command, Override, Role, SetOutput
 from waiting import WITHIN, wait_until
 from websockets.sync.client import connect
 
-OPERATOR = {"goal", "enable", "disable", "quick_stop", "pause", "resume", "override", "acquire", "release"}
+MOTION = {"goal", "enable", "disable", "quick_stop", "pause", "resume", "override"}
+OPERATOR = MOTION | {"set_output", "acquire", "release"}
 MAINTAINER = OPERATOR | {"poses", "takeover", "reset", "home"}
 MAY: dict[Role | None, set[str]] = {
     None: set(),
@@ -28,8 +29,9 @@ MAY: dict[Role | None, set[str]] = {
 """Once more, by hand."""
 PATH = "t,x,y,phi\n0,0.01,0.005,0.1\n1,0.011,0.005,0.1\n"
 ACTIONS: list[tuple[str, dict[str, Any]]] = [
-    *((name, {"do": "command", "name": name}) for name in Command if name is not Command.OVERRIDE),
+    *((name, {"do": "command", "name": name}) for name in Command if name.content not in (Override, SetOutput)),
     ("override", {"do": "command", "name": "override", "content": {"percent": 50.0}}),
+    ("set_output", {"do": "command", "name": "set_output", "content": {"output": "valve", "value": True}}),
     ("takeover", {"do": "takeover"}),
     ("goal", {"do": "hold", "velocity": [0.01, 0.0, 0.0], "seen": 10**15}),
     ("goal", {"do": "goal", "goal": {"kind": "move", "x": 0.001, "y": 0.0, "phi": 0.0}, "seen": 10**15}),
