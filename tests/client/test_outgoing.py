@@ -421,6 +421,7 @@ CLOSED: dict[str, Call] = {
     "forget": lambda robot, _: robot.forget("out"),
     "state": lambda robot, _: robot.state(),
     "records": lambda robot, _: robot.records(print),
+    "set_output": lambda robot, _: robot.set_output("valve", True),
     "calibrate_camera": lambda robot, _: robot.calibrate_camera(dict),
     "calibrate_geometry": lambda robot, _: robot.calibrate_geometry(dict, (1.0, 1.0)),
     "align": lambda robot, _: robot.align(dict, {"a": (0.0, 0.0)}, CALIBRATION),

@@ -23,7 +23,7 @@ MESSAGES = ("put", "delete", "query", "reply", "declare_subscriber", "declare_qu
 FLOWS = ("ingress", "egress")
 
 PUBLISHED = {"state", "summary", "event", "records"}
-OPERATORS = {"enable", "disable", "quick_stop", "pause", "resume", "override", "acquire", "release"}
+OPERATORS = {"enable", "disable", "quick_stop", "pause", "resume", "override", "set_output", "acquire", "release"}
 MAINTAINERS = {"reset", "home"}
 
 KEYS = [

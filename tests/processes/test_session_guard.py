@@ -106,10 +106,13 @@ def pose(robot: Robot) -> None:
     robot.move_to(x=0.01, y=0.0, phi=0.0)
 
 
+CARRYING = (Command.OVERRIDE, Command.SET_OUTPUT)
+"""Commands that need a content."""
 DOES: dict[str, Callable[[Robot], object]] = {
     "goal": pose,
-    **{name: lambda robot, name=name: robot.command(name) for name in Command if name is not Command.OVERRIDE},  # type: ignore[misc]
+    **{name: lambda robot, name=name: robot.command(name) for name in Command if name not in CARRYING},  # type: ignore[misc]
     "override": lambda robot: robot.override(50),
+    "set_output": lambda robot: robot.set_output("valve", True),
     "info": lambda robot: robot.info(),
     "poses": lambda robot: robot.poses(),
     "teach": lambda robot: robot.teach("pick"),

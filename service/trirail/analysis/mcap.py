@@ -44,7 +44,7 @@ TOPICS = {
 BASE, MEASURED, COMMANDED = "base", "platform_measured", "platform_commanded"
 """Frames; the platform of the URDF is a link of its own, which joints move."""
 JOINTS = tuple(f"{joint}_{leg}" for joint in ("slider", "pivot", "cross") for leg in "abc")
-"""Joints of the URDF: sliders lambda_10, pivots, and cross slides lambda_32, of the legs A, B, C."""
+"""Joints of the URDF: sliders, pivots and cross slides of the legs A, B, C."""
 OK, WARN, ERROR = 0, 1, 2
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 Message = tuple[int, str, Any]

@@ -160,7 +160,7 @@ class Stage(Device, AsyncReadable, HasHints):
         }
 
     async def _connect(self, loop: asyncio.AbstractEventLoop) -> StageLink:
-        robot = await self._robot.for_running_loop()
+        robot = await self._robot._for_running_loop()
         shown = DrawnRobot.from_info(await robot.info())
         return StageLink(loop, robot, shown, Mover(robot))
 

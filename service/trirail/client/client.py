@@ -195,7 +195,7 @@ class Robot:
         self._loop.close()
         self._stop_loop.close()
 
-    async def for_running_loop(self) -> AsyncRobot:
+    async def _for_running_loop(self) -> AsyncRobot:
         """Return a robot for the running event loop that shares this connection, until either of them is closed."""
         return await self._robot._shared(self._connection)
 
