@@ -107,9 +107,8 @@ def test_the_page_offers_what_a_role_may_and_nothing_else(browser: Page, role: R
         for what, selector in {"goal": "#pad", "poses": "#teach", "override": "#override", "stop": "#stop"}.items():
             if page.evaluate(f"document.querySelector({selector!r}).checkVisibility()"):
                 offered.add(what)
-        assert offered == MAY[role] - {"set_output"} | {
-            "stop"
-        }  # this robot has no outputs; that is pressed whoever one is; the service decides
+        # STOP is pressed whoever one is: the service decides. This robot has no outputs.
+        assert offered == MAY[role] - {"set_output"} | {"stop"}
         before = done(robot)
         for key in ("ArrowRight", "a"):
             page.key_down(key)

@@ -59,7 +59,9 @@ class Told:
         self.now = 0.0
         self.measured: list[ServiceMeasured] = []
         self.meter = Meter(self.measured.append, lambda: self.now)  # type: ignore[arg-type]
-        self._states = StateMaker(CONFIG)
+        self._states = StateMaker(
+            msgspec.structs.replace(CONFIG, outputs={"valve": Output("A", 16)}, inputs={"part": Input("B", 16)})
+        )
 
     def rows(self, **fields: object) -> None:
         rows = np.zeros(2, DTYPE)
