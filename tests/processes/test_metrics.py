@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from ports import free_port
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
-from trirail.config import SIM, Config
+from trirail.config import SIM, Config, Input, Output
 from trirail.errors import ServiceError
 from trirail.processes.child_process import MEASURED
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
