@@ -24,12 +24,29 @@ from waiting import WITHIN
 pytestmark = pytest.mark.slow
 
 
+DIGITAL = """
+[outputs.valve]
+drive = "A"
+bit = 16
+
+[inputs.part]
+drive = "B"
+bit = 16
+"""
+
+
 class Watched(Service):
     """A service with metrics."""
 
     def __init__(self, folder: Path) -> None:
         self.url = f"http://127.0.0.1:{(port := free_port())}"
-        super().__init__(folder, **{"state_hz = 50": f"state_hz = 50\nmetrics_port = {port}"})
+        super().__init__(
+            folder,
+            **{
+                "state_hz = 50": f"state_hz = 50\nmetrics_port = {port}",
+                "\n[telemetry]\n": DIGITAL + "\n[telemetry]\n",
+            },
+        )
 
     def health(self) -> dict[str, str]:
         """What is wrong, by process."""

@@ -87,6 +87,7 @@ def through(hub: Hub) -> Robot:
             return robot
 
 
+@pytest.mark.alone  # a stalled machine loses events
 def test_a_robot_is_seen_and_driven_through_its_router_which_may_come_and_go(hub: Hub, service: Service) -> None:
     with through(hub) as robot, Fleet(hub.locator, "demo") as fleet:
         robot.enable()

@@ -41,7 +41,7 @@ class StateDrawn(_PageMessage, frozen=True, tag="seen"):
 class JogHeld(_PageMessage, frozen=True, tag="hold"):
     """Notice that a jog button is held down; repeated while it is."""
 
-    wants = GOAL
+    permission = GOAL
 
     velocity: Coordinates
     """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
@@ -64,7 +64,7 @@ class SendCommand(_PageMessage, frozen=True, tag="command"):
     """Content of the command, forwarded as it is."""
 
     @property
-    def needs(self) -> str:
+    def required_permission(self) -> str:
         """Return the permission of the command itself."""
         return self.name
 
@@ -72,13 +72,13 @@ class SendCommand(_PageMessage, frozen=True, tag="command"):
 class TakeOver(_PageMessage, frozen=True, tag="takeover"):
     """Request to take the lease over from its holder."""
 
-    wants = TAKEOVER
+    permission = TAKEOVER
 
 
 class SendGoal(_PageMessage, frozen=True, tag="goal"):
     """Request to send a goal: the button of a named pose, of a typed one, or of a step was pressed."""
 
-    wants = GOAL
+    permission = GOAL
 
     goal: PoseGoal | NamedGoal | MoveGoal
     """Goal, forwarded as it is."""
@@ -111,7 +111,7 @@ class CheckPath(_PageMessage, frozen=True, tag="check path"):
 class Follow(_PageMessage, frozen=True, tag="follow"):
     """Request to follow the path in a file from its first point."""
 
-    wants = GOAL
+    permission = GOAL
 
     name: str
     """Name of the file, as in CheckPath."""
@@ -124,7 +124,7 @@ class Follow(_PageMessage, frozen=True, tag="follow"):
 class Teach(_PageMessage, frozen=True, tag="teach"):
     """Request to save the robot's current position as a pose."""
 
-    wants = POSES
+    permission = POSES
 
     name: str
     """Name of the pose."""
@@ -133,7 +133,7 @@ class Teach(_PageMessage, frozen=True, tag="teach"):
 class Forget(_PageMessage, frozen=True, tag="forget"):
     """Request to remove a taught pose."""
 
-    wants = POSES
+    permission = POSES
 
     name: str
     """Name of the pose."""
