@@ -66,9 +66,6 @@ def session(folder: Path) -> Path:
     """Run a random session on a service of its own; return its recording."""
     recording = folder / "session.rrd"
     config, locator = own_service.private(folder)
-    config.write_text(
-        config.read_text().replace("heartbeat = 0.1", "heartbeat = 0.1\nsdo_timeout = 5.0")
-    )  # beside others
     choice = random.Random(6)
     with own_service.service(config, recording) as service, Robot("demo", locator, user="ann") as robot:
         for then in (robot.stop, robot.quick_stop):

@@ -23,7 +23,7 @@ PATIENT = {
     "max_overruns": "1000",
     "missed_syncs": "2000",
     "missed_positions": "1000",
-    "heartbeat": "1.0",
+    "heartbeat": "1.0\nsdo_timeout = 5.0",
     "gateway_timeout": "1.0",
 }
 """Keys of a configuration that tolerates processes stalled for a second by a busy machine."""
