@@ -12,6 +12,7 @@ import pytest
 from control_rig import CONFIG, ControlRig, PerfectDrives
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, Input, Output, load
+from trirail.control.outputs import LOG_LENGTH, SWITCHED
 from trirail.errors import RefusalCode
 from trirail.wire.event_codes import EventCode
 from trirail.wire.goals import PoseGoal
@@ -186,6 +187,32 @@ def _as_near(rig: Rig, row: Switch, pose: tuple[float, float, float], best: int)
     """Whether a cycle is as near to a pose as the best one, but for rounding: where the robot waits, many are."""
     here, there = (np.linalg.norm((rig.poses[cycle - 1] - pose) / REACH["3-PRP"]) for cycle in (row.cycle, best))
     return bool(here <= there + 1e-6)
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+def test_a_delay_is_made_up_for(rig: Rig, speed: float) -> None:
+    marks = tuple(Mark("late", value=k % 2 == 0, at_path_fraction=0.2 + 0.1 * k) for k in range(7))
+    since = len(rig.poses)
+    answer = rig.send("g", PoseGoal(0.05, 0.0, 0.0, speed=speed, marks=marks))
+    assert isinstance(answer, Accepted)
+    rig.until(rig.holds, 20_000)
+    places = {placed.mark: placed.pose for placed in answer.reply.marks}
+    rows = rig.switches
+    assert len(rows) == len(marks)
+    for row in rows:
+        assert abs(row.cycle - nearest(rig, places[row.mark], OUTPUTS["late"].delay, since)) <= 1
+
+
+def test_a_full_log_keeps_its_first_rows(rig: Rig) -> None:
+    outputs = rig.control.outputs
+    room = np.zeros(LOG_LENGTH + 1, SWITCHED)
+    outputs.log, outputs.logged = room[:LOG_LENGTH], LOG_LENGTH
+    outputs.state["until"], outputs.state["goal"], outputs.state["opened"] = 1, 1, 1
+    outputs.words[:] = -1
+    outputs.step(None, 0.0, rig.control.schedule.version, 7, rig.control.measured.record)
+    assert outputs.logged == LOG_LENGTH
+    assert np.array_equal(room, np.zeros(LOG_LENGTH + 1, SWITCHED))
+    assert not outputs.values()["valve"]
 
 
 @pytest.mark.parametrize("kind", ROBOTS)
