@@ -20,6 +20,7 @@ from trirail.wire.messages import Event
 from trirail.wire.packets import Status, Welcome
 from trirail.wire.state import (
     CommandedMotion,
+    DigitalLine,
     FrameCounts,
     GoalState,
     Info,
@@ -251,6 +252,8 @@ def info(config: Config) -> Info:
         takeover=config.control.takeover.value,
         outputs=tuple(config.outputs),
         inputs=tuple(config.inputs),
+        output_lines={name: DigitalLine(each.drive, each.bit) for name, each in config.outputs.items()},
+        input_lines={name: DigitalLine(each.drive, each.bit) for name, each in config.inputs.items()},
         homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
         versions=versions(),
         correction=as_built.summary(config.correction.map, config.correction.as_built, config.correction.backlash),
