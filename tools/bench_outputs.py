@@ -11,16 +11,15 @@ sleeps between cycles, as the loop does: caches are as cold as there.
 from __future__ import annotations
 
 import math
-from contextlib import closing
 from typing import Any, Final
 
 import numpy as np
 from bench_rig import QUANTILES, Rig, quantiles
-from numba import njit
 from numpy.typing import NDArray
 from trirail.client.client import Robot
 from trirail.config import SIM, Output, load
 from trirail.control.outputs import Outputs, switch
+from trirail.kinematics.compiled import compiled
 from trirail.motion.goal_planner import GoalPlanner
 from trirail.motion.marks import GoalMarks, place_marks
 from trirail.motion.runs import rest
@@ -33,7 +32,8 @@ from trirail.wire.records import DTYPE, unpack
 
 SECTIONS: Final = '[outputs.valve]\ndrive = "A"\nbit = 16\n'
 """Sections of the configuration."""
-BIT: Final = 1 << 16
+FIRST_BIT: Final = 16
+BIT: Final = 1 << FIRST_BIT
 SPEEDS: Final = (0.01, 0.1, 0.25)
 """Speeds of the platform at the marks [m/s]."""
 TRAVELS: Final = (0.02, 0.1, 0.2)
@@ -48,8 +48,8 @@ PASSES: Final = 2
 
 def measure(made: Rig, pulses: int, tries: int) -> dict[str, Any]:
     """Return the errors of place at each speed [µm], of `pulses` marks and of `tries` by a client; and the times."""
-    limit = made.robot.info().limits["platform"]["velocity"][0]
-    rate_hz = made.robot.info().rate_hz
+    robot = DrawnRobot.from_info(made.robot.info())
+    limit, rate_hz = robot.limits.platform.velocity[0], robot.rate_hz
     rows = []
     for speed, travel in zip(SPEEDS, TRAVELS, strict=True):
         marks = _errors_of_marks(made.robot, travel, speed / limit, pulses)
@@ -84,8 +84,7 @@ def _error_of_client(robot: Robot, travel: float, speed: float) -> float:
     batches: list[bytes] = []
     with robot.records(batches.append):
         goal = robot.move_to(x=travel / 2.0, y=0.0, phi=0.0, speed=speed)
-        with closing(robot.states()) as states:
-            next(state for state in states if state.pose[0] >= 0.0)
+        next(state for state in robot.states() if state.pose[0] >= 0.0)
         robot.set_output("valve", True)
         goal.wait()
     records = np.concatenate([unpack(batch) for batch in batches])
@@ -110,7 +109,7 @@ def _times(count: int, passes: int) -> dict[str, Any]:
         .plan(PoseGoal(0.1, 0.0, 0.0, speed=0.4), Schedule(rest(start), period), 1.0, 0)
         .run
     )
-    named = {f"output{number}": Output("ABC"[number % 3], 16 + number) for number in range(count)}
+    named = {f"output{number}": Output("A", FIRST_BIT + number) for number in range(count)}
     marks = [Mark(name, start=0.0, increment=0.002, pulse_width=0.002) for name in named]
     placed = place_marks(marks, run.path, robot.geometry.packed(), start, period)
     run.marks.append(GoalMarks("bench", marks, placed.switches.tobytes()))
@@ -129,7 +128,7 @@ def _times(count: int, passes: int) -> dict[str, Any]:
     return {"outputs": count, "switched": switched, "us": quantiles(np.concatenate(found))}
 
 
-@njit
+@compiled()
 def _timed(
     outputs: NDArray[np.void],
     planned: NDArray[np.void],
@@ -146,8 +145,8 @@ def _timed(
     switched = 0
     due = now_ns(moment)
     for cycle in range(len(durations)):
-        due += period * 1e9
-        sleep(int(due), moment)
+        due += int(period * 1e9)
+        sleep(due, moment)
         began = now_ns(moment)
         logged = switch(outputs, planned, words, log, 0, knots, pieces, True, cycle * period, period, cycle, record)
         durations[cycle] = now_ns(moment) - began
