@@ -1,8 +1,8 @@
 """Outputs on the path: places at which they switch, beside a client that watches the state; and the time of a cycle.
 
 A pulse's place is compared with the commanded pose of the setpoint that its output came with. The client does what
-users of a robot without marks do: it sends `set_output` once the state is behind the place. The records of all cycles
-tell what took effect where.
+users of a robot without marks do: it sends `set_output` once the state is behind the place. The record of each cycle
+shows where an output took effect.
 
 The time is that of the compiled switch alone, in each cycle of a path, beside two calls of the clock. The program
 sleeps between cycles, as the loop does: caches are as cold as there.
@@ -117,15 +117,15 @@ def _times(count: int, passes: int) -> dict[str, Any]:
     outputs.prepare(run, 1)
     first = outputs.state.copy()
     durations = np.zeros(math.ceil(run.path.duration / period), np.int64)
-    law, record, found, switched = run.law, np.zeros(1, DTYPE), [], 0
+    law, record, samples, switched = run.law, np.zeros(1, DTYPE), [], 0
     for _ in range(passes):
         outputs.state[:] = first
         switched += _timed(
             *(outputs.state, outputs.planned, outputs.words, outputs.log, law.knots, law.pieces, period, record),
             *(durations, np.zeros(2, np.int64)),
         )
-        found.append(durations / 1e3)
-    return {"outputs": count, "switched": switched, "us": quantiles(np.concatenate(found))}
+        samples.append(durations / 1e3)
+    return {"outputs": count, "switched": switched, "us": quantiles(np.concatenate(samples))}
 
 
 @compiled()

@@ -93,18 +93,18 @@ class Switch(NamedTuple):
 
 def switches(frames: Sequence[Dissected], node: int, output: int) -> list[Switch]:
     """Return the PDOs of a node that changed an output, a bit of 60FEh:01; it is off before."""
-    found: list[Switch] = []
+    changes: list[Switch] = []
     pending: list[bool] = []
     on, syncs = False, 0
     for frame in frames:
         if frame.function == SYNC and not frame.node:
-            found += [Switch(syncs, value, frame.t) for value in pending]
+            changes += [Switch(syncs, value, frame.t) for value in pending]
             pending, syncs = [], syncs + 1
         elif frame.function == RPDO3 and frame.node == node:
             value = bool(int.from_bytes(frame.data, "little") & output)
             pending += [value] if value is not on else []
             on = value
-    return found
+    return changes
 
 
 def statistics(frames: Sequence[Dissected]) -> dict[str, int]:

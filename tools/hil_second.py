@@ -136,15 +136,15 @@ class Change(NamedTuple):
 
 def changes(log: str) -> list[Change]:
     """Return the changes of outputs in the foreign drive's log."""
-    found = re.findall(r"^outputs ([0-9A-F]{8}) at SYNC (\d+), ([\d.]+)$", log, re.MULTILINE)
-    return [Change(bool(int(bits, 16) & VALVE), int(sync), float(t)) for bits, sync, t in found]
+    lines = re.findall(r"^outputs ([0-9A-F]{8}) at SYNC (\d+), ([\d.]+)$", log, re.MULTILINE)
+    return [Change(bool(int(bits, 16) & VALVE), int(sync), float(t)) for bits, sync, t in lines]
 
 
 def cycles_problem(cycles: Sequence[tuple[int, bool]], switched: Sequence[tuple[int, bool]]) -> str:
     """Return what is wrong; "" where values switched as in a table, all equally many SYNCs after their cycle."""
-    values, found = [on for _, on in cycles], [on for _, on in switched]
-    if values != found:
-        return f"outputs have switched to {found}, in the table to {values}"
+    expected, values = [on for _, on in cycles], [on for _, on in switched]
+    if values != expected:
+        return f"outputs have switched to {values}, in the table to {expected}"
     shifts = [sync - cycle for (cycle, _), (sync, _) in zip(cycles, switched, strict=True)]
     return f"outputs have switched {shifts} SYNCs after their cycles of the table" if len(set(shifts)) > 1 else ""
 
@@ -160,12 +160,16 @@ def _switched(robot: Robot, machine: Machine, held: Held) -> list[dict[str, Any]
     expect(ended, "done", robot)
     table = ended.marks
     until(lambda: len(changes(machine.log("foreign"))) >= before + len(table), "the foreign drive switches its output")
-    taken = changes(machine.log("foreign"))[before:]
-    if problem := cycles_problem([(row.cycle, row.value) for row in table], [(each.sync, each.on) for each in taken]):
+    switched = changes(machine.log("foreign"))[before:]
+    if problem := cycles_problem(
+        [(row.cycle, row.value) for row in table], [(each.sync, each.on) for each in switched]
+    ):
         raise Failed(f"the foreign drive: {problem}")
     cycles = ", ".join(str(row.cycle) for row in table)
     held("outputs on the path", f"the foreign drive's valve has switched at the SYNC after each of cycles {cycles}")
-    return [{"cycle": row.cycle, "value": row.value, "taken": each.t} for row, each in zip(table, taken, strict=True)]
+    return [
+        {"cycle": row.cycle, "value": row.value, "taken": each.t} for row, each in zip(table, switched, strict=True)
+    ]
 
 
 def _disturb(machine: Machine, virtual: Popen[bytes], config: Config, held: Held) -> None:
