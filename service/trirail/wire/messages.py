@@ -158,6 +158,8 @@ class Notice(Struct, frozen=True, omit_defaults=True):
     """Values in the message, by the names that the event code defines; SI units and radians."""
     marks: tuple[Switch, ...] = ()
     """Switches on the path of a goal, with kind output, in the order in which they happened."""
+    planned: tuple[PlacedMark, ...] = ()
+    """Marks of an accepted goal, with kind output, and the places at which they will switch first."""
 
     def event(self, seq: int, t: float, cycle: int, time: float) -> Event:
         """Return the event with its number and time."""
