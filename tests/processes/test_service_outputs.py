@@ -117,3 +117,11 @@ def test_marks_that_cannot_be_are_refused_and_nothing_moves(robot: Robot) -> Non
         with pytest.raises(RefusedError, match=what):
             robot.move_to(x=0.02, y=0.0, phi=0.0, marks=marks)
     assert robot.state().commanded.position == before
+
+
+def test_outputs_are_safe_at_the_end_of_the_service(service: Service, robot: Robot) -> None:
+    robot.set_output("valve", True)
+    until(robot, lambda state: state.outputs["valve"])
+    assert service.end() == 0
+    sent = [int.from_bytes(data, "little") >> 16 & 1 for identifier, data in service.frames() if identifier == 0x401]
+    assert sent[-2:] == [1, 0]
