@@ -24,6 +24,7 @@ from trirail.bluesky import Stage, UnfinishedError
 from trirail.bluesky import mover as mover_module
 from trirail.client import own_service
 from trirail.wire.messages import Event
+from trirail.wire.state import State
 from waiting import WITHIN, wait_until
 
 pytestmark = pytest.mark.slow
@@ -126,32 +127,34 @@ def test_count_has_every_reading_with_its_unit_limits_and_precision(stage: Stage
 
 
 def test_axes_that_are_set_together_are_one_straight_move(stage: Stage, robot: Robot, engine: Any) -> None:
-    begin, poses = newest_event(robot), list[Any]()
-    with robot_poses(robot, poses):
+    begin, states = newest_event(robot), list[State]()
+    with robot_states(robot, states):
         run(engine, bps.mv(stage.x, 0.03, stage.y, 0.06, stage.phi, 0.15))
     assert [event.outcome for event in goal_events(robot, begin)] == ["done"]
     assert robot.state().commanded.pose == pytest.approx((0.03, 0.06, 0.15), abs=1e-12)
-    for x, y, phi in poses:
+    for x, y, phi in (state.commanded.pose for state in states):
         assert (y, phi) == pytest.approx((2.0 * x, 5.0 * x), abs=1e-9)
 
 
 @contextmanager
-def robot_poses(robot: Robot, poses: list[Any]) -> Iterator[None]:
-    """Keep commanded poses while the context lasts."""
+def robot_states(robot: Robot, kept: list[State]) -> Iterator[None]:
+    """Keep states while the context lasts."""
     over = threading.Event()
 
     def keep() -> None:
         for state in robot.states():
-            poses.append(state.commanded.pose)
+            kept.append(state)
             if over.is_set():
                 return
 
     thread = threading.Thread(target=keep)
     thread.start()
-    yield
-    over.set()
-    thread.join()
-    assert poses
+    try:
+        wait_until(lambda: bool(kept), "the first state", 0.01)
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def test_an_axis_that_is_set_later_leaves_the_others_their_targets(stage: Stage, robot: Robot, engine: Any) -> None:
@@ -219,8 +222,8 @@ def test_a_paused_plan_stops_the_robot_and_resumes(stage: Stage, robot: Robot, e
     robot.override(10.0)
     documents: Documents = []
     plan = bp.scan([stage], stage.x, 0.02, 0.04, stage.y, 0.0, 0.01, num=2)
-    poses: list[Any] = []
-    with robot_poses(robot, poses):
+    states: list[State] = []
+    with robot_states(robot, states):
         with when(lambda: robot.state().pose.x > 0.005, engine.request_pause), pytest.raises(RunEngineInterrupted):
             engine(plan, lambda name, document: documents.append((name, document)))
         state = robot.state()
@@ -232,7 +235,9 @@ def test_a_paused_plan_stops_the_robot_and_resumes(stage: Stage, robot: Robot, e
     assert [at(row, x, y) for row, (x, y) in zip(data(documents), [(0.02, 0.0), (0.04, 0.01)], strict=True)] == [
         True
     ] * 2
-    assert np.abs(np.diff([pose.x for pose in poses])).max() < 0.02  # within 20 ms at full speed, or a few states lost
+    assert (
+        np.abs(np.diff([state.commanded.pose.x for state in states])).max() < 0.02
+    )  # within 20 ms at full speed, or a few states lost
     assert robot.state().faults == ()
 
 
@@ -287,11 +292,12 @@ def test_the_end_of_a_plan_leaves_goals_of_others_alone(stage: Stage, robot: Rob
     assert goal.wait(WITHIN).outcome == "done"
 
 
-def pages(documents: Documents) -> dict[str, list[Any]]:
+def pages(documents: Documents, part: str = "data") -> dict[str, list[Any]]:
+    """Return the columns of a flight's data, or of their timestamps."""
     found: dict[str, list[Any]] = {}
     for name, document in documents:
         if name == "event_page":
-            for key, values in document["data"].items():
+            for key, values in document[part].items():
                 found.setdefault(key, []).extend(values)
     return found
 
@@ -303,6 +309,25 @@ def test_a_fly_scan_collects_every_state_on_the_way(stage: Stage, engine: Any) -
     assert np.all(np.diff(found["stage-t"]) > 0.0)
     assert found["stage-x"][0] == pytest.approx(0.01, abs=1e-3)
     assert max(found["stage-y"]) == pytest.approx(0.01, abs=1e-3)
+
+
+def test_a_reading_has_the_time_of_its_state(stage: Stage, robot: Robot, engine: Any) -> None:
+    states: list[State] = []
+    with robot_states(robot, states):
+        scanned = run(engine, bp.count([stage], num=3))
+        flown = run(engine, bp.fly([stage.fly_to(0.03, 0.0, 0.0, speed=0.3)]))
+    times = {state.t: state.time for state in states}
+    read = [(document["data"]["stage-t"], set(document["timestamps"].values()))
+            for name, document in scanned if name == "event"]  # fmt: skip
+    assert len(read) == 3
+    assert all(stamps == {times[t]} for t, stamps in read if t in times)
+    ts, stamps = pages(flown)["stage-t"], pages(flown, "timestamps")
+    assert all(column == stamps["stage-t"] for column in stamps.values())
+    shared = [(t, stamp) for t, stamp in zip(ts, stamps["stage-t"], strict=True) if t in times]
+    assert len(shared) > 10
+    assert shared == [(t, times[t]) for t, _ in shared]
+    assert np.median(np.abs(np.diff(stamps["stage-t"]) - np.diff(ts))) < 1e-3
+    assert abs(time.time() - stamps["stage-t"][-1]) < WITHIN
 
 
 def test_a_fly_scan_that_is_stopped_fails_with_the_reason(stage: Stage, robot: Robot, engine: Any) -> None:
@@ -336,10 +361,13 @@ def test_a_fly_scan_with_marks_collects_the_table_of_switches(engine: Any, tmp_p
         robot.enable()
         marks = [{"output": "strobe", "start": 0.002, "end": 0.018, "increment": 0.002, "pulse_width": 0.003}]
         flight = stage.fly_to(0.02, 0.0, 0.0, marks=marks, speed=0.3, name="strobes")
-        found = pages(run(engine, bp.fly([flight])))
+        flown = run(engine, bp.fly([flight]))
+    found, stamps = pages(flown), pages(flown, "timestamps")
     on = [x for x, value in zip(found["strobes-commanded_x"], found["strobes-value"], strict=True) if value]
     assert on == pytest.approx(np.arange(1, 10) * 0.002, abs=5e-4)
     assert set(found["strobes-output"]) == {"strobe"}
+    assert all(column == found["strobes-time"] for column in stamps.values())
+    assert np.diff(found["strobes-time"]) == pytest.approx(np.diff(found["strobes-t"]), abs=1e-3)
 
 
 def test_a_service_that_is_killed_ends_the_plan_and_the_next_one_works(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections.abc import AsyncIterator, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
@@ -135,7 +134,6 @@ class Stage(Device, AsyncReadable, HasHints):
 
     def readings(self, state: State) -> Readings:
         """Return all readings of a state."""
-        now = time.time()  # a state has no wall clock of its own; t is its exact time
         values: dict[str, Any] = {
             **dict(zip((self.x.name, self.y.name, self.phi.name), state.pose, strict=True)),
             self.pose.name: np.array(state.pose),
@@ -143,7 +141,7 @@ class Stage(Device, AsyncReadable, HasHints):
             self.key("following_error"): np.array(state.sliders.following_error),
             self.key("t"): state.t,
         }
-        return {name: {"value": value, "timestamp": now} for name, value in values.items()}
+        return {name: {"value": value, "timestamp": state.time} for name, value in values.items()}
 
     def _key(self, shown: DrawnRobot, axis: int) -> DataKey:
         limits, name = shown.limits, COORDINATES[axis]
