@@ -17,7 +17,6 @@ from trirail.bluesky.flight import Flight
 from trirail.bluesky.mover import Mover
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
-from trirail.client.path_check import check_goal
 from trirail.client.trajectory import Points, points_of
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import PoseGoal
@@ -101,14 +100,12 @@ class Stage(Device, AsyncReadable, HasHints):
         await (await self.link()).mover.stop(success)
 
     async def check(self, pose: Sequence[float]) -> None:
-        """Check the whole path to a pose against every limit, as the service does; nothing moves.
+        """Have the service check the whole path to a pose against every limit; nothing moves.
 
         Raises RefusedError with the limit and the value where the service would refuse the pose.
         """
-        link = await self.link()
-        start = (await link.robot.state()).commanded.pose
         x, y, phi = (float(value) for value in pose)
-        await asyncio.to_thread(check_goal, link.shown, start, PoseGoal(x=x, y=y, phi=phi))
+        await (await self.link()).robot.check(PoseGoal(x=x, y=y, phi=phi))
 
     def follow(
         self, points: Points, *, marks: Sequence[MarkLike] = (), stretch: bool = False, name: str = "flight"
