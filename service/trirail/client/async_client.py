@@ -351,9 +351,9 @@ class AsyncRobot:
     async def check(self, goal: Goal) -> GoalReply:
         """Plan a trirail.wire.goals.Goal without moving; return the reply of the service if it could be accepted now.
 
-        The whole path is checked against every limit. It begins at rest at the end of the goals under way, or at the
-        commanded pose, in every mode and whoever holds the lease. A jog or a track has no path, and a trajectory of
-        more than one message is not checked. Raises RefusedError as for the goal itself.
+        The whole path is checked against every limit. It begins at rest, at the end of the goals under way or at the
+        commanded pose. Neither mode nor lease matters. A jog or a track has no path to check; a trajectory is checked
+        up to the points of one message. Raises RefusedError as for the goal itself.
         """
         return await self._connection.fetch(("check", self.user), GoalReply, check_message(goal))
 

@@ -396,7 +396,7 @@ class Control:
                     self._checks.lose(what.reason)
                 case answer:
                     self._planner.hear(answer)
-                    self._checks.hear(answer)
+                    self._checks.receive(answer)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 

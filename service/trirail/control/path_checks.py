@@ -22,7 +22,7 @@ from trirail.motion.tool_frames import NamedFrames
 from trirail.wire.packets import Checked, CheckRequest, Refused
 from trirail.wire.plan_packets import NotPlanned, PlanAnswer, PlanRequest
 
-STILL = (0.0, 0.0, 0.0)
+NO_MOTION = (0.0, 0.0, 0.0)
 
 
 class PathChecks:
@@ -73,14 +73,14 @@ class PathChecks:
             except RefusedError as refusal:
                 self._refuse(refusal)
 
-    def hear(self, answer: PlanAnswer) -> None:
+    def receive(self, answer: PlanAnswer) -> None:
         """Answer the check that the planner was last asked for; ignore every other answer."""
         if self._asked_before is None or answer.number != self._number:
             return
         if isinstance(answer, NotPlanned):
             self._refuse(answer.error())
             return
-        request = self._take()
+        request = self._dequeue()
         reply = structs.replace(answer.reply, id=request.goal.id or "")
         self._ledger.answers.append(Checked(request.ticket, reply))
 
@@ -103,7 +103,7 @@ class PathChecks:
         self._number -= 1
         self._asked_before = self._planner.requests
         rate = min(self._planner.override, goal.greatest_rate)
-        begin, cycle, version = ((x, y, phi), STILL, STILL), self._schedule.cycle, self._schedule.version
+        begin, cycle, version = ((x, y, phi), NO_MOTION, NO_MOTION), self._schedule.cycle, self._schedule.version
         self._port.request_plan(
             PlanRequest(self._number, version, self._revision, cycle, LEAST_LEAD, rate, begin, (), goal)
         )
@@ -112,9 +112,9 @@ class PathChecks:
         """Answer the first check with a refusal."""
         code, text = refusal.code, str(refusal)
         self._ledger.answers.append(
-            Refused(self._take().ticket, code, text, refusal.slider, refusal.value, refusal.limit)
+            Refused(self._dequeue().ticket, code, text, refusal.slider, refusal.value, refusal.limit)
         )
 
-    def _take(self) -> CheckRequest:
+    def _dequeue(self) -> CheckRequest:
         self._asked_before = None
         return self._waiting.popleft()

@@ -101,7 +101,7 @@ class PlanRequests:
 
     @property
     def requests(self) -> int:
-        """Number of requests to the planner so far."""
+        """Number of requests sent to the planner."""
         return self._number
 
     @property
