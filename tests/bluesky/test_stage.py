@@ -17,6 +17,8 @@ import pytest
 from bluesky import RunEngine, simulators
 from bluesky import plan_stubs as bps
 from bluesky import plans as bp
+from bluesky import preprocessors as bpp
+from bluesky.protocols import Subscribable
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 from ophyd_async.core import init_devices
 from trirail import RefusedError, Robot, ServiceError, TrirailError
@@ -328,6 +330,77 @@ def test_a_reading_has_the_time_of_its_state(stage: Stage, robot: Robot, engine:
     assert shared == [(t, times[t]) for t, _ in shared]
     assert np.median(np.abs(np.diff(stamps["stage-t"]) - np.diff(ts))) < 1e-3
     assert abs(time.time() - stamps["stage-t"][-1]) < WITHIN
+
+
+def test_a_monitor_gets_every_state_until_it_is_removed(stage: Stage, robot: Robot, engine: Any) -> None:
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.monitor(stage, name="states")
+        yield from bps.monitor(stage.x, name="x")
+        yield from bps.mv(stage.x, 0.03)
+        yield from bps.unmonitor(stage.x)
+        yield from bps.unmonitor(stage)
+        yield from bps.create()
+        yield from bps.read(stage)
+        yield from bps.save()
+        yield from bps.close_run()
+
+    documents = run(engine, plan())
+    streams = {document["uid"]: document["name"] for name, document in documents if name == "descriptor"}
+    told = [(streams[document["descriptor"]], document) for name, document in documents if name == "event"]
+    assert [stream for stream, _ in told[-1:]] == ["primary"]
+    last = told[-1][1]["data"]["stage-t"]
+    whole = [document for stream, document in told if stream == "states"]
+    times = [document["data"]["stage-t"] for document in whole]
+    assert times == sorted(set(times))
+    assert times[-1] < last
+    assert max(document["data"]["stage-x"] for document in whole) > 0.02
+    assert all(set(document["timestamps"].values()) == {document["timestamps"]["stage-t"]} for document in whole)
+    places = [document["data"] for stream, document in told if stream == "x"]
+    assert len(places) > 5
+    assert {name for place in places for name in place} == {"stage-x"}
+    assert stage._monitors == stage.x._monitors == {}
+    assert isinstance(stage, Subscribable)
+    assert isinstance(stage.pose, Subscribable)
+
+
+def test_a_monitor_rests_while_the_plan_is_paused(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(10.0)
+    documents: Documents = []
+    monitored: Any = bpp.monitor_during_wrapper  # which has no types
+    plan = monitored(bp.scan([stage], stage.x, 0.02, 0.03, 2), [stage.y])
+    with when(lambda: robot.state().pose.x > 0.002, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        engine(plan, lambda name, document: documents.append((name, document)))
+    assert stage.y._monitors == {}
+    before = len(documents)
+    state = robot.state()
+    wait_until(lambda: robot.state().seq > state.seq)
+    assert len(documents) == before
+    robot.override(100.0)
+    engine.resume()
+    places = [row for row in data(documents[before:]) if "stage-y" in row and "stage-x" not in row]
+    assert len(places) > 5
+
+
+def test_an_error_of_a_monitor_does_not_end_it(stage: Stage, engine: Any, caplog: pytest.LogCaptureFixture) -> None:
+    calls: list[float] = []
+
+    def fail(readings: dict[str, Any]) -> None:
+        calls.append(readings["stage-x"]["value"])
+        raise ValueError("this monitor fails")
+
+    def plan() -> Any:
+        stage.x.subscribe_reading(fail)
+        with pytest.raises(ValueError, match="already"):
+            stage.x.subscribe_reading(fail)
+        yield from bps.mv(stage.x, 0.01)
+        stage.x.clear_sub(fail)
+
+    run(engine, plan())
+    assert len(calls) > 3
+    assert "a monitor of stage-x failed" in caplog.text
+    with pytest.raises(KeyError):
+        stage.x.clear_sub(fail)
 
 
 def test_a_fly_scan_that_is_stopped_fails_with_the_reason(stage: Stage, robot: Robot, engine: Any) -> None:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from contextlib import aclosing
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
-from bluesky.protocols import HasHints, Hints, Location, Reading
+from bluesky.protocols import HasHints, Hints, Location
 from event_model import DataKey
 from numpy.typing import NDArray
-from ophyd_async.core import AsyncLocatable, AsyncReadable, Device, WatchableAsyncStatus, WatcherUpdate
+from ophyd_async.core import AsyncLocatable, AsyncReadable, WatchableAsyncStatus, WatcherUpdate
 
 from trirail.bluesky.flight import Flight
+from trirail.bluesky.monitor import Monitored, Readings
 from trirail.bluesky.mover import Mover
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
@@ -29,7 +31,6 @@ UNNAMED = "stage"
 """Name of a stage that is used without one."""
 T = TypeVar("T", float, NDArray[np.float64])
 Keys = dict[str, DataKey]
-Readings = dict[str, Reading[Any]]
 
 
 class StageLink(NamedTuple):
@@ -41,7 +42,7 @@ class StageLink(NamedTuple):
     mover: Mover
 
 
-class Stage(Device, AsyncReadable, HasHints):
+class Stage(Monitored, AsyncReadable, HasHints):
     """A robot as a device of Bluesky, with the movable axes `x`, `y`, `phi`, and `pose` for all three together.
 
     Lengths are in metres, angles in radians. A reading is of one state, published after every event that this client
@@ -140,6 +141,14 @@ class Stage(Device, AsyncReadable, HasHints):
         }
         return {name: {"value": value, "timestamp": state.time} for name, value in values.items()}
 
+    async def _states(self) -> AsyncGenerator[State]:
+        async with aclosing((await self.link()).robot.states()) as states:
+            async for state in states:
+                yield state
+
+    def _readings(self, state: State) -> Readings:
+        return self.readings(state)
+
     def _key(self, shown: DrawnRobot, axis: int) -> DataKey:
         limits, name = shown.limits, COORDINATES[axis]
         low, high = getattr(limits.platform, name)
@@ -160,7 +169,7 @@ class Stage(Device, AsyncReadable, HasHints):
         return StageLink(loop, robot, shown, Mover(robot))
 
 
-class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
+class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
     """Axes of a stage that one value sets."""
 
     def __init__(self, coordinate: str) -> None:
@@ -193,7 +202,7 @@ class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
 
     async def read(self) -> Readings:
         """Return the measured value of the next state."""
-        return {self.name: (await self._stage.read())[self.name]}
+        return self._own(await self._stage.read())
 
     async def locate(self) -> Location[T]:
         """Return the target of the goal under way, or the commanded value at rest, and the measured value."""
@@ -224,6 +233,15 @@ class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
     async def stop(self, success: bool = True) -> None:
         """Stop the goal of the stage's axes; return when the robot is at rest."""
         await self._stage.stop(success)
+
+    def _states(self) -> AsyncGenerator[State]:
+        return self._stage._states()
+
+    def _readings(self, state: State) -> Readings:
+        return self._own(self._stage.readings(state))
+
+    def _own(self, readings: Readings) -> Readings:
+        return {self.name: readings[self.name]}
 
     def _targets(self, value: T) -> dict[int, float]:
         raise NotImplementedError
