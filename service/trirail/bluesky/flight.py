@@ -55,7 +55,9 @@ class Flight(Device, Flyable, EventCollectable):
         self._first = first
         self._goal: AsyncGoalHandle | None = None
         self._sampling: asyncio.Task[None] | None = None
-        self._samples: list[dict[str, Reading[Any]]] = []
+        self._samples: list[tuple[str, dict[str, Reading[Any]]]] = []
+        """Readings, each with the id of the goal under way: states can arrive before the acceptance of the path."""
+        self._sending = asyncio.Lock()
         self._interrupted = self._stopped = False
         super().__init__(name)
 
@@ -73,17 +75,20 @@ class Flight(Device, Flyable, EventCollectable):
         link = await self._stage.link()
         self._goal, self._samples = None, []
         self._interrupted = self._stopped = False
+        self._sending = asyncio.Lock()  # of this event loop
         if self._first is not None:
             await link.mover.start(self._first).end
-        if self._stopped:  # mypy cannot know that stop() runs meanwhile
-            raise TrirailError("stopped before its goal was sent")
-        if not self._has_marks:
-            self._sampling = asyncio.create_task(self._sample(link.robot))
-        try:
-            self._goal = await self._send(link.robot)
-        except BaseException:
-            self._end_sampling()
-            raise
+        async with self._sending:
+            if self._stopped:  # mypy cannot know that stop() runs meanwhile
+                raise TrirailError("stopped before its goal was sent")
+            if not self._has_marks:
+                self._sampling = asyncio.create_task(self._sample(link.robot))
+                self._sampling.add_done_callback(lambda task: task.cancelled() or task.exception())
+            try:
+                self._goal = await self._send(link.robot)
+            except BaseException:
+                self._end_sampling()
+                raise
 
     @AsyncStatus.wrap
     async def complete(self) -> None:
@@ -102,9 +107,11 @@ class Flight(Device, Flyable, EventCollectable):
         """Stop the path; return when the robot is at rest."""
         self._stopped = True
         await (await self._stage.link()).mover.stop(success)
-        if self._goal is not None and self._goal.result is None:
+        async with self._sending:  # a goal that is being sent is first accepted
+            goal = self._goal
+        if goal is not None and goal.result is None:
             self._interrupted |= success
-            await cancel(self._goal)
+            await cancel(goal)
 
     async def describe_collect(self) -> dict[str, dict[str, DataKey]]:
         """Return the columns of the collected data, in a stream of the flight's name."""
@@ -115,7 +122,9 @@ class Flight(Device, Flyable, EventCollectable):
 
     async def collect(self) -> AsyncIterator[PartialEvent]:
         """Yield a row per switch on the path; without marks, one per state."""
-        rows = self._switches() if self._has_marks else self._samples
+        goal_id = self._goal.id if self._goal is not None else ""
+        sampled = [readings for during, readings in self._samples if during == goal_id]
+        rows = self._switches() if self._has_marks else sampled
         for row in rows:
             values = {name: reading["value"] for name, reading in row.items()}
             stamps = {name: reading["timestamp"] for name, reading in row.items()}
@@ -132,8 +141,8 @@ class Flight(Device, Flyable, EventCollectable):
     async def _sample(self, robot: AsyncRobot) -> None:
         async with aclosing(robot.states()) as states:
             async for state in states:
-                if self._goal is not None and state.goal is not None and state.goal.id == self._goal.id:
-                    self._samples.append(self._stage.readings(state))
+                if state.goal is not None:
+                    self._samples.append((state.goal.id, self._stage.readings(state)))
 
     def _end_sampling(self) -> None:
         if self._sampling is not None:

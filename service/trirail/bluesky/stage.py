@@ -75,7 +75,8 @@ class Stage(Monitored, AsyncReadable, HasHints):
         task = self._linking
         failed = task is not None and task.done() and (task.cancelled() or task.exception() is not None)
         if task is None or task.get_loop() is not loop or failed:
-            task = self._linking = asyncio.create_task(self._connect(loop))
+            over = task is not None and task.done() and not failed and task.get_loop().is_closed()
+            task = self._linking = asyncio.create_task(self._connect(loop, task.result() if task and over else None))
         return await asyncio.shield(task)
 
     async def describe(self) -> Keys:
@@ -163,7 +164,10 @@ class Stage(Monitored, AsyncReadable, HasHints):
             "limits": {"control": {"low": low, "high": high}},
         }
 
-    async def _connect(self, loop: asyncio.AbstractEventLoop) -> StageLink:
+    async def _connect(self, loop: asyncio.AbstractEventLoop, before: StageLink | None) -> StageLink:
+        """Return a connection in the running event loop; close the one before, whose event loop is closed."""
+        if before is not None:
+            await before.robot.close()
         robot = await self._robot._for_running_loop()
         shown = DrawnRobot.from_info(await robot.info())
         return StageLink(loop, robot, shown, Mover(robot))
