@@ -113,7 +113,7 @@ def test_sets_that_wait_are_stopped_before_their_goal_is_sent(success: bool, end
         moves = [mover.start({0: 0.01}), mover.start({0: 0.02})]  # of one axis: two goals
         await mover.stop(success)
         assert [await outcome(move) for move in moves] == ends
-        await asyncio.sleep(0.02)  # longer than sets are gathered
+        await until(lambda: not mover._tasks)
         assert robot.targets == []
 
     run(work)
@@ -126,7 +126,7 @@ def test_a_stop_while_a_goal_is_being_sent_stops_that_and_all_behind_it() -> Non
         await until(lambda: len(robot.targets) == 1)
         second, third = mover.start({0: 0.02}), mover.start({0: 0.03})
         stopping = asyncio.create_task(mover.stop(False))
-        await asyncio.sleep(0.02)
+        await until(second.end.done)
         assert not stopping.done()
         robot.accepts.set()
         await stopping
@@ -259,7 +259,7 @@ def test_a_flight_that_is_stopped_while_its_path_is_sent_does_not_fly() -> None:
         begun = flight.kickoff()
         await until(lambda: len(robot.targets) == 1)
         stopping = asyncio.create_task(flight.stop(success=False))
-        await asyncio.sleep(0.01)
+        await until(lambda: flight._stopped)
         robot.accepts.set()
         await stopping
         assert robot.under_way == []

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from bluesky import plan_stubs as bps
 from bluesky import plans as bp
 from bluesky import preprocessors as bpp
 from bluesky.protocols import Subscribable
-from bluesky.utils import FailedStatus, RunEngineInterrupted
+from bluesky.utils import FailedStatus, RunEngineInterrupted, SigintHandler
 from ophyd_async.core import init_devices
 from trirail import RefusedError, Robot, ServiceError, TrirailError
 from trirail.bluesky import Stage, UnfinishedError
@@ -30,6 +31,7 @@ from trirail.wire.state import State
 from waiting import WITHIN, wait_until
 
 pytestmark = pytest.mark.slow
+GUIDE = Path(__file__).parents[2] / "service/bluesky.md"
 HALF_WINDOW = 1e-4
 """Greatest error of x and y of a pose that is done [m]; that of phi is ten times as large [rad]."""
 Documents = list[tuple[str, dict[str, Any]]]
@@ -160,9 +162,13 @@ def robot_states(robot: Robot, kept: list[State]) -> Iterator[None]:
 
 
 def test_an_axis_that_is_set_later_leaves_the_others_their_targets(stage: Stage, robot: Robot, engine: Any) -> None:
+    async def is_moving() -> None:
+        while (await stage.x.locate())["readback"] < 0.002:
+            pass  # the next state
+
     def plan() -> Any:
         yield from bps.abs_set(stage.x, 0.04, group="later")
-        yield from bps.sleep(0.1)
+        yield from bps.wait_for([is_moving])
         yield from bps.abs_set(stage.y, 0.02, group="later")
         yield from bps.wait("later")
 
@@ -243,16 +249,26 @@ def test_a_paused_plan_stops_the_robot_and_resumes(stage: Stage, robot: Robot, e
     assert robot.state().faults == ()
 
 
-def test_ctrl_c_in_a_move_stops_the_robot(stage: Stage, robot: Robot, engine: Any) -> None:
+def test_ctrl_c_in_a_move_stops_the_robot(
+    stage: Stage, robot: Robot, engine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot.override(10.0)
     begin = newest_event(robot)
 
     def press_twice() -> None:  # the first asks for a pause at the next checkpoint, the second for one now
         os.kill(os.getpid(), signal.SIGINT)
         wait_until(lambda: engine._deferred_pause_requested, "the first Ctrl-C")
-        time.sleep(0.2)  # the engine takes two within 0.1 s as one
+        (handler,) = handlers
+        wait_until(lambda: time.monotonic() - handler._last_sigint_time > 0.1, "the handler takes earlier ones as one")
         os.kill(os.getpid(), signal.SIGINT)
 
+    handlers: list[Any] = []
+
+    def keep_handler(engine: Any) -> Any:
+        handlers.append(SigintHandler(engine))  # type: ignore[no-untyped-call]
+        return handlers[-1]
+
+    monkeypatch.setattr(engine, "context_managers", [keep_handler])
     with when(lambda: robot.state().pose.x > 0.005, press_twice), pytest.raises(RunEngineInterrupted):
         run(engine, bp.scan([stage], stage.x, 0.03, 0.04, 2))
     assert robot.state().mode == "holding"
@@ -282,6 +298,66 @@ def test_what_ends_a_goal_ends_the_plan_with_its_message(
     assert isinstance(caught.value.__cause__, UnfinishedError)
     assert caught.value.__cause__.result.outcome == outcome
     assert words in str(caught.value.__cause__)
+
+
+def step_of_the_guide() -> Any:
+    """Return the step of the guide's scan that a fault pauses."""
+    blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    (block,) = (block for block in blocks if "repeated_step" in block)
+    names: dict[str, Any] = {"bps": bps}
+    exec(block.partition("RE(")[0], names)
+    return names["repeated_step"]
+
+
+def test_a_scan_goes_on_after_a_fault_that_is_cleared(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(20.0)
+    documents: Documents = []
+    xs, begin = np.linspace(0.01, 0.05, 5), newest_event(robot)
+    plan = bp.scan([stage], stage.x, 0.01, 0.05, stage.y, 0.0, 0.02, num=5, per_step=step_of_the_guide())
+    with when(lambda: robot.state().pose.x > 0.025, robot.quick_stop), pytest.raises(RunEngineInterrupted):
+        engine(plan, lambda name, document: documents.append((name, document)))
+    assert engine.state == "paused"
+    state = robot.state()
+    assert (state.mode, len(data(documents))) == ("fault", 2)
+    clear_fault(robot)
+    robot.override(100.0)
+    engine.resume()
+    rows = data(documents)
+    assert [at(row, x, (x - 0.01) / 2.0) for row, x in zip(rows, xs, strict=True)] == [True] * 5
+    assert [document["seq_num"] for name, document in documents if name == "event"] == [1, 2, 3, 4, 5]
+    assert documents[-1][1]["exit_status"] == "success"
+    outcomes = [event.outcome for event in goal_events(robot, begin)]
+    assert (outcomes.count("faulted"), set(outcomes)) == (1, {"done", "faulted"})
+
+
+def test_a_plan_clears_a_fault_itself_and_repeats_the_point(stage: Stage, robot: Robot, engine: Any) -> None:
+    def clearing_step(detectors: Any, step: Any, pos_cache: Any) -> Any:
+        try:
+            yield from bps.one_nd_step(detectors, step, pos_cache)
+        except FailedStatus:
+            pos_cache.update(dict.fromkeys(step))
+            yield from bps.wait_for([lambda: asyncio.to_thread(clear_fault, robot)])
+            robot.override(100.0)
+            yield from bps.one_nd_step(detectors, step, pos_cache)
+
+    robot.override(20.0)
+    with when(lambda: robot.state().pose.x > 0.005, robot.quick_stop):
+        rows = data(run(engine, bp.scan([stage], stage.x, 0.0, 0.02, 3, per_step=cast(Any, clearing_step))))
+    assert [at(row, x) for row, x in zip(rows, (0.0, 0.01, 0.02), strict=True)] == [True] * 3
+
+
+def clear_fault(robot: Robot) -> None:
+    """Reset once the drives are at rest, and enable."""
+
+    def is_reset() -> bool:
+        try:
+            robot.reset()
+        except RefusedError:
+            return False
+        return True
+
+    wait_until(is_reset, "the drives are at rest")
+    robot.enable()
 
 
 def test_the_end_of_a_plan_leaves_goals_of_others_alone(stage: Stage, robot: Robot, engine: Any) -> None:
@@ -418,6 +494,27 @@ def test_a_stage_is_named_after_its_variable_or_stage(stage: Stage, robot: Robot
     with init_devices():
         table = Stage(robot)
     assert {"table-x", "table-pose", "table-t"} < set(data(run(engine, bp.count([table])))[0])
+
+
+def test_a_stage_is_used_in_one_event_loop_after_another(stage: Stage, robot: Robot, engine: Any) -> None:
+    other = Stage(robot, "other")
+    links = []
+
+    async def use(x: float) -> None:
+        link, again = await asyncio.gather(other.link(), other.link())
+        assert link is again
+        links.append(link)
+        await other.x.set(x)
+        assert (await other.read())["other-x"]["value"] == pytest.approx(x, abs=HALF_WINDOW)
+
+    for x in (0.01, 0.02):
+        asyncio.run(use(x))
+    rows = data(run(engine, scans([other], other.x, [0.0])))
+    assert [round(row["other-x"], 3) for row in rows] == [0.0]
+    first, second = links
+    for link in (first, second):  # nothing is received for an event loop that is closed
+        with pytest.raises(ServiceError):
+            asyncio.run(link.robot.state())
 
 
 def with_outputs(config: Path) -> None:
