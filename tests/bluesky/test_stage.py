@@ -563,10 +563,15 @@ def test_a_service_that_is_killed_ends_the_plan_and_the_next_one_works(
                 with pytest.raises((FailedStatus, TrirailError)):
                     run(engine, bps.mv(stage.x, 0.03))
                 first.wait(WITHIN)
+                text = config.read_text(encoding="utf-8")
+                changed = re.sub(r"^x = \[.*?\]", "x = [-0.12, 0.12]", text, count=1, flags=re.MULTILINE)
+                config.write_text(changed, encoding="utf-8")
                 second = own_service.start(config, log)
                 try:
                     robot.enable()
-                    run(engine, bps.mv(stage.x, 0.03))
+                    documents = run(engine, scans([stage], stage.x, [0.02, 0.03]))
+                    keys = next(document["data_keys"] for name, document in documents if name == "descriptor")
+                    assert keys["stage-x"]["limits"] == {"control": {"low": -0.12, "high": 0.12}}
                     assert robot.state().pose.x == pytest.approx(0.03, abs=HALF_WINDOW)
                 finally:
                     own_service.end(second)

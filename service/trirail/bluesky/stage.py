@@ -80,8 +80,11 @@ class Stage(Monitored, AsyncReadable, HasHints):
         return await asyncio.shield(task)
 
     async def describe(self) -> Keys:
-        """Return units, limits and precision of every reading."""
-        shown = (await self.link()).shown
+        """Return units, limits and precision of every reading, as the service has them now."""
+        return self._keys(DrawnRobot.from_info(await (await self.link()).robot.info()))
+
+    def _keys(self, shown: DrawnRobot) -> Keys:
+        """Return units, limits and precision of every reading of a robot."""
         keys = [self._key(shown, axis) for axis in range(3)]
         source = keys[0]["source"]
         vector = DataKey(source=source, dtype="array", dtype_numpy="<f8", shape=[3], units="m")
@@ -211,8 +214,7 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
     async def locate(self) -> Location[T]:
         """Return the target of the goal under way, or the commanded value at rest, and the measured value."""
         state = await (await self._stage.link()).robot.state()
-        target = state.goal.target if state.goal is not None else None
-        return Location(setpoint=self._value(target or state.commanded.pose), readback=self._value(state.pose))
+        return Location(setpoint=self._value(_setpoint(state)), readback=self._value(state.pose))
 
     @WatchableAsyncStatus.wrap
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:
@@ -222,11 +224,11 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         milliseconds are one straight move.
         """
         targets = self._targets(value)
-        mover = (await self._stage.link()).mover
-        move = mover.start(targets)
+        link = await self._stage.link()
+        move = link.mover.start(targets)
         initial: T | None = None
-        key = (await self.describe())[self.name]
-        async for pose in mover.progress(move):
+        key = self._stage._keys(link.shown)[self.name]
+        async for pose in link.mover.progress(move):
             current = self._value(pose)
             initial = current if initial is None else initial
             yield WatcherUpdate(
@@ -262,8 +264,8 @@ class MovableAxis(_Movable[float]):
         super().__init__(COORDINATES[index])
 
     async def check_value(self, value: float) -> None:
-        """Check the path to a value with the other coordinates as they are; see Stage.check."""
-        pose = list((await (await self._stage.link()).robot.state()).commanded.pose)
+        """Check the path to a value with the other coordinates as they are commanded; see Stage.check."""
+        pose = list(_setpoint(await (await self._stage.link()).robot.state()))
         pose[self._index] = float(value)
         await self._stage.check(pose)
 
@@ -290,3 +292,9 @@ class MovablePose(_Movable[NDArray[np.float64]]):
 
     def _value(self, pose: Pose) -> NDArray[np.float64]:
         return np.array(pose)
+
+
+def _setpoint(state: State) -> Pose:
+    """Return the target of the goal under way; without one the commanded pose."""
+    target = state.goal.target if state.goal is not None else None
+    return target or state.commanded.pose
