@@ -389,6 +389,58 @@ def test_a_fly_scan_collects_every_state_on_the_way(stage: Stage, engine: Any) -
     assert max(found["stage-y"]) == pytest.approx(0.01, abs=1e-3)
 
 
+def outcome_of(robot: Robot, begin: int) -> str | None:
+    """Wait until the robot is at rest; return the outcome of its last goal after an event."""
+    wait_until(
+        lambda: robot.state().mode != "moving" and bool(goal_events(robot, begin)), "the end of the flight", 0.01
+    )
+    return goal_events(robot, begin)[-1].outcome
+
+
+def test_an_error_in_a_plan_stops_its_flight(stage: Stage, robot: Robot, engine: Any) -> None:
+    flight = stage.fly_to(0.05, 0.0, 0.0)
+
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.kickoff(flight, wait=True)
+        raise ValueError("another device has failed")
+
+    robot.override(10.0)
+    begin = newest_event(robot)
+    with pytest.raises(ValueError, match="another device"):
+        run(engine, plan())
+    assert outcome_of(robot, begin) == "stopped"
+
+
+def test_a_pause_stops_a_flight_and_resume_repeats_it(stage: Stage, robot: Robot, engine: Any) -> None:
+    points = [(0.0, 0.01, 0.0, 0.0), (0.5, 0.02, 0.01, 0.05), (1.0, 0.03, 0.0, 0.0)]
+    robot.override(20.0)
+    begin = newest_event(robot)
+    documents: Documents = []
+    with when(lambda: robot.state().pose.x > 0.015, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        engine(bp.fly([stage.follow(points)]), lambda name, document: documents.append((name, document)))
+    assert (engine.state, robot.state().mode) == ("paused", "holding")
+    assert 0.01 < robot.state().commanded.pose.x < 0.03
+    robot.override(100.0)
+    engine.resume()
+    assert [event.outcome for event in goal_events(robot, begin)] == ["done", "stopped", "done", "done"]
+    found = pages(documents)
+    assert (found["stage-x"][0], found["stage-x"][-1]) == pytest.approx((0.01, 0.03), abs=1e-3)
+    assert np.all(np.diff(found["stage-t"]) > 0.0)
+    assert max(np.diff(found["stage-t"])) < 1.0  # of one flight
+    assert documents[-1][1]["exit_status"] == "success"
+
+
+def test_an_abort_of_a_paused_flight_leaves_the_robot_at_rest(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(10.0)
+    begin = newest_event(robot)
+    with when(lambda: robot.state().pose.x > 0.005, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        run(engine, bp.fly([stage.fly_to(0.05, 0.0, 0.0)]))
+    engine.abort()
+    assert outcome_of(robot, begin) == "stopped"
+    assert robot.state().commanded.pose.x < 0.05
+
+
 def test_a_reading_has_the_time_of_its_state(stage: Stage, robot: Robot, engine: Any) -> None:
     states: list[State] = []
     with robot_states(robot, states):
