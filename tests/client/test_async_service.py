@@ -100,8 +100,9 @@ def test_a_check_is_answered_as_the_goal_and_moves_nothing(locator: str) -> None
         points = tuple(TrajectoryPoint(t, 0.01 * t, 0.0, 0.0) for t in (0.0, 1.0))
         assert (await robot.check(TrajectoryGoal(points))).duration == pytest.approx(1.0, abs=0.01)
         await robot.override(10.0)
-        moving, *beside = await asyncio.gather(robot.send(goal), *(robot.check(goal) for _ in range(5)))
-        assert {reply.accepted for reply in beside} == {True}
+        checks = [asyncio.create_task(robot.check(goal)) for _ in range(5)]
+        moving = await robot.send(goal)
+        assert {(await check).accepted for check in checks} == {True}
         assert replies[0].duration is not None
         assert moving.duration == pytest.approx(10.0 * replies[0].duration, rel=0.01)
         assert (await robot.check(MoveGoal(0.001, 0.0, 0.0))).duration is not None
