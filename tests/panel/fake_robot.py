@@ -278,6 +278,7 @@ class FakeRobot:
         return State(
             seq=seq,
             t=seq / 1e3,
+            time=1.7e9 + seq / 1e3,
             mode=self.mode,
             pose=Pose(x, y, phi),
             velocity=self.velocity,

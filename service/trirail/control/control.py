@@ -22,6 +22,7 @@ from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger
 from trirail.control.modes import ModeEvent, ModeState
 from trirail.control.outputs import Outputs
+from trirail.control.path_checks import PathChecks
 from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.returning_drives import ReturningDrives
 from trirail.control.setpoints import Setpoints
@@ -37,6 +38,7 @@ from trirail.wire.marks import StopAt
 from trirail.wire.messages import FaultDetail, Notice, Outcome
 from trirail.wire.packets import (
     Announcement,
+    CheckRequest,
     CommandRequest,
     Disturbance,
     GoalRequest,
@@ -87,6 +89,7 @@ class Control:
         self.goal_queue = GoalQueue(
             self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period, self.outputs
         )
+        self._checks = PathChecks(config, planner, self._planner, self.schedule, self.ledger, frames, self.outputs)
         legs, step_length = robot.packed(), config.limits.slider.fastest * config.period
         self._following_error_limit = config.limits.slider.following_error
         taken = reserve_for_backlash(config.correction.backlash, config.limits.slider)
@@ -130,7 +133,7 @@ class Control:
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
-        if stopped_now or self.ledger.busy or mode in (Mode.ENABLING, Mode.HOMING):
+        if stopped_now or self.ledger.busy or self._checks.due or mode in (Mode.ENABLING, Mode.HOMING):
             return None
         if self.outputs.any:
             self.outputs.follow_mode(mode)
@@ -353,7 +356,8 @@ class Control:
     def decide(self, given: Iterable[Given]) -> None:
         """Decide what the next cycle executes.
 
-        `handle` the input, end a lease or a jog that is not renewed, and begin a planned motion that is due.
+        `handle` the input, end a lease or a jog that is not renewed, begin a planned motion that is due, and ask for a
+        check.
         """
         try:
             for what, now_ns in given:
@@ -369,6 +373,7 @@ class Control:
                 words = f"goal {beginning.id} of {beginning.user}"
                 begun = coded(words, EventCode.GOAL_STARTED, goal=beginning.id, user=beginning.user)
                 self.modes.go(ModeEvent.GOAL, begun, beginning)
+            self._checks.think(self._place_of_check)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
@@ -378,14 +383,20 @@ class Control:
             match what:
                 case Disturbance():
                     self.modes.happen(ModeEvent[what.event], what.text)
+                    if what.event == ModeEvent.GATEWAY_LOST.name:
+                        self._checks.withdraw(what.reason)
+                case CheckRequest():
+                    self._checks.enqueue(what)
                 case GoalRequest() | CommandRequest():
                     self._answer(what, now_ns)
                 case Announcement(notice):
                     self.ledger.notices.append(notice)
                 case PlannerLost():
                     self._planner.lose(what.reason)
+                    self._checks.lose(what.reason)
                 case answer:
                     self._planner.hear(answer)
+                    self._checks.receive(answer)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
@@ -427,9 +438,12 @@ class Control:
     def _admit(self) -> bool:
         """Whether the robot is moving to a goal. Raises RefusedError where it accepts none."""
         self.modes.check(ModeEvent.GOAL)
+        self._check_homed()
+        return self.state.mode is Mode.MOVING
+
+    def _check_homed(self) -> None:
         if not self.measured.homed:
             raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
-        return self.state.mode is Mode.MOVING
 
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
         """Return the pose from which a move begins: the end of the goals before it, or the measured pose.
@@ -444,6 +458,16 @@ class Control:
                 "a goal waits half-way, and a move would count from its end: send stop first, or resume it, or move "
                 "from where the robot is measured to be",
             )
+        return self._end_pose
+
+    def _place_of_check(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
+        """Return the pose from which a check plans: as `_place`, but of a goal that waits half-way the end."""
+        self._check_homed()
+        return self.measured.pose if origin == "measured" else self._end_pose
+
+    @property
+    def _end_pose(self) -> Sequence[float]:
+        """Pose at the end of the goals under way; the commanded one without such an end."""
         last, goal = self.schedule.last, self.ledger.goal
         if last is None or goal is None or goal.kind.renewed:
             return self.commanded.pose

@@ -100,6 +100,11 @@ class PlanRequests:
         return self._goal is not None
 
     @property
+    def requests(self) -> int:
+        """Number of requests sent to the planner."""
+        return self._number
+
+    @property
     def awaits_answer(self) -> bool:
         """Whether the planner has been asked for a goal and has not answered."""
         return self._goal is not None and self._asked is not None and self._answer is None

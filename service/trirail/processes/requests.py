@@ -1,6 +1,7 @@
-"""Requests of clients to the loop: goals in turn, commands immediately, each answered exactly once; alignment reports.
+"""Requests of clients to the loop, each answered exactly once; alignment reports.
 
-A command that stops the robot is carried out even if it cannot be read.
+Goals are sent in turn, commands and checks immediately. A command that stops the robot is carried out even if it cannot
+be read.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies
 from trirail.processes.session_guard import Guard
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, LoopGoal
 from trirail.wire.links import PacketLink
 from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, alignment_event_text, in_words
 from trirail.wire.messages import CommandReply, ErrorReply, Level, Notice
-from trirail.wire.packets import CommandRequest, GoalRequest, message
+from trirail.wire.packets import CheckRequest, CommandRequest, GoalRequest, message
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
@@ -39,7 +40,7 @@ robot is stopped do not begin any more."""
 AHEAD_OF_ALL = 16
 """Goals of all users that the loop has at a time: as many as it takes in four cycles."""
 UNDER_WAY = 8
-"""Commands of one user that the loop has at a time; more are refused, except those that stop the robot."""
+"""Commands and checks of one user that the loop has at a time; more are refused, except those that stop the robot."""
 UNDER_WAY_OF_ALL = 64
 """The same for all users."""
 REPLY_WITHIN = 15.0
@@ -79,7 +80,7 @@ class Requests:
         self._ahead: dict[int, str] = {}
         """Users of the goals that the loop has, by ticket."""
         self._commands: dict[int, str] = {}
-        """Users of the commands that the loop has, by ticket."""
+        """Users of the commands and checks that the loop has, by ticket."""
         self._waiting: dict[int, _Waiting] = {}
         self._tickets = 0
 
@@ -129,21 +130,29 @@ class Requests:
         self._tickets += 1
         request = CommandRequest(self._tickets, user, name, content)
         with self._hurrying() if name.stops else nullcontext():
-            sent = self._link.send(message(request))
-        if not sent:
-            raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
-        self._commands[request.ticket] = user
-        within = self._home_within if name is Command.HOME else REPLY_WITHIN
-        self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + within)
+            self._send(incoming, request, self._home_within if name is Command.HOME else REPLY_WITHIN)
         return request.ticket
 
+    def check(self, incoming: Incoming, user: str, goal: LoopGoal) -> None:
+        """Have a goal planned without moving to it. Raises RefusedError if too many requests are under way."""
+        self._check_under_way(user)
+        self._tickets += 1
+        self._send(incoming, CheckRequest(self._tickets, user, goal), REPLY_WITHIN)
+
+    def _send(self, incoming: Incoming, request: CommandRequest | CheckRequest, within: float) -> None:
+        """Send the loop a request, to be answered within a time [s]. Raises RefusedError if it takes no more."""
+        if not self._link.send(message(request)):
+            raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
+        self._commands[request.ticket] = request.user
+        self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + within)
+
     def _check_under_way(self, user: str) -> None:
-        """Raise RefusedError if the loop has the most commands that it may have, of a user or of all."""
-        own = sum(sender == user for sender in self._commands.values())
+        """Raise RefusedError if the loop has the most commands and checks that it may have, of a user or of all."""
+        own, all_ = sum(sender == user for sender in self._commands.values()), len(self._commands)
         if own >= UNDER_WAY:
             raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
-        if len(self._commands) >= UNDER_WAY_OF_ALL:
-            raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
+        if all_ >= UNDER_WAY_OF_ALL:
+            raise RefusedError(RefusalCode.BUSY, f"{all_} commands are under way already: send fewer")
 
     # ------------------------------------------------------------------ answers
 

@@ -25,10 +25,10 @@ REMEMBERED_IDS = 10_000
 
 
 class GoalReply(Struct, frozen=True):
-    """Acceptance of a goal, which ends with exactly one event."""
+    """Acceptance of a goal, which ends with exactly one event; or of a check, which moves nothing and has no event."""
 
     id: str
-    """Id of the goal, from the client or generated."""
+    """Id of the goal, from the client or generated; of a check that of its goal, empty if absent."""
     duration: float | None
     """Expected time from now to the end of the path [s]. None if the end is unknown: at override zero, and for a target
     that a newer one has replaced. The goal is done when the robot has then been in position for the dwell of

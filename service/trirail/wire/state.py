@@ -131,6 +131,8 @@ class State(Struct, frozen=True):
     """Cycle of its record."""
     t: float
     """Nominal time since the loop's start [s]; the same as in records and events."""
+    time: float
+    """Wall clock when its cycle was due [s since 1970]."""
     mode: str
     """A trirail.wire.vocabulary.Mode."""
     pose: Pose
