@@ -148,7 +148,7 @@ def _timed(
         due += int(period * 1e9)
         sleep(due, moment)
         began = now_ns(moment)
-        logged = switch(outputs, planned, words, log, 0, knots, pieces, True, cycle * period, period, cycle, record)
+        logged = switch(outputs, planned, words, log, 0, knots, pieces, True, cycle * period, period, cycle, 0, record)
         durations[cycle] = now_ns(moment) - began
         switched += logged
     return switched

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -101,6 +102,9 @@ def test_a_goal_tells_its_switches_and_they_are_in_the_recording(
     words = dict(zip(recorded.records["cycle"].tolist(), recorded.records["outputs"][:, 0].tolist(), strict=True))
     for on in pulses[::2]:
         assert (words[on.cycle - 1] >> 16 & 1, words[on.cycle] >> 16 & 1) == (0, 1)
+    due = dict(zip(recorded.records["cycle"].tolist(), recorded.records["deadline_ns"].tolist(), strict=True))
+    offsets = [each.time - due[each.cycle] * 1e-9 for each in result.marks]  # of the wall clock, in missed ticks too
+    assert offsets == pytest.approx([time.time() - time.monotonic()] * len(offsets), abs=1e-3)
     compared = replay_session(recorded, load(service.folder / "robot.toml"), simulated=False)
     assert (compared.differing, compared.plans_differing) == (0, 0)
     path = tmp_path / "switches.npy"

@@ -161,9 +161,12 @@ class Notice(Struct, frozen=True, omit_defaults=True):
     planned: tuple[PlacedMark, ...] = ()
     """Marks of an accepted goal, with kind output, and the places at which they will switch first."""
 
-    def event(self, seq: int, t: float, cycle: int, time: float) -> Event:
-        """Return the event with its number and time."""
-        marks = tuple(structs.replace(switch, time=time - (t - switch.t)) for switch in self.marks)
+    def event(self, seq: int, t: float, cycle: int, time: float, offset: float = 0.0) -> Event:
+        """Return the event with its number and time; `offset` is the wall clock less the monotonic one [s]."""
+        marks = tuple(
+            structs.replace(each, time=time - (t - each.t) if math.isnan(each.time) else each.time + offset)
+            for each in self.marks
+        )
         return Event(**structs.asdict(structs.replace(self, marks=marks)), seq=seq, t=t, cycle=cycle, time=time)
 
 
