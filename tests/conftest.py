@@ -34,7 +34,7 @@ from trirail_drivers.simulated import SimulatedDrive
 _STATE = tempfile.TemporaryDirectory(prefix="trirail-tests-")
 os.environ["STATE_DIRECTORY"] = _STATE.name  # the poses that somebody has taught on this machine are no test's
 
-pytest_plugins = ["generated", "parsed_eds", "warm"]
+pytest_plugins = ["caused_messages", "generated", "parsed_eds", "warm"]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have it for what runs in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
