@@ -205,7 +205,7 @@ def test_the_gateway_takes_any_message(
     gateway: tuple[Gateway, FakeLink], kind: str, key: str, payload: bytes, encoding: str
 ) -> None:
     served, link = gateway
-    served._refusals._told_since = -math.inf
+    served._refusals._announced_since = -math.inf
     link.sent.clear()
     served._handle(Incoming(kind, key, len(payload), payload, encoding, None, time.monotonic_ns()))
     for packet in link.sent:
@@ -220,7 +220,7 @@ def test_the_gateway_takes_any_message(
 @given(packet=st.binary(min_size=1, max_size=300) | st.builds(bytes.__add__, st.sampled_from((b"\1", b"\2")), payloads))
 def test_the_gateway_outlives_any_packet(gateway: tuple[Gateway, FakeLink], packet: bytes) -> None:
     served, _ = gateway
-    served._hear(packet, lambda: None)
+    served._handle_packet(packet, lambda: None)
 
 
 # ---------------------------------------------------------------------- what goes between the processes

@@ -14,7 +14,7 @@ from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import Loop
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
 from trirail.processes.reports import BATCHES_PER_SECOND
-from trirail.processes.requests import AHEAD_OF_ALL, UNDER_WAY_OF_ALL
+from trirail.processes.requests import MAX_COMMANDS, MAX_GOALS
 from trirail.wire import links
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal
@@ -162,7 +162,7 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: b
         beating(shell, 50)
     drives = Followers(shell.loop.control.measured.feedback)
     shell.loop._drives = shell.loop.control._drives = cast(DriveGroup, drives)
-    heart, tick = shell.heartbeats.of("gateway"), Tick(round(shell.rig.now * 1e9), 0, 0)
+    heart, tick = shell.heartbeats.heart("gateway"), Tick(round(shell.rig.now * 1e9), 0, 0)
 
     def cycle() -> None:
         heart.beat()
@@ -208,7 +208,7 @@ def test_a_lost_gateway_is_noticed(shell: Shell) -> None:
 def beating(shell: Shell, cycles: int) -> None:
     """Cycles of a loop whose gateway gives its signs of life."""
     for _ in range(cycles // 50):
-        shell.heartbeats.of("gateway").beat()
+        shell.heartbeats.heart("gateway").beat()
         shell.cycles(50)
 
 
@@ -251,7 +251,7 @@ def test_what_a_frozen_gateway_has_left_dies_with_it(shell: Shell, tmp_path: Pat
     shell.cycles(300)
     shell.send(2, "g-1", PoseGoal(0.01, 0.0, 0.0))
     shell.gateway.close()
-    shell.heartbeats.of("gateway").rest()
+    shell.heartbeats.heart("gateway").rest()
     shell.cycles(30)
     shell.gateway = links.connect(tmp_path / "gateway")
     shell.cycles(300)  # the next one takes its time to serve
@@ -299,11 +299,11 @@ def test_a_machine_that_stands_still_is_no_frozen_gateway(shell: Shell) -> None:
 
 
 def test_the_loop_gives_signs_of_life_while_it_turns(shell: Shell) -> None:
-    watch = Watch(shell.heartbeats.of("loop"), 2)
+    watch = Watch(shell.heartbeats.heart("loop"), 2)
     for _ in range(20):
         shell.cycles(20)
         assert not watch.silent()
-        assert watch.heard
+        assert watch.has_beat
     assert [watch.silent() for _ in range(3)] == [False, False, True]
 
 
@@ -312,9 +312,9 @@ def test_it_ends_when_the_robot_has_no_power(shell: Shell) -> None:
     shell.loop.ending = True
     shell.cycles(1)
     assert shell.loop.control.state.mode is Mode.DISABLED
-    assert not shell.loop._over()  # the drives have not said so yet
+    assert not shell.loop._has_ended()  # the drives have not said so yet
     shell.cycles(5)
-    assert shell.loop._over()
+    assert shell.loop._has_ended()
 
 
 def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) -> None:
@@ -343,7 +343,7 @@ def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     shell.cycles(60)
     full, unreadable = shell.events()[2:]
     assert (full.level, full.message) == ("warning", "the disk is full")
-    assert unreadable.message.startswith("the recorder said something unreadable")
+    assert unreadable.message.startswith("the recorder has sent an invalid packet")
     assert shell.loop.control.state.mode is Mode.HOLDING
 
 
@@ -412,11 +412,11 @@ def test_an_urgent_stop_takes_effect_in_its_cycle_whatever_was_sent_before_it(sh
     shell.send(2, "g-1", PoseGoal(0.08, 0.02, 0.2))
     shell.cycles(100)
     assert shell.mode() is Mode.MOVING
-    for ticket in range(100, 100 + AHEAD_OF_ALL):
+    for ticket in range(100, 100 + MAX_GOALS):
         shell.send(ticket, f"g{ticket}", PoseGoal(-0.08, 0.02, 0.2))
-    for ticket in range(200, 200 + UNDER_WAY_OF_ALL):
+    for ticket in range(200, 200 + MAX_COMMANDS):
         shell.gateway.send(message(CommandRequest(ticket, "eve", Command.OVERRIDE, Override(100.0))))
-    with shell.heartbeats.hurrying():
+    with shell.heartbeats.urgent_section():
         shell.gateway.send(message(CommandRequest(300, "ann", name)))
     shell.cycles(1)
     assert shell.mode() is not Mode.MOVING

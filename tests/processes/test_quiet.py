@@ -126,7 +126,7 @@ class Session:
         while (packet := self.planner.receive()) is not None:
             self.planner.send(encode(self.motion.plan(decode_plan_request(packet))))
         if self.beats:
-            self.hearts.of("gateway").beat()
+            self.hearts.heart("gateway").beat()
         self.now_ns = max(self.now_ns, deadline_ns + self.late_ns)
         self.late_ns = 0
         self.pump()
@@ -163,7 +163,7 @@ class Session:
     def ask(self, request: Request) -> None:
         """Send a request; a stop with haste, as the gateway does."""
         hurries = isinstance(request, CommandRequest) and request.name.stops
-        with self.hearts.hurrying() if hurries else nullcontext():
+        with self.hearts.urgent_section() if hurries else nullcontext():
             self.gateway.send(message(request))
 
     def run(self, script: dict[int, list[Happening]], cycles: int = CYCLES) -> None:

@@ -721,7 +721,7 @@ def test_a_planner_that_is_lost_costs_a_goal_and_no_more(service: Service, harm:
     assert service.end() == 0
     assert_stopped_smoothly(service.frames())
     log = service.log.read_text()
-    assert "the motion under way goes on, new goals are refused; starting it again" in log
+    assert "the motion under way continues, new goals are refused; starting it again" in log
     assert "Traceback" not in log
 
 

@@ -49,7 +49,7 @@ class Asked:
 
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_door, "PLACES", PLACES)
+    monkeypatch.setattr(stop_door, "MAX_CALLERS", PLACES)
 
 
 Opened = tuple[str, Asked]

@@ -1,7 +1,7 @@
-"""Door for stops beside Zenoh's endpoints: a thread that does TLS and framing, and waits for no connection.
+"""Door for stops: a server beside Zenoh's endpoints that accepts only stops, in a thread that never blocks.
 
-Handshakes run beside each other. Each connection has a share: by its address until its user is known, by the user's
-name from then on; beyond the share its oldest connection is closed, so that a new one is served whatever others hold.
+Handshakes run concurrently. Each source has a share of the connections: an address until the user is known, the user
+from then on. Beyond the share its oldest connection is closed, so that a flood from one source keeps no other out.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answer_with
 from trirail.wire.text import quoted
 
-PLACES: Final = 4096
-"""Most connections, or a quarter of the process's descriptors if that is less; they are reserved for them."""
-ASKED_WITHIN: Final = 10.0
-"""Longest time to send a request [s]: the shorter it is, the more connections an idle holder has to open."""
-ANSWERED_WITHIN: Final = 20.0
+MAX_CALLERS: Final = 4096
+"""Most connections, or a quarter of the process's descriptors if that is less; the descriptors are reserved."""
+REQUEST_TIMEOUT_S: Final = 10.0
+"""Longest time until a connection has sent its request [s]; a shorter one makes idle floods more expensive."""
+ANSWER_TIMEOUT_S: Final = 20.0
 """Longest wait for the answer, which comes within 15 s [s]."""
-TURN: Final = 0.25
-"""Interval of the checks for connections whose time is over [s]."""
-AT_ONCE: Final = 64
-"""Connections accepted before the existing ones continue."""
+CHECK_PERIOD_S: Final = 0.25
+"""Interval between two checks for connections that have timed out [s]."""
+ACCEPTED_PER_TURN: Final = 64
+"""Most connections accepted before the existing ones are served."""
 
-IN_TURN: Final = 16
-"""Connections that continue before new ones are accepted: a step of a handshake takes a millisecond."""
+SERVED_PER_TURN: Final = 16
+"""Most connections served before new ones are accepted: a step of a handshake takes a millisecond."""
 
 Answer = Callable[[CommandReply | ErrorReply], None]
 """Receiver of the answer to a request, from any thread."""
-Take = Callable[[str, StopRequest, Answer], None]
-"""Receiver of a request, with the name in its sender's certificate, "" without certificates."""
+RequestHandler = Callable[[str, StopRequest, Answer], None]
+"""Receiver of a request, with the name in the sender's certificate; "" without certificates."""
 
 
 class _Stage(Enum):
@@ -57,12 +57,12 @@ class _Stage(Enum):
 
 
 _SHARES: Final = {_Stage.SILENT: 1 / 2, _Stage.TALKING: 1 / 8, _Stage.KNOWN: 1 / 8, _Stage.WAITING: 1 / 64}
-"""Shares of the places: connections of one address that are silent or in a handshake; of one user, before the request
+"""Share of all connections per source: of one address while silent and in a handshake, of one user before the request
 and after it."""
 
 
 class _Caller:
-    """A connection."""
+    """Connection of a client."""
 
     def __init__(self, connection: socket.socket, source: str, now: float) -> None:
         self.connection = connection
@@ -70,41 +70,41 @@ class _Caller:
         self.stage, self.share = _Stage.SILENT, source
         self.since = now
         self.user = ""
-        self.heard = b""
-        self.shakes_hands = False
+        self.received = b""
+        self.in_handshake = False
 
 
 class StopDoor:
-    """Server for stops at addresses, from `start` until it is closed."""
+    """Server for stops; `start` begins to serve, `close` ends."""
 
-    def __init__(self, secured: ssl.SSLContext | None, take: Take) -> None:
+    def __init__(self, secured: ssl.SSLContext | None, handle_request: RequestHandler) -> None:
         self._secured = secured
-        self._take = take
+        self._handle_request = handle_request
         self._callers: dict[int, _Caller] = {}  # by descriptor
-        self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # those first that are longest in it
+        self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # the longest in its stage first
         self._answers: deque[tuple[_Caller, bytes]] = deque()
         self._closing = False
-        self._next_look = 0.0
+        self._next_check = 0.0
         self._selector = selectors.DefaultSelector()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._selector.register(self._wake, selectors.EVENT_READ, self._woken)
+        self._selector.register(self._wake, selectors.EVENT_READ, self._clear_wake)
         self._listening: list[socket.socket] = []
-        self._places = min(PLACES, descriptor_limit() // 4)
-        self._reserve = Reserve(self._places)
+        self._max_callers = min(MAX_CALLERS, descriptor_limit() // 4)
+        self._reserve = Reserve(self._max_callers)
         self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
 
     def listen(self, address: StopAddress) -> None:
-        """Listen at an address, before the start. Raises OSError if that is impossible."""
+        """Listen at an address, before `start`. Raises OSError on failure."""
         for listening in listen(address):
             self._listening.append(listening)
             self._selector.register(listening, selectors.EVENT_READ, partial(self._accept, listening))
 
     def start(self) -> None:
-        """Begin to take requests."""
+        """Begin to serve."""
         self._thread.start()
 
     def close(self) -> None:
-        """End; requests without an answer get none here."""
+        """Stop serving; requests not answered yet get no answer."""
         self._closing = True
         os.eventfd_write(self._wake, 1)
         self._thread.join()
@@ -116,28 +116,28 @@ class StopDoor:
 
     def _run(self) -> None:
         while not self._closing:
-            ready = [key.data for key, _ in self._selector.select(TURN if self._callers else None)]
+            ready = [key.data for key, _ in self._selector.select(CHECK_PERIOD_S if self._callers else None)]
             for woken in ready:
                 if not isinstance(woken, _Caller):
                     woken()
             callers = [each for each in ready if isinstance(each, _Caller)]
-            # Of hundreds of handshakes first those nearest to their end, and of these the newest.
+            # Serve handshakes nearest to their end first, and of these the newest, so that some finish under a flood.
             callers.sort(key=lambda caller: (caller.stage.value, caller.since), reverse=True)
-            for caller in callers[:IN_TURN]:
-                self._go_on(caller)
+            for caller in callers[:SERVED_PER_TURN]:
+                self._serve(caller)
             self._send_answers()
             self._drop_late()
         for caller in list(self._callers.values()):
             self._drop(caller)
 
-    def _woken(self) -> None:
+    def _clear_wake(self) -> None:
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._wake)
 
     # ------------------------------------------------------------------ accept and drop
 
     def _accept(self, listening: socket.socket) -> None:
-        for _ in range(AT_ONCE):
+        for _ in range(ACCEPTED_PER_TURN):
             if not self._reserve and self._callers:
                 self._drop(next(iter(self._callers.values())))
             if self._reserve:
@@ -146,14 +146,14 @@ class StopDoor:
                 connected, address = listening.accept()
             except BlockingIOError:
                 break
-            except OSError:  # another thread took the descriptor where they are short, or the caller has gone
+            except OSError:  # another thread has used the free descriptor, or the caller has disconnected
                 continue
             connected.setblocking(False)
             caller = _Caller(connected, source(connected, address), time.monotonic())
             self._callers[caller.number] = caller
             self._shares.setdefault((caller.stage, caller.share), {})[caller] = None
             self._selector.register(caller.number, selectors.EVENT_READ, caller)
-            self._go_on(caller)  # its request is often there already
+            self._serve(caller)  # its request has often arrived already
             self._keep_to_share(caller)
         self._reserve.refill(len(self._callers))
 
@@ -171,11 +171,11 @@ class StopDoor:
 
     def _keep_to_share(self, caller: _Caller) -> None:
         share = self._shares.get((caller.stage, caller.share), {})
-        if len(share) > self._places * _SHARES[caller.stage]:
+        if len(share) > self._max_callers * _SHARES[caller.stage]:
             self._drop(next(iter(share)))
 
     def _drop(self, caller: _Caller) -> None:
-        """Close a connection, unless that has been done."""
+        """Close a connection, unless it is closed already."""
         if self._callers.get(caller.number) is not caller:
             return
         del self._callers[caller.number]
@@ -186,28 +186,28 @@ class StopDoor:
 
     def _drop_late(self) -> None:
         now = time.monotonic()
-        if now < self._next_look:
+        if now < self._next_check:
             return
-        self._next_look = now + TURN
+        self._next_check = now + CHECK_PERIOD_S
         for caller in list(self._callers.values()):
-            within = ANSWERED_WITHIN if caller.stage is _Stage.WAITING else ASKED_WITHIN
+            within = ANSWER_TIMEOUT_S if caller.stage is _Stage.WAITING else REQUEST_TIMEOUT_S
             if now - caller.since > within:
                 self._drop(caller)
 
     # ------------------------------------------------------------------ read and answer
 
-    def _go_on(self, caller: _Caller) -> None:
+    def _serve(self, caller: _Caller) -> None:
         if self._callers.get(caller.number) is not caller:
             return
         try:
             self._listen_to(caller)
         except (BlockingIOError, ssl.SSLWantReadError):
             return
-        except (OSError, ValueError):  # it has gone, has no good certificate, or does not speak TLS
+        except (OSError, ValueError):  # disconnected, no valid certificate, or no TLS
             self._drop(caller)
 
     def _listen_to(self, caller: _Caller) -> None:
-        """Continue as far as there is data. Raises BlockingIOError or SSLWantReadError if there is none."""
+        """Advance a connection as far as data has arrived. Raises BlockingIOError or SSLWantReadError for no data."""
         if caller.stage is _Stage.SILENT:
             if not caller.connection.recv(1, socket.MSG_PEEK):
                 raise ConnectionError
@@ -215,22 +215,22 @@ class StopDoor:
                 caller.connection = self._secured.wrap_socket(
                     caller.connection, server_side=True, do_handshake_on_connect=False
                 )
-                caller.shakes_hands = True
+                caller.in_handshake = True
             self._enter(caller, _Stage.TALKING, caller.share)
-        if caller.shakes_hands and isinstance(caller.connection, ssl.SSLSocket):
+        if caller.in_handshake and isinstance(caller.connection, ssl.SSLSocket):
             caller.connection.do_handshake()
-            caller.shakes_hands = False
+            caller.in_handshake = False
             caller.user = tls.peer(caller.connection)
             self._enter(caller, _Stage.KNOWN, caller.user)
         while True:
-            heard = caller.connection.recv(MAX_LINE)
-            if not heard or caller.stage is _Stage.WAITING:  # it has gone, or sends more than one request
+            data = caller.connection.recv(MAX_LINE)
+            if not data or caller.stage is _Stage.WAITING:  # disconnected, or a second request
                 raise ConnectionError
-            caller.heard += heard
-            line, ended, _ = caller.heard.partition(b"\n")
+            caller.received += data
+            line, ended, _ = caller.received.partition(b"\n")
             if ended:
                 self._pass_on(caller, line)
-            elif len(caller.heard) > MAX_LINE:
+            elif len(caller.received) > MAX_LINE:
                 raise ConnectionError
 
     def _pass_on(self, caller: _Caller, line: bytes) -> None:
@@ -242,21 +242,21 @@ class StopDoor:
             return
         user = caller.user or request.key.split("/")[3:4]
         self._enter(caller, _Stage.WAITING, str(user))
-        caller.heard = b""
+        caller.received = b""
         try:
-            self._take(caller.user, request, answer)
+            self._handle_request(caller.user, request, answer)
         except RefusedError as refusal:
             answer(ErrorReply(refusal.code, quoted(str(refusal))))
 
     def _answer(self, caller: _Caller, content: CommandReply | ErrorReply) -> None:
         self._answers.append((caller, answer_with(content)))
-        with contextlib.suppress(OSError):  # it is closed
+        with contextlib.suppress(OSError):  # the door is closed
             os.eventfd_write(self._wake, 1)
 
     def _send_answers(self) -> None:
         while self._answers:
             caller, line = self._answers.popleft()
             if self._callers.get(caller.number) is caller:
-                with contextlib.suppress(OSError):  # it has gone, or reads nothing: no line is longer than its buffer
+                with contextlib.suppress(OSError):  # disconnected, or not reading: a line fits into the socket's buffer
                     caller.connection.send(line)
                 self._drop(caller)
