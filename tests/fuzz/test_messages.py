@@ -29,7 +29,7 @@ from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
 from trirail.wire.goals import TrajectoryPoint as Point
 from trirail.wire.links import Port, TooLarge
 from trirail.wire.messages import CommandReply, Event, Notice
-from trirail.wire.packets import Accepted, Announcement, GoalRequest, Happened
+from trirail.wire.packets import Accepted, Announcement, EventReport, GoalRequest
 from trirail.wire.records import DTYPE, SIZE
 from trirail.wire.sizes import (
     MAX_BESIDE,
@@ -269,7 +269,7 @@ def test_an_event_always_fits_into_a_packet(length: int) -> None:
     packet = packets.event_packet(event)
     assert len(packet) <= MAX_PACKET
     told = packets.decode_answer(packet[1:])
-    assert isinstance(told, Happened)
+    assert isinstance(told, EventReport)
     assert told.event.message.startswith(event.message[:1000])
 
 

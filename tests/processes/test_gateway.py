@@ -27,11 +27,11 @@ from trirail.wire.packets import (
     Accepted,
     Announcement,
     Answer,
+    CommandDone,
     CommandRequest,
-    Confirmed,
+    EventReport,
     Farewell,
     GoalRequest,
-    Happened,
     Request,
     Status,
     Welcome,
@@ -160,14 +160,14 @@ def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
         rig.command(name)
     passed = [request.name for request in rig.commands()]
     assert passed == ["resume"] * MAX_COMMANDS_OF_USER + ["stop", "quick_stop", "disable", "pause"]
-    rig.hear(Confirmed(1, Command.RESUME, "holding", 1))
+    rig.hear(CommandDone(1, Command.RESUME, "holding", 1))
     for ticket in (
         MAX_COMMANDS_OF_USER + 1,
         MAX_COMMANDS_OF_USER + 2,
         MAX_COMMANDS_OF_USER + 3,
         MAX_COMMANDS_OF_USER + 4,
     ):
-        rig.hear(Confirmed(ticket, Command.STOP, "holding", 1))
+        rig.hear(CommandDone(ticket, Command.STOP, "holding", 1))
     rig.command("reset")
     assert rig.commands()[-1].name == "reset"
 
@@ -211,7 +211,7 @@ def test_what_waits_for_the_loop_does_not_begin_under_anothers_lease(rig: Rig) -
         rig.goal(f"a{number}", "ann")
         rig.goal(f"b{number}", "bob")
     event = Event("lease", "info", "lease acquired by bob", user="bob", seq=1, t=0.0, cycle=1, time=0.0)
-    rig.hear(Happened(event))
+    rig.hear(EventReport(event))
     for ticket in range(1, 2 * MAX_GOALS_OF_USER + 1):
         rig.accepted(ticket)
     assert rig.goals()[2 * MAX_GOALS_OF_USER :] == [

@@ -9,15 +9,15 @@ from rigs import Clock
 from trirail.processes.loop_death import LoopDeath
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
-from trirail.wire.packets import ControlInput, Farewell, GoalRequest, Happened, Status
+from trirail.wire.packets import ControlInput, EventReport, Farewell, GoalRequest, Status
 
 
 def request(goal_id: str) -> GoalRequest:
     return GoalRequest(1, "ann", goal_id, PoseGoal(0.0, 0.0, 0.0), 0)
 
 
-def ended(seq: int, goal_id: str) -> Happened:
-    return Happened(Event("goal", "info", "", id=goal_id, outcome="done", seq=seq, t=0.0, cycle=1, time=0.0))
+def ended(seq: int, goal_id: str) -> EventReport:
+    return EventReport(Event("goal", "info", "", id=goal_id, outcome="done", seq=seq, t=0.0, cycle=1, time=0.0))
 
 
 @pytest.mark.parametrize(

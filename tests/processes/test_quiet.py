@@ -31,7 +31,7 @@ from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.links import Port
-from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Request, decode_answer, message
+from trirail.wire.packets import CommandRequest, EventReport, GoalRequest, Kind, Request, decode_answer, message
 from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import MODES, Command, Mode
@@ -190,7 +190,7 @@ def _comparable(packet: bytes) -> Iterator[object]:
         yield from (record.tobytes() for record in records)
     elif packet[0] == Kind.MESSAGE:
         said = decode_answer(packet[1:])
-        if isinstance(said, Happened):
+        if isinstance(said, EventReport):
             event = said.event
             yield event.seq, event.cycle, event.t, event.kind, CHANNEL.sub("can0", event.message), event.outcome
         else:

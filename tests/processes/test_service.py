@@ -571,7 +571,7 @@ def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> 
             until(robot, lambda state: state.settled)
             far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
             assert far.returncode == 1
-            assert "unsettled: not in position 0.3 s after the end of its path; left to go: slider A " in far.stdout
+            assert "unsettled: not in position 0.3 s after the end of its path; residuals: slider A " in far.stdout
             said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
             assert (said["outcome"], said["settle"]) == ("unsettled", None)
             assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0

@@ -35,7 +35,7 @@ from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.credentials import Admission, Credentials
 from trirail.wire.messages import Event, GoalReply
-from trirail.wire.packets import Accepted, Announcement, CommandRequest, Confirmed, GoalRequest, Request
+from trirail.wire.packets import Accepted, Announcement, CommandDone, CommandRequest, GoalRequest, Request
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Command
 from waiting import WITHIN
@@ -52,7 +52,7 @@ class Loop:
         request = packets.decode_request(packet[1:])
         self.asked.append(request)
         if isinstance(request, CommandRequest):
-            self.answers.append(packets.message(Confirmed(request.ticket, request.name, "holding", 1)))
+            self.answers.append(packets.message(CommandDone(request.ticket, request.name, "holding", 1)))
         elif isinstance(request, GoalRequest):
             self.answers.append(packets.message(Accepted(request.ticket, GoalReply(request.id, 1.0))))
         return True

@@ -24,7 +24,7 @@ from trirail.processes.replies import REMEMBERED_S, Copies
 from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply, GoalReply
-from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused
+from trirail.wire.packets import Accepted, CommandDone, CommandRequest, GoalRequest, Refused
 from trirail.wire.records import DTYPE
 from trirail.wire.stop_protocol import STOPS
 
@@ -95,7 +95,7 @@ class Played:
             )
             no = Refused(request.ticket, RefusalCode.NO_GOAL, "not under way")
             self._packets.append(
-                packets.message(Confirmed(request.ticket, request.name, "holding", 1) if under_way else no)
+                packets.message(CommandDone(request.ticket, request.name, "holding", 1) if under_way else no)
             )
         else:
             return True

@@ -209,7 +209,7 @@ def test_a_first_start_is_waited_for_as_long_as_it_compiles(run: Running, monkey
     run.told = Told("the first start", 3.0, monkeypatch)
     compiling = f"""
 for number in range({FUNCTIONS}):
-    child.compiling(f"f{{number}}")
+    child.report_compiling(f"f{{number}}")
     time.sleep(4.0 / {FUNCTIONS})
 """
     end = "ready(); beat_until(lambda: begun('up')); heartbeats.heart('loop').rest()"

@@ -42,8 +42,8 @@ from trirail.wire.packets import (
     Accepted,
     Announcement,
     Answer,
-    Confirmed,
-    Happened,
+    CommandDone,
+    EventReport,
     Kind,
     Refused,
     Status,
@@ -246,13 +246,13 @@ class Gateway:
     def _on_answer(self, answer: Answer) -> None:
         self._loop_death.follow(answer)
         match answer:
-            case Happened(event):
+            case EventReport(event):
                 self._handle_event(event)
             case Status() | Welcome():
                 self._states.update(answer)
             case Accepted(ticket, reply):
                 self._requests.answer(ticket, reply)
-            case Confirmed(ticket, name, mode, cycle):
+            case CommandDone(ticket, name, mode, cycle):
                 self._commands.confirmed(ticket)
                 self._requests.answer(ticket, CommandReply(name, mode, cycle))
             case Refused(ticket, code, text, slider, value, limit):

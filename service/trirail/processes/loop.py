@@ -11,7 +11,7 @@ from trirail_drivers.driver.cyclic import Lender
 from trirail_drivers.interface import NAMES, DriveFault, DriveGroup, Feedback
 
 from trirail.config import Config
-from trirail.control.control import Control, Given
+from trirail.control.control import Control, TimedInput
 from trirail.control.modes import ModeEvent
 from trirail.processes.clock import SPARE_NS, Doors, Overruns, Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
@@ -231,7 +231,7 @@ class Loop:
             self.control.decide(inputs)
         self._send_reports()
 
-    def _noted(self, now_ns: int, requests: Iterable[Request], *, waiting: bool = False) -> Iterator[Given]:
+    def _noted(self, now_ns: int, requests: Iterable[Request], *, waiting: bool = False) -> Iterator[TimedInput]:
         """Yield requests and the planner's answers, noting each for the recorder."""
         for what in itertools.chain(requests, self._planner.answers()):
             self._reports.note(now_ns, what, waiting=waiting)

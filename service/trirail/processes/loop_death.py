@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import REMEMBERED_IDS, Event, FaultDetail, Notice
-from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
+from trirail.wire.packets import Answer, ControlInput, EventReport, Farewell, GoalRequest, Status
 from trirail.wire.vocabulary import FaultCause, Mode
 
 FROZEN, CYCLES = 0.5, 3
@@ -42,7 +42,7 @@ class LoopDeath:
                 self._record_begin(request.id, request.user)
             case Status(goal=str(goal_id)):
                 self._record_begin(goal_id, None)
-            case Happened(event):
+            case EventReport(event):
                 self._seq = event.seq
                 if event.outcome is not None and event.id is not None:
                     self._record_end(event.id)

@@ -239,7 +239,7 @@ class Poses:
         if mode not in (Mode.DISABLED, Mode.HOLDING):
             raise RefusedError(RefusalCode.MOVING, f"the robot is {mode}: teach a pose when it stands")
         if not np.all(record["homed"]):
-            raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
+            raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
         x, y, phi = record["pose"].tolist()
         there = travels(self._geometry, (x, y, phi))[0]
         if not np.abs(there - record["position"] + record["backlash"]).max() <= MAX_CLOSURE_ERROR_M:

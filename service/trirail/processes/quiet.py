@@ -87,7 +87,7 @@ STATE = np.dtype(
         ("mode", "u1"),  # as in a record
         ("source", "u1"),  # FOLLOW, HOLD or COMMAND
         ("held", "u1"),  # as in trirail.control.cycle.follow
-        ("stands", "u1"),  # as in trirail.control.cycle.observe
+        ("at_rest", "u1"),  # as in trirail.control.cycle.observe
         ("in_sliders", "u1"),  # of the path
         ("behind", "<i8"),  # result of trirail.control.cycle.observe
         ("code", "<i8"),  # result of trirail.control.cycle.command
@@ -172,7 +172,16 @@ def _receive(
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND),
-        *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
+        *(
+            cycle.MOTION,
+            cycle.SLIDERS,
+            cycle.BACKLASH_STATES,
+            f8[::1],
+            cycle.FEEDBACKS,
+            f8[:, ::1],
+            types.b1[::1],
+            f8[:, ::1],
+        ),
         *(cycle.MONITORED, cycle.RECORD, u1[::1]),
         *(cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
         *(outputs.OUTPUTS, outputs.PLAN, i8[::1], outputs.LOG),
@@ -299,7 +308,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             feedback[0].age[i] = axes[i].syncs - axes[i].sampled
         _mark(state, moment, Part.MODE)
         s.behind = cycle.observe(
-            *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.stands != 0),
+            *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.at_rest != 0),
             *(jumps, room, monitored, record),
         )
         if s.behind:

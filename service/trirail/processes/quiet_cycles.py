@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from trirail_drivers.driver.cyclic import Cyclic, Lender
 
-from trirail.control.control import Calm, Control
+from trirail.control.control import Control, SteadyState
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run
 from trirail.processes import quiet
@@ -80,7 +80,7 @@ class QuietCycles:
         """Number of orders sent to the drives before they lent their tables."""
         self._decided = False
         """Whether Python has handled anything since the newest cycle."""
-        self._calm: Calm | None = None
+        self._steady: SteadyState | None = None
         self._tables: tuple[Any, ...] = ()
         self._motion: tuple[Any, ...] = ()
         """Arguments of the compiled call, kept until the drives lend other tables or the motion changes."""
@@ -137,7 +137,7 @@ class QuietCycles:
         if reached not in (Reached.DONE, Reached.CALLED):
             synced = left["synced"] if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
             self.leave(left["handled"], left["arrived"], synced=synced, error=max(left["error"], 0))
-        control.go_on(left["cycle"], left["time"], left["code"] if decides else None)
+        control.resume(left["cycle"], left["time"], left["code"] if decides else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(left["sent"])
         tick = left["deadline_ns"], left["lateness_ns"], left["missed"]
@@ -156,8 +156,8 @@ class QuietCycles:
         """
         if self._lent is not None and not self._decided:
             return True
-        self._calm, orders = self._control.calm(), self._control.modes.orders
-        if self._calm is None or self._calm.until <= self._control.cycles:
+        self._steady, orders = self._control.steady_state(), self._control.modes.orders
+        if self._steady is None or self._steady.until <= self._control.cycles:
             return False
         if orders != self._orders:
             self.leave()
@@ -165,8 +165,8 @@ class QuietCycles:
             self._lent, self._orders = self._drives.lend(), orders
             self._tables = self._table_arguments(self._lent) if self._lent is not None else ()
         if self._lent is not None:
-            self._write_state(self._calm)
-            self._motion = self._motion_arguments(self._calm.run)
+            self._write_state(self._steady)
+            self._motion = self._motion_arguments(self._steady.run)
             self._decided = False
         return self._lent is not None
 
@@ -175,14 +175,14 @@ class QuietCycles:
         passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
         self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, MAX_PART_NS)
 
-    def _write_state(self, calm: Calm) -> None:
-        state, run = self._state[0], calm.run
-        state["source"] = quiet.FOLLOW if calm.follows else quiet.HOLD if run is None else quiet.COMMAND
+    def _write_state(self, steady: SteadyState) -> None:
+        state, run = self._state[0], steady.run
+        state["source"] = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
         state["cycle"], state["mode"] = self._control.cycles, MODES.index(self._control.state.mode)
-        state["held"], state["stands"], state["code"] = calm.held, calm.stands, calm.found
-        state["due"] = int(min(calm.until, _NO_CYCLE))
-        state["settles"] = calm.settles_by is not None
-        state["timeout"] = calm.settles_by or 0
+        state["held"], state["at_rest"], state["code"] = steady.held, steady.at_rest, steady.code
+        state["due"] = int(min(steady.until, _NO_CYCLE))
+        state["settles"] = steady.settles_by is not None
+        state["timeout"] = steady.settles_by or 0
         runs = self._control.schedule.runs
         state["time"] = runs[0].time if runs else 0.0
         if run is not None:
@@ -198,7 +198,7 @@ class QuietCycles:
             *(lent.outputs.frames, lent.outputs.headers),
             *(lent.expected, lent.axes, lent.times, lent.history),
             *(self._doors.room, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
-            *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.found),
+            *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.refused_values),
             *(measured.numbers, measured.written, measured.jumping, measured.room),
             *(measured.settling.monitored, measured.record, self._made),
         )

@@ -29,9 +29,9 @@ from trirail.wire.packets import (
     Announcement,
     Answer,
     ControlInput,
-    Happened,
+    EventReport,
     Kind,
-    RecorderSaid,
+    RecorderMessage,
     Status,
     Unrecorded,
     Welcome,
@@ -93,7 +93,7 @@ class Intake:
     def loop_gone(self) -> None:
         """Record the end of the loop, unless the loop has said farewell."""
         for event in self._loop_death.events(self._cycle):
-            self._handle_answer(Happened(event))
+            self._handle_answer(EventReport(event))
 
     def close(self) -> None:
         """Complete and close all files."""
@@ -104,7 +104,7 @@ class Intake:
         recorder, box = self.recorder, self._box
         self._loop_death.follow(answer)
         match answer:
-            case Happened(event):
+            case EventReport(event):
                 recorder.event(event)
                 box.event(event)
             case ControlInput():
@@ -131,7 +131,7 @@ class Intake:
         """Make the loop announce a notice."""
         self._send(Announcement(Notice("service", level, text.text, **text.fields)))
 
-    def _send(self, packet: RecorderSaid) -> bool:
+    def _send(self, packet: RecorderMessage) -> bool:
         """Send a packet to the loop; return False if its queue is full, or it has disconnected."""
         with contextlib.suppress(LinkClosed):
             return self._link.send(message(packet))

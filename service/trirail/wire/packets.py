@@ -71,7 +71,7 @@ class Accepted(Struct, frozen=True, tag=True):
     reply: GoalReply
 
 
-class Confirmed(Struct, frozen=True, tag=True):
+class CommandDone(Struct, frozen=True, tag=True):
     """Loop to gateway: the command has been carried out."""
 
     ticket: int
@@ -103,7 +103,7 @@ class Welcome(Struct, frozen=True, tag=True):
     """Protections that the drives lack."""
 
 
-class Happened(Struct, frozen=True, tag=True):
+class EventReport(Struct, frozen=True, tag=True):
     """Loop to gateway and recorder: an event."""
 
     event: Event
@@ -195,17 +195,17 @@ class Unrecorded(Struct, frozen=True, tag=True):
     why: str
 
 
-RecorderSaid = Announcement | Unrecorded
-Answer = Accepted | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
+RecorderMessage = Announcement | Unrecorded
+Answer = Accepted | CommandDone | Refused | Welcome | Farewell | EventReport | Status | ControlInput
 
-prepare(Request, Answer, RecorderSaid, *(command.content for command in Command))
+prepare(Request, Answer, RecorderMessage, *(command.content for command in Command))
 encode = msgpack.Encoder().encode
 decode_request = decoder(Request, packed=True).decode
 decode_answer = decoder(Answer, packed=True).decode
-decode_recorder = decoder(RecorderSaid, packed=True).decode
+decode_recorder = decoder(RecorderMessage, packed=True).decode
 
 
-def message(content: Request | Answer | RecorderSaid) -> bytes:
+def message(content: Request | Answer | RecorderMessage) -> bytes:
     """Return the packet of a message."""
     return bytes((Kind.MESSAGE,)) + encode(content)
 
@@ -214,10 +214,10 @@ def event_packet(event: Event) -> bytes:
     """Return the packet of an event, shortened if necessary: the loop keeps events and sends them to a new gateway, so
     one that is too large to read would fail again and again.
     """
-    packet = message(Happened(event))
+    packet = message(EventReport(event))
     if len(packet) <= MAX_PACKET:
         return packet
     words = f"{event.message[:1000]}… ({len(event.message)} characters)"
     reason = event.reason and f"{event.reason[:1000]}…"
     name, goal, user = (text and text[:100] for text in (event.id, event.goal, event.user))
-    return message(Happened(structs.replace(event, message=words, id=name, reason=reason, goal=goal, user=user)))
+    return message(EventReport(structs.replace(event, message=words, id=name, reason=reason, goal=goal, user=user)))
