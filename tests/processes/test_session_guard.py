@@ -155,7 +155,7 @@ def test_who_has_no_role_does_nothing_and_is_told(served: Served, name: str, doe
     with robot(served, name) as asking, pytest.raises(RefusedError) as caught:
         DOES[does](asking)
     assert caught.value.code is RefusalCode.NOT_ALLOWED
-    said = f"{name} has no role at demo: its [zenoh.users] does not name him, or he is revoked"
+    said = f"{name} has no role at demo: [zenoh.users] does not list this user, or it is revoked"
     assert str(caught.value) == said
 
 

@@ -282,12 +282,12 @@ class AsyncRobot:
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Send a timed trajectory that begins at the robot's pose; see trirail.client.client.Robot.follow."""
-        meant = points_of(points)
+        trajectory = points_of(points)
         if go_there:
-            check_arrived(await (await self.send(first_pose(meant))).wait())
+            check_arrived(await (await self.send(first_pose(trajectory))).wait())
         return await self.send(
             lambda name: TrajectoryGoal(
-                meant, stretch=stretch, settle=settle, id=name, marks=marks_of(marks), stop_at=stop_at_of(stop_at)
+                trajectory, stretch=stretch, settle=settle, id=name, marks=marks_of(marks), stop_at=stop_at_of(stop_at)
             ),
             id,
         )
@@ -365,8 +365,8 @@ class AsyncRobot:
         """
         from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves
 
-        wishes = calibrate_by_moves(DEFAULT_MOVES if moves is None else moves, views, lens, centre, looks, approach)
-        return await self._converse(look, wishes, speed, wait)
+        requests = calibrate_by_moves(DEFAULT_MOVES if moves is None else moves, views, lens, centre, looks, approach)
+        return await self._converse(look, requests, speed, wait)
 
     async def align(
         self,
@@ -397,8 +397,8 @@ class AsyncRobot:
         def task(known: CameraCalibration) -> AlignmentTask:
             return AlignmentTask(known, targets, tolerance, angle, corrections, distance, looks, approach)
 
-        wishes = align(task(calibration)) if calibration is not None else calibrate_and_align(task, looks, approach)
-        return await self._converse(look, wishes, speed, wait)
+        requests = align(task(calibration)) if calibration is not None else calibrate_and_align(task, looks, approach)
+        return await self._converse(look, requests, speed, wait)
 
     async def calibrate_geometry(
         self,
@@ -433,12 +433,12 @@ class AsyncRobot:
         return await self._converse(look, calibrate_geometry(task), speed, wait)
 
     async def _converse(
-        self, look: Look, wishes: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
+        self, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
     ) -> T:
         """Carry out the requests of a conversation of trirail.alignment.procedure; return its result."""
         from trirail.client.alignment import drive_async
 
-        return await drive_async(self, look, wishes, speed, wait)
+        return await drive_async(self, look, requests, speed, wait)
 
     async def _report_look(self, look: bytes) -> None:
         """Report a look of an alignment to the service: a trirail.wire.looks.AlignmentLook as JSON."""

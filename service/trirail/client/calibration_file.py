@@ -78,4 +78,4 @@ def read(path: Path) -> CalibrationFile:
         return decoded(text, CalibrationFile)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         problem = str(error).replace("`", "")
-        raise FileError(f"{path}: {problem}; make it anew with trirail align calibrate") from error
+        raise FileError(f"{path}: {problem}; create it again with trirail align calibrate") from error

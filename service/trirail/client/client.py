@@ -287,11 +287,11 @@ class Robot:
     # ------------------------------------------------------------------ inside
 
     async def _converse(
-        self, look: Look, wishes: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
+        self, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
     ) -> T:
         """Carry out the requests of a trirail.alignment.procedure conversation in this thread; return its result."""
         from trirail.client.alignment import drive
 
-        return drive(self, look, wishes, speed, wait)
+        return drive(self, look, requests, speed, wait)
 
     _report_look = _call(AsyncRobot._report_look)

@@ -17,7 +17,7 @@ from trirail.wire.credentials import credentials_for
 from trirail.wire.state import RobotSummary
 from trirail.wire.vocabulary import Mode
 
-SILENT: Final = 3.0
+MAX_SILENCE_S: Final = 3.0
 """Age of the newest data of a robot's loop from which the robot is silent [s]: a summary arrives once a second.
 
 Liveliness tokens outlive an unclean death, so they are not used.
@@ -46,7 +46,7 @@ class Member(NamedTuple):
 
     def need(self, now: float) -> Attention:
         """Return its need for attention."""
-        if self.age(now) > SILENT:
+        if self.age(now) > MAX_SILENCE_S:
             return Attention.SILENT
         return Attention.FAULT if self.summary.mode == Mode.FAULT else Attention.NOTHING
 

@@ -20,7 +20,7 @@ from trirail.wire.vocabulary import Command, Stop
 
 STANDS_WITHIN = 10.0
 """Time that the end of a jog may take beyond its own time-out [s]."""
-LETTING_GO = 0.05
+BRAKE_RENEWAL_S = 0.05
 """Time-out of a jog's last renewal, whose velocity is zero [s]."""
 
 Velocity = tuple[float, float, float]
@@ -218,7 +218,7 @@ class AsyncJog:
             await self._renewing  # a renewal that has been sent is not cancelled
         if self._goal is not None and self.result is None and self.error is None:
             with contextlib.suppress(TrirailError):  # it has ended, or will by its time-out
-                await self._send((0.0, 0.0, 0.0), LETTING_GO)
+                await self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S)
             await self._goal.wait(self._timeout + STANDS_WITHIN)
 
     async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:
