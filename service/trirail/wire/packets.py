@@ -138,10 +138,10 @@ class Status(Struct, frozen=True, tag=True):
 
 
 class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it
-    """An unrequested change, in the form that Control.happen takes."""
+    """Unrequested change, an input of Control.handle."""
 
     event: str
-    """Name of a trirail.control.modes.Event."""
+    """Name of a trirail.control.modes.ModeEvent."""
     reason: str
     event_code: EventCode = EventCode.OTHER
     params: Params = {}
