@@ -578,7 +578,7 @@ def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> 
             assert until(robot, lambda state: state.mode == "holding").faults == ()
             until(robot, lambda state: state.settled)
             there = trirail("goto", 0.05, 0.0, 0.0, "--wait", locator=lagging.locator)
-            assert (there.returncode, "done: arrived, settled in 1 ms" in there.stdout) == (0, True)
+            assert (there.returncode, "done: arrived, settled after 1 ms" in there.stdout) == (0, True)
         assert lagging.end() == 0
         (file,) = (tmp_path / "recordings").glob("*.rrd")
         recording = read(file)
@@ -824,8 +824,8 @@ def test_killed_drives_are_a_fault_and_the_service_stays(service: Service) -> No
         (fault,) = state.faults
         assert re.fullmatch(r"CAN bus .* is down: cannot (send|receive): .*listening end( of the bus)? is gone", fault)
         service.wait_said(
-            "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
-            "service's next start"
+            "the simulated drives have died (killed by SIGKILL): the robot is in fault; restart the "
+            "service to restart them"
         )
         with pytest.raises(RefusedError) as refused:
             robot.reset()

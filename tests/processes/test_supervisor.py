@@ -274,8 +274,8 @@ def test_simulated_drives_that_die_are_told_and_come_back_with_the_next_service_
     )
     assert run.told[:2] == [
         "up",
-        "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
-        "service's next start",
+        "the simulated drives have died (killed by SIGKILL): the robot is in fault; restart the "
+        "service to restart them",
     ]
     assert len(run.told) == 3, run.told
     assert not (run.folder / "drives-2.begun").exists()
