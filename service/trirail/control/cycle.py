@@ -122,7 +122,7 @@ def observe(
     limit: float,
     at_rest: bool,
     jumps: NDArray[np.bool],
-    room: Array,
+    scratch: Array,
     monitored: NDArray[np.void],
     record: NDArray[np.void],
 ) -> int:
@@ -140,7 +140,7 @@ def observe(
         Whether the commanded motion is at rest; then `monitored` records whether the robot is in position.
     jumps : (3,)
         Whether each slider jumps; written here.
-    room : (2, 3)
+    scratch : (2, 3)
         Scratch space.
 
     Returns
@@ -171,11 +171,11 @@ def observe(
         jumping |= jumps[i]
         row.position[i], row.age[i] = now.position[i], min(now.age[i], MAX_RECORDED_AGE)
         row.drive_state[i], row.follows[i], row.homed[i] = now.drive_state[i], now.follows[i], now.homed[i]
-        room[0, i], room[1, i] = now.position[i] - row.backlash[i], row.pose[i]
+        scratch[0, i], scratch[1, i] = now.position[i] - row.backlash[i], row.pose[i]
     row.homing = now.homing
-    known = not jumping and forward_into(legs, room[0], room[1], room[1]) == 0
+    known = not jumping and forward_into(legs, scratch[0], scratch[1], scratch[1]) == 0
     if known:
-        row.pose[:] = room[1]
+        row.pose[:] = scratch[1]
     monitor(record, known and not taking_up(backlash), at_rest, monitored)
     feedback[1] = feedback[0]
     return beyond

@@ -62,7 +62,7 @@ class MeasuredState:
         self.limit = limit
         self._packed = self.numbers.view(np.uint8).data
         self.written = np.zeros((2 + cycle.MAX_AGE, 3))
-        self.room = np.zeros((2, 3))
+        self.scratch = np.zeros((2, 3))
 
     @property
     def position(self) -> Triple:
@@ -128,18 +128,18 @@ class MeasuredState:
             self.limit,
             at_rest,
             self.jumping,
-            self.room,
+            self.scratch,
             self.settling.monitored,
             self.record,
         )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
         """Return the pose of slider setpoints that is nearest to the newest pose; None if they belong to no pose."""
-        self.room[:] = sliders, self.pose
-        self.room[0] -= self.backlash[0]["offset"]
-        if forward_into(self.legs, self.room[0], self.room[1], self.room[1]):
+        self.scratch[:] = sliders, self.pose
+        self.scratch[0] -= self.backlash[0]["offset"]
+        if forward_into(self.legs, self.scratch[0], self.scratch[1], self.scratch[1]):
             return None
-        x, y, phi = self.room[1].tolist()
+        x, y, phi = self.scratch[1].tolist()
         return x, y, phi
 
     def _pack(self, feedback: Feedback) -> None:

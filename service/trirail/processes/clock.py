@@ -1,8 +1,8 @@
 """Fixed-rate ticks on absolute deadlines of the monotonic clock; messages that arrive during a wait end it early.
 
-A neighbour is a process connected to the loop, its door the socket of that connection, and a call a readable or closed
-socket. A call that arrives early enough before the deadline is served immediately, not a cycle later. The wait is
-compiled, and used by the Python cycle and the compiled one alike.
+A neighbour is a process connected to the loop; it calls by sending a packet or by disconnecting. A call that arrives
+early enough before the deadline is served immediately, not a cycle later. The wait is compiled, and used by the Python
+cycle and the compiled one alike.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _clock_gettime: Any = types.ExternalFunction("clock_gettime", i4(i4, types.intp)
 _poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
 _ppoll: Any = types.ExternalFunction("ppoll", i4(types.intp, u8, types.intp, types.intp))
 
-DOORS = i4[:, ::1]
+POLLFDS = i4[:, ::1]
 SPARE_NS: Final = 500_000
 """Time that Python needs to serve a call [ns]; with less time before the deadline, a call waits for the next cycle."""
 _MONOTONIC: Final = 1
@@ -51,21 +51,21 @@ def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
         pass
 
 
-@compiled(b1(DOORS))
-def called(doors: NDArray[np.int32]) -> bool:
-    """Return whether any neighbour has sent something or disconnected; `doors` (n, 2) is an array of struct pollfd."""
-    return bool(_poll(doors.ctypes.data, np.uint64(len(doors)), 0) != 0)
+@compiled(b1(POLLFDS))
+def called(pollfds: NDArray[np.int32]) -> bool:
+    """Return whether a neighbour calls; `pollfds` (n, 2) is an array of struct pollfd."""
+    return bool(_poll(pollfds.ctypes.data, np.uint64(len(pollfds)), 0) != 0)
 
 
-@compiled(b1(i8, DOORS, i8[::1]), releases=True)
-def wait(deadline_ns: int, doors: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
+@compiled(b1(i8, POLLFDS, i8[::1]), releases=True)
+def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
     """Wait for the deadline, or for a call that arrives more than SPARE_NS before it; return whether there is a call.
 
     Parameters
     ----------
     deadline_ns : int
         Time of the monotonic clock [ns].
-    doors : (n, 2)
+    pollfds : (n, 2)
         Sockets of the neighbours, as in `called`.
     moment : (2,)
         Room for a struct timespec.
@@ -75,36 +75,36 @@ def wait(deadline_ns: int, doors: NDArray[np.int32], moment: NDArray[np.int64]) 
     left = deadline_ns - SPARE_NS - now_ns(moment)
     while left > 0:
         moment[0], moment[1] = left // _SECOND, left % _SECOND
-        if _ppoll(doors.ctypes.data, np.uint64(len(doors)), moment.ctypes.data, 0) > 0:
+        if _ppoll(pollfds.ctypes.data, np.uint64(len(pollfds)), moment.ctypes.data, 0) > 0:
             return True
         left = deadline_ns - SPARE_NS - now_ns(moment)
     sleep(deadline_ns, moment)
     return False
 
 
-class Doors:
-    """Sockets of the neighbours, for compiled code."""
+class PollSet:
+    """Sockets of the neighbours, to poll in compiled code."""
 
     def __init__(self, ports: Sequence[Port]) -> None:
         self._ports = ports
-        self.room = np.zeros((len(ports), 2), np.int32)
+        self.pollfds = np.zeros((len(ports), 2), np.int32)
         """Array of struct pollfd."""
         self._moment = np.zeros(2, np.int64)
 
     def refresh(self) -> None:
         """Update the array with the present connections."""
-        for door, port in zip(self.room, self._ports, strict=True):
-            door[:] = port.fileno(), _POLLIN
+        for pollfd, port in zip(self.pollfds, self._ports, strict=True):
+            pollfd[:] = port.fileno(), _POLLIN
 
     def called(self) -> bool:
-        """Return whether any neighbour has sent something or disconnected."""
+        """Return whether a neighbour calls."""
         self.refresh()
-        return bool(called(self.room))
+        return bool(called(self.pollfds))
 
     def wait(self, deadline_ns: int) -> bool:
         """Wait for the deadline or an early call, as in `wait`."""
         self.refresh()
-        return bool(wait(deadline_ns, self.room, self._moment))
+        return bool(wait(deadline_ns, self.pollfds, self._moment))
 
 
 class Tick(NamedTuple):
@@ -168,12 +168,12 @@ class Ticker:
         self._sleep_to_next()
         return self._now()
 
-    def listen(self, doors: Doors) -> bool:
+    def listen(self, poll_set: PollSet) -> bool:
         """Wait for the next deadline or an early call; return whether there is a call."""
         if self._now is time.monotonic_ns:
-            return doors.wait(self.deadline_ns + self._period_ns)
+            return poll_set.wait(self.deadline_ns + self._period_ns)
         self._sleep_to_next()
-        return doors.called()
+        return poll_set.called()
 
     def wait(self) -> Tick:
         """Sleep until the next deadline, skipping those missed by a whole period or more."""

@@ -62,7 +62,7 @@ _called: Any = intrinsic(_call)
 
 @compiled()
 def receive_frames(
-    bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], room: NDArray[np.int64]
+    bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], scratch: NDArray[np.int64]
 ) -> tuple[int, int]:
     """Receive the frames that have arrived.
 
@@ -72,7 +72,7 @@ def receive_frames(
         A BusAccess.
     headers, frames
         Arrays of PackedFrames, with room for MOST_FRAMES.
-    room : (1,)
+    scratch : (1,)
         Scratch space.
 
     Returns
@@ -88,9 +88,9 @@ def receive_frames(
         return (number, 0) if number >= 0 else (~number, _PERSISTENT_ERROR)
     number = _recvmmsg(bus[0], headers.ctypes.data, np.uint32(MOST_FRAMES), _FLAGS, 0)
     if number < 0:
-        room[0] = 0
-        memcpy(room.ctypes.data, _errno(), np.uint64(4))
-        return 0, (room[0] if room[0] != _NOTHING_THERE else 0)
+        scratch[0] = 0
+        memcpy(scratch.ctypes.data, _errno(), np.uint64(4))
+        return 0, (scratch[0] if scratch[0] != _NOTHING_THERE else 0)
     for i in range(number):
         if headers[i, 7] & np.uint64(0xFFFFFFFF) != np.uint64(_FRAME):
             return i, _PERSISTENT_ERROR

@@ -13,7 +13,7 @@ from trirail_drivers.interface import NAMES, DriveFault, DriveGroup, Feedback
 from trirail.config import Config
 from trirail.control.control import Control, TimedInput
 from trirail.control.modes import ModeEvent
-from trirail.processes.clock import SPARE_NS, Doors, Overruns, Tick, Ticker
+from trirail.processes.clock import SPARE_NS, Overruns, PollSet, Tick, Ticker
 from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import Reached
@@ -82,7 +82,7 @@ class Loop:
         self._overruns = Overruns(config.watchdogs.max_overruns)
         self._heart = heartbeats.heart("loop")
         self._urgent_flag = UrgentFlag(heartbeats)
-        self._doors = Doors(ports)
+        self._poll_set = PollSet(ports)
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
         """Whether no further call is served before the next tick."""
@@ -90,7 +90,7 @@ class Loop:
         """Whether events and answers wait, for lack of time before a tick."""
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
-            beside = self._reports, heartbeats, ports.gateway, self._doors, watch, self._urgent_flag
+            beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
             self._quiet = QuietCycles(self.control, drives, *beside)
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
@@ -128,7 +128,7 @@ class Loop:
             newest = quiet.run(ticker, self._overruns, listens=not self._listened, once=self._postponed)
         elif quiet is not None:
             quiet.leave()
-        if newest is None and not self._listened and ticker.listen(self._doors):
+        if newest is None and not self._listened and ticker.listen(self._poll_set):
             self._serve_call(ticker)
         elif newest is None:
             self.cycle(ticker.wait())

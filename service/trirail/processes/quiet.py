@@ -22,7 +22,7 @@ from trirail_drivers.driver.cyclic import MOST_FRAMES
 from trirail.control import cycle, outputs
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.processes.clock import DOORS, SPARE_NS, called, now_ns, sleep, wait
+from trirail.processes.clock import POLLFDS, SPARE_NS, called, now_ns, sleep, wait
 from trirail.processes.cycle_frames import (
     AXES,
     EXPECTATIONS,
@@ -130,12 +130,12 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
 
 
 @compiled()
-def _wait(state: NDArray[np.void], moment: NDArray[np.int64], doors: NDArray[np.int32]) -> bool:
+def _wait(state: NDArray[np.void], moment: NDArray[np.int64], pollfds: NDArray[np.int32]) -> bool:
     """Wait for the deadline; return whether a neighbour's call must be served before it."""
     if state[0].injected_ns >= 0:
-        return bool(state[0].listens and called(doors))
+        return bool(state[0].listens and called(pollfds))
     if state[0].listens:
-        return bool(wait(state[0].deadline_ns, doors, moment))
+        return bool(wait(state[0].deadline_ns, pollfds, moment))
     sleep(state[0].deadline_ns, moment)
     return False
 
@@ -170,7 +170,7 @@ def _receive(
     i8(
         *(_STATE, i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
+        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], POLLFDS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND),
         *(
             cycle.MOTION,
@@ -206,7 +206,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     axes: NDArray[np.void],
     times: NDArray[np.void],
     history: Array,
-    doors: NDArray[np.int32],
+    pollfds: NDArray[np.int32],
     hearts: NDArray[np.uint64],
     batch: NDArray[np.uint8],
     legs: Array,
@@ -218,7 +218,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     feedback: NDArray[np.void],
     written: Array,
     jumps: NDArray[np.bool],
-    room: Array,
+    scratch: Array,
     monitored: NDArray[np.void],
     record: NDArray[np.void],
     made: NDArray[np.uint8],
@@ -245,7 +245,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         A BusAccess.
     pins, switchings
         Frames of the drives' outputs, and their headers.
-    doors : (n, 2)
+    pollfds : (n, 2)
         Array of struct pollfd, the gateway's first.
     hearts
         Counters of trirail.processes.heartbeats.
@@ -260,7 +260,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
         s.deadline_ns += s.period_ns
-        if _wait(state, moment, doors):
+        if _wait(state, moment, pollfds):
             s.deadline_ns -= s.period_ns
             s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
             return Reached.CALLED
@@ -287,10 +287,10 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         begin_cycle(axes, history)
         _mark(state, moment, Part.SYNC)
 
-        somebody = called(doors)
+        called_now = called(pollfds)
         count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch checks it
         turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
-        if hearts[URGENT_INDEX] != s.urgent_seen or doors[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
+        if hearts[URGENT_INDEX] != s.urgent_seen or pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
             return Reached.SYNCED
         t = _now_ns(state, moment) / 1e9
         if not (
@@ -309,7 +309,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.MODE)
         s.behind = cycle.observe(
             *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.at_rest != 0),
-            *(jumps, room, monitored, record),
+            *(jumps, scratch, monitored, record),
         )
         if s.behind:
             return Reached.OBSERVED
@@ -327,7 +327,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             code = 0
             cycle.follow(legs, feedback, jumps, s.held != 0, False, s.step, motion, sliders, backlash, record)
         in_position = s.settles and (monitored[0].inside >= monitored[0].dwell or s.cycle + 1 >= s.timeout)
-        s.called, s.code = in_position or somebody or code != s.code or s.cycle + 1 >= s.due, code
+        s.called, s.code = in_position or called_now or code != s.code or s.cycle + 1 >= s.due, code
         late = _now_ns(state, moment) / 1e9 - s.synced > s.period
         if code >> 2 != 0 or late or not set_frames(setpoints, axes, sliders[0]):
             return Reached.SOLVED

@@ -13,7 +13,7 @@ from trirail.control.control import Control, SteadyState
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run
 from trirail.processes import quiet
-from trirail.processes.clock import Doors, Overruns, Ticker
+from trirail.processes.clock import Overruns, PollSet, Ticker
 from trirail.processes.heartbeats import PROCESSES, URGENT_INDEX, Heartbeats, UrgentFlag, Watch
 from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
@@ -59,7 +59,7 @@ class QuietCycles:
         reports: Reports,
         hearts: Heartbeats,
         gateway: Port,
-        doors: Doors,
+        poll_set: PollSet,
         watch: Watch,
         urgent_flag: UrgentFlag,
     ) -> None:
@@ -74,7 +74,7 @@ class QuietCycles:
         self._hearts = np.frombuffer(hearts.counts, np.uint64)[: URGENT_INDEX + 1]
         self._state = np.zeros(1, quiet.STATE)
         self._moment = np.zeros(2, np.int64)
-        self._doors = doors
+        self._poll_set = poll_set
         self._lent: Cyclic | None = None
         self._orders = 0
         """Number of orders sent to the drives before they lent their tables."""
@@ -123,7 +123,7 @@ class QuietCycles:
         state["listens"] = listens
         state["report_after"] = control.outputs.report_after
         state["logged"], state["report_due"] = control.outputs.logged, control.outputs.report_due
-        self._doors.refresh()
+        self._poll_set.refresh()
         reached = Reached(quiet.run(*self._tables, *self._motion))
         left = dict(zip(_NAMES, state.item(), strict=True))  # faster than reading field by field
         overruns.all, overruns.in_a_row = left["overruns"], left["in_a_row"]
@@ -197,9 +197,9 @@ class QuietCycles:
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
             *(lent.outputs.frames, lent.outputs.headers),
             *(lent.expected, lent.axes, lent.times, lent.history),
-            *(self._doors.room, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
+            *(self._poll_set.pollfds, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
             *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.refused_values),
-            *(measured.numbers, measured.written, measured.jumping, measured.room),
+            *(measured.numbers, measured.written, measured.jumping, measured.scratch),
             *(measured.settling.monitored, measured.record, self._made),
         )
 
