@@ -47,18 +47,18 @@ if TYPE_CHECKING:  # numpy, which most programs do without
     from trirail.client.alignment import Look
 
 REPORT_WITHIN = 2.0
-"""Longest time of the answer to the report of a look [s]."""
+"""Time-out of the answer to the report of a look [s]."""
 HOME_WITHIN = 600.0
 """Longest time of homing [s]: three drives with the greatest time-out."""
 T = TypeVar("T")
 
 
 class AsyncRobot:
-    """A connection to one robot's service while its context lasts; for the tasks of one event loop.
+    """Connection to one robot's service inside its context, for the tasks of one event loop.
 
-    Arguments, names and errors are those of trirail.client.client.Robot, whose calls wait in threads for these. A
-    cancelled call leaves nothing behind: a goal that was being sent is stopped if the service has taken it. A goal that
-    was accepted continues, even if nobody waits for it.
+    Arguments, names and errors are those of trirail.client.client.Robot, which wraps these calls for threads.
+    Cancelling a call that sends a goal stops that goal if the service has received it. An accepted goal continues, even
+    if no task waits for it.
     """
 
     def __init__(
