@@ -83,6 +83,16 @@ def peers(*, seconds: float = 15.0, json: bool = False) -> None:
 
 
 @app.command
+def outputs(*, pulses: int = 20, tries: int = 10, json: bool = False) -> None:
+    """Compare where outputs switch with their marks, and with a client that watches the state; time the switch."""
+    import bench_outputs
+    import bench_rig
+
+    with bench_rig.rig(1000, own=True, sections=bench_outputs.SECTIONS) as made:
+        report(bench_outputs.measure(made, pulses, tries), json)
+
+
+@app.command
 def kinematics(*, json: bool = False) -> None:
     """Time the recursion against a straightforward numpy port of the paper's matrices."""
     import bench_kinematics

@@ -18,6 +18,7 @@ COMMANDS = {
     "kinematics": (),
     "latency": ("--goals", "80"),
     "loop": ("--rates", "1000", "--rates", "2000", "--seconds", "60", "--runs", "5"),
+    "outputs": ("--tries", "5"),
     "peers": ("--seconds", "5"),
     "start": (),
 }
@@ -27,6 +28,7 @@ BRIEF = {
     "frames": ("--cycles", "50"),
     "latency": ("--goals", "3"),
     "loop": ("--rates", "1000", "--seconds", "2", "--runs", "1"),
+    "outputs": ("--pulses", "3", "--tries", "1"),
     "peers": ("--seconds", "1"),
 }
 """Options for a brief run."""
@@ -117,6 +119,18 @@ AIMS = (
         "3.8 / 2.8",
         (2.0, 2.0),
         lambda results: (results["fairness"]["goal_p99_ratio"], results["fairness"]["stop_p99_ratio"]),
+    ),
+    Aim(
+        "outputs on the path: error of place to half a cycle's travel, the worst",
+        "no outputs",
+        (1.0,),
+        lambda results: (max(at["marks_um"][3] / at["half_a_cycle_um"] for at in results["outputs"]["speeds"]),),
+    ),
+    Aim(
+        "outputs on the path: time in a cycle, of 8 outputs less that of none, p99 [µs]",
+        "no outputs",
+        (3.0,),
+        lambda results: (results["outputs"]["switch_us"][-1]["us"][1] - results["outputs"]["switch_us"][0]["us"][1],),
     ),
     Aim("frames of one cycle, p50 [µs]", "43", (10.0,), lambda results: (results["frames"]["socket_us"]["p50"],)),
 )

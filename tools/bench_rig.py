@@ -47,11 +47,16 @@ def quantiles(values: list[float] | NDArray[np.float64]) -> list[float]:
 
 
 @contextlib.contextmanager
-def rig(rate_hz: int, own: bool = False) -> Iterator[Rig]:
-    """Run an enabled service at a rate, on its `own` simulated drives or on some on a bus with listeners."""
+def rig(rate_hz: int, own: bool = False, sections: str = "") -> Iterator[Rig]:
+    """Run an enabled service at a rate, on its `own` simulated drives or on some on a bus with listeners.
+
+    `sections` are added to its configuration.
+    """
     with tempfile.TemporaryDirectory(prefix="trirail-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         config, locator = configured(folder, rate_hz, own)
+        with config.open("a", encoding="utf-8") as file:
+            file.write(f"\n{sections}")
         bus = "" if own else str(folder / "can")
         if bus:
             stack.enter_context(drives(config, bus))

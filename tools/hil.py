@@ -17,6 +17,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,6 +25,7 @@ from typing import Any
 import bus_log
 import hil_dissector
 import hil_second
+from hil_dissector import Dissected
 from hil_machine import ROOT, compiling, machine, output_lines, pack
 from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
@@ -223,8 +225,32 @@ def _check_second(folder: Path, result: dict[str, Any], say: Progress, report: d
     problems += hil_dissector.problems(dissected, until)
     if problems:
         raise Failed("the second robot's frames are wrong:\n  " + "\n  ".join(problems[:10]) + f"\nsee {path}")
+    _check_outputs(dissected, result["switches"], until, config, say, report)
     report["second_dissected"] = hil_dissector.statistics(dissected)
     say(f"the second robot's frames, as Wireshark sees them: {json.dumps(report['second_dissected'])}")
+
+
+def _check_outputs(
+    frames: Sequence[Dissected],
+    table: Sequence[dict[str, Any]],
+    until: float,
+    config: Config,
+    say: Progress,
+    report: dict[str, Any],
+) -> None:
+    """Check a goal's switches in the frames that Wireshark decodes, and that the drive took each at the next SYNC."""
+    calm = [frame for frame in frames if frame.t < until]
+    seen = hil_dissector.switches(calm, config.drives.C.node, hil_second.VALVE)
+    cycles = [(row["cycle"], row["value"]) for row in table]
+    if problem := hil_second.cycles_problem(cycles, [(each.sync, each.on) for each in seen]):
+        raise Failed(f"the second robot's frames: {problem}")
+    for row, each in zip(table, seen, strict=True):
+        late = row["taken"] - each.next_sync
+        if not 0.0 <= late < config.period:
+            raise Failed(f"the drive has switched {late:.3f} s after the SYNC that took its frame, not at it")
+    words = f"{len(seen)} switches of an output leave in their cycle, and are taken at the next SYNC"
+    report["checks"]["switches"] = words
+    say(f"frames: {words}")
 
 
 def _logs(folder: Path, *names: str) -> str:

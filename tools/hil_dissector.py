@@ -27,9 +27,12 @@ FIELDS = (
     "canopen.nmt_guard.state",
     "canopen.nmt_ctrl.cd",
     "canopen.nmt_ctrl.node_id",
+    "canopen.pdo.data.bytes",
 )
 SDO_ANSWER, SDO_REQUEST, EMERGENCY, ERROR_CONTROL = 0xB, 0xC, 0x1, 0xE
 """Function codes, bits 7 to 10 of an identifier (CiA 301, 7.3.3)."""
+SYNC, RPDO3 = 0x1, 0x8
+"""Function codes of the SYNC, which has node 0, and of the PDO that takes digital outputs."""
 BOOT_UP, OPERATIONAL = 0x0, 0x5
 START, ALL_NODES = 0x01, 0
 """Values of an NMT command (CiA 301, 7.2.8.3.1)."""
@@ -53,6 +56,8 @@ class Dissected(NamedTuple):
     command: int | None
     commanded: int | None
     """NMT command, and the node that it addresses."""
+    data: bytes = b""
+    """Data of a PDO."""
 
 
 def dissect(log: Path) -> list[Dissected]:
@@ -74,6 +79,32 @@ def problems(frames: Sequence[Dissected], until: float) -> list[str]:
     """
     calm = [frame for frame in frames if frame.t < until]
     return [*_unreadable(frames), *_unanswered(calm), *_fallen(calm)]
+
+
+class Switch(NamedTuple):
+    """PDO with another value of a digital output."""
+
+    sync: int
+    """Number of SYNCs before it in the log."""
+    on: bool
+    next_sync: float
+    """Time of the SYNC after it, at which the drive takes it [s since 1970]."""
+
+
+def switches(frames: Sequence[Dissected], node: int, output: int) -> list[Switch]:
+    """Return the PDOs of a node that changed an output, a bit of 60FEh:01; it is off before."""
+    changes: list[Switch] = []
+    pending: list[bool] = []
+    on, syncs = False, 0
+    for frame in frames:
+        if frame.function == SYNC and not frame.node:
+            changes += [Switch(syncs, value, frame.t) for value in pending]
+            pending, syncs = [], syncs + 1
+        elif frame.function == RPDO3 and frame.node == node:
+            value = bool(int.from_bytes(frame.data, "little") & output)
+            pending += [value] if value is not on else []
+            on = value
+    return changes
 
 
 def statistics(frames: Sequence[Dissected]) -> dict[str, int]:
@@ -127,7 +158,7 @@ def _entry(frame: Dissected) -> str:
 
 
 def _frame(fields: Sequence[str]) -> Dissected:
-    t, function, node, malformed, *entry, abort, emergency, state, command, commanded = fields
+    t, function, node, malformed, *entry, abort, emergency, state, command, commanded, data = fields
     index, sub = map(_number, entry)
     return Dissected(
         t=float(t),
@@ -140,6 +171,7 @@ def _frame(fields: Sequence[str]) -> Dissected:
         state=_number(state),
         command=_number(command),
         commanded=_number(commanded),
+        data=bytes.fromhex(data.replace(":", "")),
     )
 
 

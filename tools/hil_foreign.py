@@ -67,7 +67,10 @@ class LastingBus(can.BusABC):
 
 
 def serve(bus: can.BusABC, node: int, say: Callable[[str], None], going: Callable[[], bool]) -> None:
-    """Run a drive on a bus while `going`; print each change of its state with the position of its slider."""
+    """Run a drive on a bus while `going`; print each change of its state with the position of its slider.
+
+    Each change of its digital outputs is another line: bits of 60FEh:01, number of the SYNC, and wall-clock time [s].
+    """
     rpm = 60.0 * REVOLUTIONS
     drive = ForeignDrive(MAKE, node, bus, time.monotonic, Truth(COUNTS, rpm, rpm))
     reported = None
@@ -76,6 +79,9 @@ def serve(bus: can.BusABC, node: int, say: Callable[[str], None], going: Callabl
         if drive.state != reported:
             reported = drive.state
             say(f"C {NAMES[reported]}, {drive.servo.position * 1e3:.3f} mm")
+        for sync, bits in drive.switched:
+            say(f"outputs {bits:08X} at SYNC {sync}, {time.time():.3f}")
+        drive.switched.clear()
 
 
 def main() -> int:

@@ -7,9 +7,9 @@ that time, and is lost at rest and in motion later. The same service survives al
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from subprocess import Popen
-from typing import Any
+from typing import Any, NamedTuple
 
 from hil_programs import STEP_TIMEOUT_S, Failed, Machine, wait_until
 from hil_programs import run as run_command
@@ -26,6 +26,10 @@ REVOLUTIONS = 200.0
 """Turns per metre of drive C, which uses rpm."""
 CLOSE = 1e-4
 """Maximum deviation of a drive at rest from the position that the service reports [m]."""
+VALVE = 1 << 16
+"""Output of the foreign drive, as a bit of 60FEh:01."""
+PULSES = {"output": "valve", "start": 0.004, "end": 0.016, "increment": 0.005, "pulse_width": 0.3}
+"""Mark of a goal: three pulses of three cycles, seven cycles apart."""
 
 CHANGES = {
     'name = "robot"': 'name = "second"',
@@ -40,7 +44,7 @@ CHANGES = {
     ),
     "[drives.C]\nnode = 3\ncounts_per_metre = 1e6": (
         f"[drives.C]\nnode = 3\ncounts_per_metre = {COUNTS}\nrevolutions_per_metre = {REVOLUTIONS}\n"
-        'accept_without = ["1006"]'
+        'accept_without = ["1006"]\n\n[outputs.valve]\ndrive = "C"\nbit = 16'
     ),
     "/zenoh": "/zenoh-second",
     "/recordings": "/recordings-second",
@@ -102,6 +106,7 @@ def run(
         held("homing", f"drive A has found its switch, {robot.state().sliders.position[0] * 1e3:.3f} mm")
         moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(STEP_TIMEOUT_S)
         expect(moved, "done", robot)
+        result["switches"] = _switched(robot, machine, held)
         result["second_cut"] = quick_stopped(robot, held, "quick stop of a foreign drive")
         moved = robot.move_to(x=-0.01, y=0.005, phi=-0.05).wait(STEP_TIMEOUT_S)
         expect(moved, "done", robot)
@@ -116,6 +121,57 @@ def run(
     _disturb(machine, virtual, config, held)
     machine.end(service, "the second service")
     held("second end", "exit code 0 after SIGTERM")
+
+
+class Change(NamedTuple):
+    """Change of the foreign drive's outputs, as it prints it."""
+
+    on: bool
+    """Value of the valve."""
+    sync: int
+    """Number of the SYNC at which they changed."""
+    t: float
+    """Wall-clock time soon after it [s]."""
+
+
+def changes(log: str) -> list[Change]:
+    """Return the changes of outputs in the foreign drive's log."""
+    lines = re.findall(r"^outputs ([0-9A-F]{8}) at SYNC (\d+), ([\d.]+)$", log, re.MULTILINE)
+    return [Change(bool(int(bits, 16) & VALVE), int(sync), float(t)) for bits, sync, t in lines]
+
+
+def cycles_problem(cycles: Sequence[tuple[int, bool]], switched: Sequence[tuple[int, bool]]) -> str:
+    """Return what is wrong; "" where values switched as in a table, all equally many SYNCs after their cycle."""
+    expected, values = [on for _, on in cycles], [on for _, on in switched]
+    if values != expected:
+        return f"outputs have switched to {values}, in the table to {expected}"
+    shifts = [sync - cycle for (cycle, _), (sync, _) in zip(cycles, switched, strict=True)]
+    return f"outputs have switched {shifts} SYNCs after their cycles of the table" if len(set(shifts)) > 1 else ""
+
+
+def _switched(robot: Robot, machine: Machine, held: Held) -> list[dict[str, Any]]:
+    """Switch an output of the foreign drive on the path of a goal; return the table of its switches.
+
+    Each must take effect equally many SYNCs after the cycle that the table has.
+    """
+    before = len(changes(machine.log("foreign")))
+    goal = robot.move_to(x=0.01, y=0.015, phi=0.05, speed=0.3, marks=[PULSES])
+    ended = goal.wait(STEP_TIMEOUT_S)
+    expect(ended, "done", robot)
+    table = ended.marks
+    wait_until(
+        lambda: len(changes(machine.log("foreign"))) >= before + len(table), "the foreign drive switches its output"
+    )
+    switched = changes(machine.log("foreign"))[before:]
+    if problem := cycles_problem(
+        [(row.cycle, row.value) for row in table], [(each.sync, each.on) for each in switched]
+    ):
+        raise Failed(f"the foreign drive: {problem}")
+    cycles = ", ".join(str(row.cycle) for row in table)
+    held("outputs on the path", f"the foreign drive's valve has switched at the SYNC after each of cycles {cycles}")
+    return [
+        {"cycle": row.cycle, "value": row.value, "taken": each.t} for row, each in zip(table, switched, strict=True)
+    ]
 
 
 def _disturb(machine: Machine, virtual: Popen[bytes], config: Config, held: Held) -> None:
@@ -155,6 +211,6 @@ def _set_link(state: str) -> None:
 
 def _at(machine: Machine) -> float | None:
     """Return the position of the foreign drive [m], if its newest output reports no power."""
-    lines = machine.log("foreign").splitlines()
-    match = re.fullmatch(r"C switch on disabled, (-?[\d.]+) mm", lines[-1]) if lines else None
-    return float(match[1]) * 1e-3 if match else None
+    lines = [line for line in machine.log("foreign").splitlines() if line.startswith("C ")]
+    logs = re.fullmatch(r"C switch on disabled, (-?[\d.]+) mm", lines[-1]) if lines else None
+    return float(logs[1]) * 1e-3 if logs else None

@@ -25,6 +25,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 MESSAGES: dict[str, tuple[Any, str]] = {
     "goal": (goals.Goal, "What is sent to goal/<user>: a goal of one of the kinds."),
     "goal-reply": (messages.GoalReply, "The reply to a goal that is accepted."),
+    "check": (goals.PathGoal, "What is sent to check/<user>: a goal with a path; the reply is that to a goal."),
     **{
         f"command-{name}": (name.accepts, f"The content{', if any,' * name.content.optional} of cmd/<user>/{name}.")
         for name in Command

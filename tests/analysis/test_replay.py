@@ -23,8 +23,8 @@ from trirail.errors import RefusedError, ServiceError
 from trirail.telemetry import provenance
 from trirail.telemetry.reading import join, read
 from trirail.telemetry.recording import Recording
-from trirail.wire.goals import VelocityGoal
-from trirail.wire.packets import CommandRequest, Disturbance, DrivesFault, GoalRequest
+from trirail.wire.goals import MoveGoal, PoseGoal, VelocityGoal
+from trirail.wire.packets import CheckRequest, CommandRequest, Disturbance, DrivesFault, GoalRequest
 from trirail.wire.plan_packets import NotPlanned, PathExtension, PreemptingMotion
 from warm import trirail
 
@@ -38,6 +38,7 @@ def act(robot: Robot, choice: random.Random) -> None:
     x, y, phi = (choice.uniform(-span, span) for span in (0.07, 0.07, 0.5))
     match choice.randrange(9):
         case 0 | 1:
+            robot.check(PoseGoal(x, y, phi))
             robot.move_to(x=x, y=y, phi=phi, valid_for=5.0)
         case 2:
             for blend in (0.01, None):
@@ -56,6 +57,7 @@ def act(robot: Robot, choice: random.Random) -> None:
         case 6:
             robot.override(choice.choice([30.0, 100.0, 150.0]))
         case 7:
+            robot.check(MoveGoal(0.1 * x, 0.0, 0.0))
             robot.pause()
             robot.resume()
         case _:
@@ -107,7 +109,7 @@ def test_the_recording_is_whole(recording: Recording) -> None:
     assert np.array_equal(recording.records["cycle"], np.arange(1, len(recording.records) + 1))
     assert [what.seq for what in recording.requests] == list(range(1, len(recording.requests) + 1))
     kinds = {type(what.given) for what in recording.requests}
-    assert {GoalRequest, CommandRequest, Disturbance} <= kinds
+    assert {GoalRequest, CheckRequest, CommandRequest, Disturbance} <= kinds
     assert {what.waiting for what in recording.requests} == {False, True}  # behind a cycle, and before the next tick
 
 

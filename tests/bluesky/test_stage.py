@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from bluesky import RunEngine, simulators
 from bluesky import plan_stubs as bps
 from bluesky import plans as bp
-from bluesky.utils import FailedStatus, RunEngineInterrupted
+from bluesky import preprocessors as bpp
+from bluesky.protocols import Subscribable
+from bluesky.utils import FailedStatus, RunEngineInterrupted, SigintHandler
 from ophyd_async.core import init_devices
 from trirail import RefusedError, Robot, ServiceError, TrirailError
 from trirail.bluesky import Stage, UnfinishedError
 from trirail.bluesky import mover as mover_module
 from trirail.client import own_service
 from trirail.wire.messages import Event
+from trirail.wire.state import State
 from waiting import WITHIN, wait_until
 
 pytestmark = pytest.mark.slow
+GUIDE = Path(__file__).parents[2] / "service/bluesky.md"
 HALF_WINDOW = 1e-4
 """Greatest error of x and y of a pose that is done [m]; that of phi is ten times as large [rad]."""
 Documents = list[tuple[str, dict[str, Any]]]
@@ -126,38 +131,44 @@ def test_count_has_every_reading_with_its_unit_limits_and_precision(stage: Stage
 
 
 def test_axes_that_are_set_together_are_one_straight_move(stage: Stage, robot: Robot, engine: Any) -> None:
-    begin, poses = newest_event(robot), list[Any]()
-    with robot_poses(robot, poses):
+    begin, states = newest_event(robot), list[State]()
+    with robot_states(robot, states):
         run(engine, bps.mv(stage.x, 0.03, stage.y, 0.06, stage.phi, 0.15))
     assert [event.outcome for event in goal_events(robot, begin)] == ["done"]
     assert robot.state().commanded.pose == pytest.approx((0.03, 0.06, 0.15), abs=1e-12)
-    for x, y, phi in poses:
+    for x, y, phi in (state.commanded.pose for state in states):
         assert (y, phi) == pytest.approx((2.0 * x, 5.0 * x), abs=1e-9)
 
 
 @contextmanager
-def robot_poses(robot: Robot, poses: list[Any]) -> Iterator[None]:
-    """Keep commanded poses while the context lasts."""
+def robot_states(robot: Robot, kept: list[State]) -> Iterator[None]:
+    """Keep states while the context lasts."""
     over = threading.Event()
 
     def keep() -> None:
         for state in robot.states():
-            poses.append(state.commanded.pose)
+            kept.append(state)
             if over.is_set():
                 return
 
     thread = threading.Thread(target=keep)
     thread.start()
-    yield
-    over.set()
-    thread.join()
-    assert poses
+    try:
+        wait_until(lambda: bool(kept), "the first state", 0.01)
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def test_an_axis_that_is_set_later_leaves_the_others_their_targets(stage: Stage, robot: Robot, engine: Any) -> None:
+    async def is_moving() -> None:
+        while (await stage.x.locate())["readback"] < 0.002:
+            pass  # the next state
+
     def plan() -> Any:
         yield from bps.abs_set(stage.x, 0.04, group="later")
-        yield from bps.sleep(0.1)
+        yield from bps.wait_for([is_moving])
         yield from bps.abs_set(stage.y, 0.02, group="later")
         yield from bps.wait("later")
 
@@ -219,8 +230,8 @@ def test_a_paused_plan_stops_the_robot_and_resumes(stage: Stage, robot: Robot, e
     robot.override(10.0)
     documents: Documents = []
     plan = bp.scan([stage], stage.x, 0.02, 0.04, stage.y, 0.0, 0.01, num=2)
-    poses: list[Any] = []
-    with robot_poses(robot, poses):
+    states: list[State] = []
+    with robot_states(robot, states):
         with when(lambda: robot.state().pose.x > 0.005, engine.request_pause), pytest.raises(RunEngineInterrupted):
             engine(plan, lambda name, document: documents.append((name, document)))
         state = robot.state()
@@ -232,20 +243,32 @@ def test_a_paused_plan_stops_the_robot_and_resumes(stage: Stage, robot: Robot, e
     assert [at(row, x, y) for row, (x, y) in zip(data(documents), [(0.02, 0.0), (0.04, 0.01)], strict=True)] == [
         True
     ] * 2
-    assert np.abs(np.diff([pose.x for pose in poses])).max() < 0.02  # within 20 ms at full speed, or a few states lost
+    assert (
+        np.abs(np.diff([state.commanded.pose.x for state in states])).max() < 0.02
+    )  # within 20 ms at full speed, or a few states lost
     assert robot.state().faults == ()
 
 
-def test_ctrl_c_in_a_move_stops_the_robot(stage: Stage, robot: Robot, engine: Any) -> None:
+def test_ctrl_c_in_a_move_stops_the_robot(
+    stage: Stage, robot: Robot, engine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot.override(10.0)
     begin = newest_event(robot)
 
     def press_twice() -> None:  # the first asks for a pause at the next checkpoint, the second for one now
         os.kill(os.getpid(), signal.SIGINT)
         wait_until(lambda: engine._deferred_pause_requested, "the first Ctrl-C")
-        time.sleep(0.2)  # the engine takes two within 0.1 s as one
+        (handler,) = handlers
+        wait_until(lambda: time.monotonic() - handler._last_sigint_time > 0.1, "the handler takes earlier ones as one")
         os.kill(os.getpid(), signal.SIGINT)
 
+    handlers: list[Any] = []
+
+    def keep_handler(engine: Any) -> Any:
+        handlers.append(SigintHandler(engine))  # type: ignore[no-untyped-call]
+        return handlers[-1]
+
+    monkeypatch.setattr(engine, "context_managers", [keep_handler])
     with when(lambda: robot.state().pose.x > 0.005, press_twice), pytest.raises(RunEngineInterrupted):
         run(engine, bp.scan([stage], stage.x, 0.03, 0.04, 2))
     assert robot.state().mode == "holding"
@@ -277,6 +300,66 @@ def test_what_ends_a_goal_ends_the_plan_with_its_message(
     assert words in str(caught.value.__cause__)
 
 
+def step_of_the_guide() -> Any:
+    """Return the step of the guide's scan that a fault pauses."""
+    blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    (block,) = (block for block in blocks if "repeated_step" in block)
+    names: dict[str, Any] = {"bps": bps}
+    exec(block.partition("RE(")[0], names)
+    return names["repeated_step"]
+
+
+def test_a_scan_goes_on_after_a_fault_that_is_cleared(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(20.0)
+    documents: Documents = []
+    xs, begin = np.linspace(0.01, 0.05, 5), newest_event(robot)
+    plan = bp.scan([stage], stage.x, 0.01, 0.05, stage.y, 0.0, 0.02, num=5, per_step=step_of_the_guide())
+    with when(lambda: robot.state().pose.x > 0.025, robot.quick_stop), pytest.raises(RunEngineInterrupted):
+        engine(plan, lambda name, document: documents.append((name, document)))
+    assert engine.state == "paused"
+    state = robot.state()
+    assert (state.mode, len(data(documents))) == ("fault", 2)
+    clear_fault(robot)
+    robot.override(100.0)
+    engine.resume()
+    rows = data(documents)
+    assert [at(row, x, (x - 0.01) / 2.0) for row, x in zip(rows, xs, strict=True)] == [True] * 5
+    assert [document["seq_num"] for name, document in documents if name == "event"] == [1, 2, 3, 4, 5]
+    assert documents[-1][1]["exit_status"] == "success"
+    outcomes = [event.outcome for event in goal_events(robot, begin)]
+    assert (outcomes.count("faulted"), set(outcomes)) == (1, {"done", "faulted"})
+
+
+def test_a_plan_clears_a_fault_itself_and_repeats_the_point(stage: Stage, robot: Robot, engine: Any) -> None:
+    def clearing_step(detectors: Any, step: Any, pos_cache: Any) -> Any:
+        try:
+            yield from bps.one_nd_step(detectors, step, pos_cache)
+        except FailedStatus:
+            pos_cache.update(dict.fromkeys(step))
+            yield from bps.wait_for([lambda: asyncio.to_thread(clear_fault, robot)])
+            robot.override(100.0)
+            yield from bps.one_nd_step(detectors, step, pos_cache)
+
+    robot.override(20.0)
+    with when(lambda: robot.state().pose.x > 0.005, robot.quick_stop):
+        rows = data(run(engine, bp.scan([stage], stage.x, 0.0, 0.02, 3, per_step=cast(Any, clearing_step))))
+    assert [at(row, x) for row, x in zip(rows, (0.0, 0.01, 0.02), strict=True)] == [True] * 3
+
+
+def clear_fault(robot: Robot) -> None:
+    """Reset once the drives are at rest, and enable."""
+
+    def is_reset() -> bool:
+        try:
+            robot.reset()
+        except RefusedError:
+            return False
+        return True
+
+    wait_until(is_reset, "the drives are at rest")
+    robot.enable()
+
+
 def test_the_end_of_a_plan_leaves_goals_of_others_alone(stage: Stage, robot: Robot, engine: Any) -> None:
     run(engine, bps.mv(stage.x, 0.001))
     robot.override(10.0)
@@ -287,11 +370,12 @@ def test_the_end_of_a_plan_leaves_goals_of_others_alone(stage: Stage, robot: Rob
     assert goal.wait(WITHIN).outcome == "done"
 
 
-def pages(documents: Documents) -> dict[str, list[Any]]:
+def pages(documents: Documents, part: str = "data") -> dict[str, list[Any]]:
+    """Return the columns of a flight's data, or of their timestamps."""
     found: dict[str, list[Any]] = {}
     for name, document in documents:
         if name == "event_page":
-            for key, values in document["data"].items():
+            for key, values in document[part].items():
                 found.setdefault(key, []).extend(values)
     return found
 
@@ -303,6 +387,148 @@ def test_a_fly_scan_collects_every_state_on_the_way(stage: Stage, engine: Any) -
     assert np.all(np.diff(found["stage-t"]) > 0.0)
     assert found["stage-x"][0] == pytest.approx(0.01, abs=1e-3)
     assert max(found["stage-y"]) == pytest.approx(0.01, abs=1e-3)
+
+
+def outcome_of(robot: Robot, begin: int) -> str | None:
+    """Wait until the robot is at rest; return the outcome of its last goal after an event."""
+    wait_until(
+        lambda: robot.state().mode != "moving" and bool(goal_events(robot, begin)), "the end of the flight", 0.01
+    )
+    return goal_events(robot, begin)[-1].outcome
+
+
+def test_an_error_in_a_plan_stops_its_flight(stage: Stage, robot: Robot, engine: Any) -> None:
+    flight = stage.fly_to(0.05, 0.0, 0.0)
+
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.kickoff(flight, wait=True)
+        raise ValueError("another device has failed")
+
+    robot.override(10.0)
+    begin = newest_event(robot)
+    with pytest.raises(ValueError, match="another device"):
+        run(engine, plan())
+    assert outcome_of(robot, begin) == "stopped"
+
+
+def test_a_pause_stops_a_flight_and_resume_repeats_it(stage: Stage, robot: Robot, engine: Any) -> None:
+    points = [(0.0, 0.01, 0.0, 0.0), (0.5, 0.02, 0.01, 0.05), (1.0, 0.03, 0.0, 0.0)]
+    robot.override(20.0)
+    begin = newest_event(robot)
+    documents: Documents = []
+    with when(lambda: robot.state().pose.x > 0.015, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        engine(bp.fly([stage.follow(points)]), lambda name, document: documents.append((name, document)))
+    assert (engine.state, robot.state().mode) == ("paused", "holding")
+    assert 0.01 < robot.state().commanded.pose.x < 0.03
+    robot.override(100.0)
+    engine.resume()
+    assert [event.outcome for event in goal_events(robot, begin)] == ["done", "stopped", "done", "done"]
+    found = pages(documents)
+    assert (found["stage-x"][0], found["stage-x"][-1]) == pytest.approx((0.01, 0.03), abs=1e-3)
+    assert np.all(np.diff(found["stage-t"]) > 0.0)
+    assert max(np.diff(found["stage-t"])) < 1.0  # of one flight
+    assert documents[-1][1]["exit_status"] == "success"
+
+
+def test_an_abort_of_a_paused_flight_leaves_the_robot_at_rest(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(10.0)
+    begin = newest_event(robot)
+    with when(lambda: robot.state().pose.x > 0.005, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        run(engine, bp.fly([stage.fly_to(0.05, 0.0, 0.0)]))
+    engine.abort()
+    assert outcome_of(robot, begin) == "stopped"
+    assert robot.state().commanded.pose.x < 0.05
+
+
+def test_a_reading_has_the_time_of_its_state(stage: Stage, robot: Robot, engine: Any) -> None:
+    states: list[State] = []
+    with robot_states(robot, states):
+        scanned = run(engine, bp.count([stage], num=3))
+        flown = run(engine, bp.fly([stage.fly_to(0.03, 0.0, 0.0, speed=0.3)]))
+    times = {state.t: state.time for state in states}
+    read = [(document["data"]["stage-t"], set(document["timestamps"].values()))
+            for name, document in scanned if name == "event"]  # fmt: skip
+    assert len(read) == 3
+    assert all(stamps == {times[t]} for t, stamps in read if t in times)
+    ts, stamps = pages(flown)["stage-t"], pages(flown, "timestamps")
+    assert all(column == stamps["stage-t"] for column in stamps.values())
+    shared = [(t, stamp) for t, stamp in zip(ts, stamps["stage-t"], strict=True) if t in times]
+    assert len(shared) > 10
+    assert shared == [(t, times[t]) for t, _ in shared]
+    assert np.median(np.abs(np.diff(stamps["stage-t"]) - np.diff(ts))) < 1e-3
+    assert abs(time.time() - stamps["stage-t"][-1]) < WITHIN
+
+
+def test_a_monitor_gets_every_state_until_it_is_removed(stage: Stage, robot: Robot, engine: Any) -> None:
+    def plan() -> Any:
+        yield from bps.open_run()
+        yield from bps.monitor(stage, name="states")
+        yield from bps.monitor(stage.x, name="x")
+        yield from bps.mv(stage.x, 0.03)
+        yield from bps.unmonitor(stage.x)
+        yield from bps.unmonitor(stage)
+        yield from bps.create()
+        yield from bps.read(stage)
+        yield from bps.save()
+        yield from bps.close_run()
+
+    documents = run(engine, plan())
+    streams = {document["uid"]: document["name"] for name, document in documents if name == "descriptor"}
+    told = [(streams[document["descriptor"]], document) for name, document in documents if name == "event"]
+    assert [stream for stream, _ in told[-1:]] == ["primary"]
+    last = told[-1][1]["data"]["stage-t"]
+    whole = [document for stream, document in told if stream == "states"]
+    times = [document["data"]["stage-t"] for document in whole]
+    assert times == sorted(set(times))
+    assert times[-1] < last
+    assert max(document["data"]["stage-x"] for document in whole) > 0.02
+    assert all(set(document["timestamps"].values()) == {document["timestamps"]["stage-t"]} for document in whole)
+    places = [document["data"] for stream, document in told if stream == "x"]
+    assert len(places) > 5
+    assert {name for place in places for name in place} == {"stage-x"}
+    assert stage._monitors == stage.x._monitors == {}
+    assert isinstance(stage, Subscribable)
+    assert isinstance(stage.pose, Subscribable)
+
+
+def test_a_monitor_rests_while_the_plan_is_paused(stage: Stage, robot: Robot, engine: Any) -> None:
+    robot.override(10.0)
+    documents: Documents = []
+    monitored: Any = bpp.monitor_during_wrapper  # which has no types
+    plan = monitored(bp.scan([stage], stage.x, 0.02, 0.03, 2), [stage.y])
+    with when(lambda: robot.state().pose.x > 0.002, engine.request_pause), pytest.raises(RunEngineInterrupted):
+        engine(plan, lambda name, document: documents.append((name, document)))
+    assert stage.y._monitors == {}
+    before = len(documents)
+    state = robot.state()
+    wait_until(lambda: robot.state().seq > state.seq)
+    assert len(documents) == before
+    robot.override(100.0)
+    engine.resume()
+    places = [row for row in data(documents[before:]) if "stage-y" in row and "stage-x" not in row]
+    assert len(places) > 5
+
+
+def test_an_error_of_a_monitor_does_not_end_it(stage: Stage, engine: Any, caplog: pytest.LogCaptureFixture) -> None:
+    calls: list[float] = []
+
+    def fail(readings: dict[str, Any]) -> None:
+        calls.append(readings["stage-x"]["value"])
+        raise ValueError("this monitor fails")
+
+    def plan() -> Any:
+        stage.x.subscribe_reading(fail)
+        with pytest.raises(ValueError, match="already"):
+            stage.x.subscribe_reading(fail)
+        yield from bps.mv(stage.x, 0.01)
+        stage.x.clear_sub(fail)
+
+    run(engine, plan())
+    assert len(calls) > 3
+    assert "a monitor of stage-x failed" in caplog.text
+    with pytest.raises(KeyError):
+        stage.x.clear_sub(fail)
 
 
 def test_a_fly_scan_that_is_stopped_fails_with_the_reason(stage: Stage, robot: Robot, engine: Any) -> None:
@@ -322,6 +548,27 @@ def test_a_stage_is_named_after_its_variable_or_stage(stage: Stage, robot: Robot
     assert {"table-x", "table-pose", "table-t"} < set(data(run(engine, bp.count([table])))[0])
 
 
+def test_a_stage_is_used_in_one_event_loop_after_another(stage: Stage, robot: Robot, engine: Any) -> None:
+    other = Stage(robot, "other")
+    links = []
+
+    async def use(x: float) -> None:
+        link, again = await asyncio.gather(other.link(), other.link())
+        assert link is again
+        links.append(link)
+        await other.x.set(x)
+        assert (await other.read())["other-x"]["value"] == pytest.approx(x, abs=HALF_WINDOW)
+
+    for x in (0.01, 0.02):
+        asyncio.run(use(x))
+    rows = data(run(engine, scans([other], other.x, [0.0])))
+    assert [round(row["other-x"], 3) for row in rows] == [0.0]
+    first, second = links
+    for link in (first, second):  # nothing is received for an event loop that is closed
+        with pytest.raises(ServiceError):
+            asyncio.run(link.robot.state())
+
+
 def with_outputs(config: Path) -> None:
     text = config.read_text(encoding="utf-8")
     config.write_text(text + '\n[outputs.strobe]\ndrive = "A"\nbit = 16\n', encoding="utf-8")
@@ -336,10 +583,14 @@ def test_a_fly_scan_with_marks_collects_the_table_of_switches(engine: Any, tmp_p
         robot.enable()
         marks = [{"output": "strobe", "start": 0.002, "end": 0.018, "increment": 0.002, "pulse_width": 0.003}]
         flight = stage.fly_to(0.02, 0.0, 0.0, marks=marks, speed=0.3, name="strobes")
-        found = pages(run(engine, bp.fly([flight])))
+        flown = run(engine, bp.fly([flight]))
+    found, stamps = pages(flown), pages(flown, "timestamps")
     on = [x for x, value in zip(found["strobes-commanded_x"], found["strobes-value"], strict=True) if value]
     assert on == pytest.approx(np.arange(1, 10) * 0.002, abs=5e-4)
     assert set(found["strobes-output"]) == {"strobe"}
+    assert all(column == found["strobes-time"] for column in stamps.values())
+    late = np.diff(found["strobes-time"]) - np.diff(found["strobes-t"])  # where ticks were missed, between two tables
+    assert np.median(np.abs(late)) < 1e-4
 
 
 def test_a_service_that_is_killed_ends_the_plan_and_the_next_one_works(
@@ -365,10 +616,15 @@ def test_a_service_that_is_killed_ends_the_plan_and_the_next_one_works(
                 with pytest.raises((FailedStatus, TrirailError)):
                     run(engine, bps.mv(stage.x, 0.03))
                 first.wait(WITHIN)
+                text = config.read_text(encoding="utf-8")
+                changed = re.sub(r"^x = \[.*?\]", "x = [-0.12, 0.12]", text, count=1, flags=re.MULTILINE)
+                config.write_text(changed, encoding="utf-8")
                 second = own_service.start(config, log)
                 try:
                     robot.enable()
-                    run(engine, bps.mv(stage.x, 0.03))
+                    documents = run(engine, scans([stage], stage.x, [0.02, 0.03]))
+                    keys = next(document["data_keys"] for name, document in documents if name == "descriptor")
+                    assert keys["stage-x"]["limits"] == {"control": {"low": -0.12, "high": 0.12}}
                     assert robot.state().pose.x == pytest.approx(0.03, abs=HALF_WINDOW)
                 finally:
                     own_service.end(second)

@@ -38,6 +38,7 @@ def a_state(**changed: Any) -> State:
     state = State(
         seq=1,
         t=1.0,
+        time=1.7e9,
         mode="holding",
         pose=Pose(*REST),
         velocity=REST,

@@ -11,7 +11,7 @@ from refusals import refused_as
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.errors import RefusalCode, RefusedError
-from trirail.wire.goals import TrajectoryPoint
+from trirail.wire.goals import MoveGoal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.records import unpack
 from trirail.wire.state import State
 from trirail.wire.vocabulary import Role
@@ -82,6 +82,33 @@ def test_a_session(locator: str) -> None:
         await robot.quick_stop()
         await robot.reset()
         await robot.disable()
+
+    run(locator, work)
+
+
+def test_a_check_is_answered_as_the_goal_and_moves_nothing(locator: str) -> None:
+    async def work(robot: AsyncRobot) -> None:
+        goal = PoseGoal(0.02, 0.01, 0.1, id="checked")
+        replies = await asyncio.gather(*(robot.check(goal) for _ in range(5)))
+        state = await robot.state()
+        assert (state.mode, state.goal) == ("holding", None)
+        assert {(reply.id, reply.accepted) for reply in replies} == {("checked", True)}
+        with refused_as(RefusalCode.OUT_OF_WORKSPACE):
+            await robot.check(PoseGoal(0.3, 0.0, 0.0))
+        with refused_as(RefusalCode.MALFORMED):
+            await robot.check(VelocityGoal(0.01, 0.0, 0.0))
+        points = tuple(TrajectoryPoint(t, 0.01 * t, 0.0, 0.0) for t in (0.0, 1.0))
+        assert (await robot.check(TrajectoryGoal(points))).duration == pytest.approx(1.0, abs=0.01)
+        await robot.override(10.0)
+        checks = [asyncio.create_task(robot.check(goal)) for _ in range(5)]
+        moving = await robot.send(goal)
+        assert {(await check).accepted for check in checks} == {True}
+        assert replies[0].duration is not None
+        assert moving.duration == pytest.approx(10.0 * replies[0].duration, rel=0.01)
+        assert (await robot.check(MoveGoal(0.001, 0.0, 0.0))).duration is not None
+        assert (await robot.state()).mode == "moving"
+        await robot.override(100.0)
+        assert (await moving.wait(WITHIN)).outcome == "done"
 
     run(locator, work)
 

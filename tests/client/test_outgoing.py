@@ -33,7 +33,7 @@ from trirail.client.outgoing import number, seconds
 from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire import boundary
 from trirail.wire.goals import KINDS as EVERY_KIND
-from trirail.wire.goals import Goal, OwnLimits, TrajectoryGoal, TrajectoryPoint, VelocityGoal
+from trirail.wire.goals import Goal, OwnLimits, PathGoal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import CommandReply, Event, GoalReply
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, ReleaseLease, Stop
@@ -58,10 +58,10 @@ class Taken:
         payload = query.payload.to_bytes() if query.payload is not None else b""
         with query:
             reply: msgspec.Struct
-            if what == "goal":
-                goal = boundary.decode(payload, Goal, "not a goal")
+            if what in ("goal", "check"):
+                goal = boundary.decode(payload, Goal if what == "goal" else PathGoal, "not a goal")
                 self.said.append(goal)
-                reply = GoalReply(goal.id, 1.0)
+                reply = GoalReply(goal.id or "", 1.0)
                 if isinstance(goal, VelocityGoal) and not any((goal.x, goal.y, goal.phi)):
                     self._end(goal.id)
             else:
@@ -149,6 +149,7 @@ CALLS: dict[str, Call] = {
     "follow, rows": lambda robot, n: robot.follow([(0.0, n, n, n), [n, n, n, n]]),
     "jog": lambda robot, n: robot.jog(n, n, n, timeout=n, tool=(n, n)),
     "track": lambda robot, n: robot.track(timeout=n),
+    "check": lambda robot, n: robot.check(PoseGoal(n, n, n, speed=n, limits=limits(n), valid_for=n)),
     "override": lambda robot, n: robot.override(n),
     "lease": lambda robot, n: robot.lease(timeout=n),
     "acquire": lambda robot, n: robot.acquire(AcquireLease("mine", n)),
@@ -215,6 +216,12 @@ def test_a_goal_of_any_kind_and_any_command_with_its_content_are_sent_as_they_ar
             for goal in goals:
                 await done(robot, lambda robot, goal: robot.send(goal), goal)
                 assert SERVICE[0].taken() == [structs.replace(goal, id=None)]
+                if type(goal).renewed:
+                    with refused_as(RefusalCode.MALFORMED):
+                        await done(robot, lambda robot, goal: robot.check(goal), goal)
+                else:
+                    await done(robot, lambda robot, goal: robot.check(goal), goal)
+                    assert SERVICE[0].taken() == [structs.replace(goal, id=None)]
             for name, content in contents.items():
                 if name not in STOPS:
                     await done(robot, lambda robot, order: robot.command(*order), (name, content))

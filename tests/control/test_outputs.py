@@ -338,6 +338,16 @@ def test_marks_that_a_cancelled_blend_had_cut_off_switch_again(rig: Rig) -> None
     assert [(row.goal, row.mark) for row in rig.switches] == [("g1", 0), ("g1", 1)]
 
 
+def test_the_places_of_accepted_marks_are_an_event_for_all(rig: Rig) -> None:
+    marks = (Mark("valve", after_start=0.01), Mark("light", start=0.01, end=0.03, increment=0.01, pulse_width=0.01))
+    rig.send("g1", PoseGoal(0.05, 0.0, 0.0, marks=marks))
+    rig.send("g2", PoseGoal(0.0, 0.0, 0.0))
+    accepted = next(answer for answer in rig.answers if isinstance(answer, Accepted) and answer.reply.id == "g1")
+    (notice,) = [notice for notice in rig.notices if notice.event_code == EventCode.MARKS_PLANNED]
+    assert (notice.goal, notice.planned) == ("g1", accepted.reply.marks)
+    assert [(mark.output, mark.number) for mark in notice.planned] == [("valve", 1), ("light", 3)]
+
+
 def test_marks_of_a_preempted_goal_do_not_switch(rig: Rig) -> None:
     rig.send("g1", PoseGoal(0.05, 0.0, 0.0, speed=0.3, marks=(Mark("valve", after_start=0.04),)))
     rig.cycles(10)

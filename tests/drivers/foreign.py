@@ -188,6 +188,8 @@ class ForeignDrive:
         self._consumer_heard: float | None = None
         self._toggle = 0
         self._syncs = 0
+        self.switched: list[tuple[int, int]] = []
+        """Changes of its digital outputs by PDO: number of the SYNC since its start, and the bits of 60FEh:01."""
         self._feedback()
 
     # ---- its dictionary
@@ -370,6 +372,8 @@ class ForeignDrive:
             at += size
             if not self.has(mapped, subindex):
                 continue
+            if (mapped, subindex) == (0x60FE, 1) and self.value(mapped, subindex) != int.from_bytes(piece, "little"):
+                self.switched.append((self._syncs, int.from_bytes(piece, "little")))
             self.local.data_store.setdefault(mapped, {})[subindex] = piece
             value = int.from_bytes(piece, "little", signed=True)
             if mapped == 0x6040:

@@ -38,7 +38,7 @@ from trirail.wire.state import (
     Sliders,
     State,
 )
-from trirail.wire.vocabulary import Command, Override, Role
+from trirail.wire.vocabulary import Command, Override, Role, SetOutput
 from trirail_drivers.interface import Triple
 
 T = TypeVar("T")
@@ -78,6 +78,8 @@ class FakeRobot:
         self.moved_to: list[tuple[Triple, Tool | None, str]] = []
         self.followed: list[tuple[TrajectoryPoint, ...]] = []
         self.connected = ["ann", "bob"]
+        self.outputs: dict[str, bool] = {}
+        self.inputs: dict[str, bool] = {}
         self.warnings: tuple[str, ...] = ()
         self.forced: list[bool] = []
         self.named = {"park": (0.0, 0.05, 0.0)}
@@ -220,6 +222,9 @@ class FakeRobot:
             self._advance()
             if name == Command.OVERRIDE and content is not None:
                 self.share = msgspec.json.decode(content, type=Override).percent / 100.0
+            if name == Command.SET_OUTPUT and content is not None:
+                wanted = msgspec.json.decode(content, type=SetOutput)
+                self.outputs[wanted.output] = wanted.value
             if name == Command.STOP:
                 self._stand("stopped", "stop of ann")
             self.mode = {"enable": "holding", "disable": "disabled", "reset": "disabled"}.get(name, self.mode)
@@ -273,6 +278,7 @@ class FakeRobot:
         return State(
             seq=seq,
             t=seq / 1e3,
+            time=1.7e9 + seq / 1e3,
             mode=self.mode,
             pose=Pose(x, y, phi),
             velocity=self.velocity,
@@ -285,6 +291,8 @@ class FakeRobot:
             loop=LOOP,
             settled=True,
             lease=self.holder,
+            outputs=dict(self.outputs),
+            inputs=dict(self.inputs),
             warnings=self.warnings,
         )
 

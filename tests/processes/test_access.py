@@ -28,7 +28,7 @@ MAINTAINERS = {"reset", "home"}
 
 KEYS = [
     *PUBLISHED, "info", "alive", "role/ME", "role/bob", "goal/ME", "goal/bob", "goal/*",
-    "alignment/ME", "alignment/bob", "alignment/*",
+    "alignment/ME", "alignment/bob", "alignment/*", "check/ME", "check/bob", "check/*",
     *(f"cmd/{who}/{name}" for who in ("ME", "bob", "*") for name in Command), "cmd/ME/dance", "cmd/*/*", "role/*",
     "here/ME", "here/bob",
     "poses", *(f"{what}/{who}/pick" for what in ("teach", "forget") for who in ("ME", "bob", "*")), "teach/*/*",
@@ -43,12 +43,12 @@ def allowed(role: Role | None, flow: str, message: str) -> set[str]:
     sends = role in (Role.OPERATOR, Role.MAINTAINER)
     mine = (
         ({"cmd/ME/stop"} if asking else set())
-        | ({f"cmd/ME/{name}" for name in OPERATORS} | {"goal/ME", "alignment/ME"} if sends else set())
+        | ({f"cmd/ME/{name}" for name in OPERATORS} | {"goal/ME", "check/ME", "alignment/ME"} if sends else set())
         | ({f"cmd/ME/{name}" for name in MAINTAINERS} if role is Role.MAINTAINER else set())
         | ({"teach/ME/pick", "forget/ME/pick"} if role is Role.MAINTAINER else set())
     )
     roles = {"role/ME", "role/bob", "role/*"}
-    of_all = {key for key in KEYS if key.split("/")[0] in ("goal", "alignment", "cmd", "teach", "forget")}
+    of_all = {key for key in KEYS if key.split("/")[0] in ("goal", "check", "alignment", "cmd", "teach", "forget")}
     told, here = {"info", "poses"}, {"here/ME", "here/bob"}
     adv = {"event/@adv/pub/1/2/_"}
     table: dict[tuple[str, str], set[str]] = {

@@ -358,6 +358,20 @@ def test_bad_goals(shared: tuple[Service, Robot, zenoh.Session], payload: bytes,
     assert state.commanded.position == pytest.approx(before, abs=1e-12)
 
 
+def test_bad_checks(shared: tuple[Service, Robot, zenoh.Session]) -> None:
+    _, robot, session = shared
+    points = [{"t": t, "x": 0.0, "y": 0.0, "phi": 0.0} for t in (0.0, 1.0)]
+    part = json.dumps({"kind": "trajectory", "id": "t", "part": {"number": 1, "of": 2}, "points": points})
+    jog = '{"kind":"velocity","x":0.01,"y":0,"phi":0,"timeout":0.1}'
+    for payload, said in ((part, "one message"), (jog, "not a goal to check"), ("", "not a goal to check")):
+        (reply,) = session.get("trirail/demo/check/eve", payload=payload)
+        assert reply.err is not None
+        error = json.loads(reply.err.payload.to_bytes())
+        assert error["code"] == "malformed"
+        assert said in error["message"]
+    assert robot.state().mode == "holding"
+
+
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, Robot, zenoh.Session]]:
     """One enabled service for the tests that ask it for nothing but a no."""

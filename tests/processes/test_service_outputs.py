@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -101,6 +102,9 @@ def test_a_goal_tells_its_switches_and_they_are_in_the_recording(
     words = dict(zip(recorded.records["cycle"].tolist(), recorded.records["outputs"][:, 0].tolist(), strict=True))
     for on in pulses[::2]:
         assert (words[on.cycle - 1] >> 16 & 1, words[on.cycle] >> 16 & 1) == (0, 1)
+    due = dict(zip(recorded.records["cycle"].tolist(), recorded.records["deadline_ns"].tolist(), strict=True))
+    offsets = [each.time - due[each.cycle] * 1e-9 for each in result.marks]  # of the wall clock, in missed ticks too
+    assert offsets == pytest.approx([time.time() - time.monotonic()] * len(offsets), abs=1e-3)
     compared = replay_session(recorded, load(service.folder / "robot.toml"), simulated=False)
     assert (compared.differing, compared.plans_differing) == (0, 0)
     path = tmp_path / "switches.npy"
@@ -117,3 +121,11 @@ def test_marks_that_cannot_be_are_refused_and_nothing_moves(robot: Robot) -> Non
         with pytest.raises(RefusedError, match=what):
             robot.move_to(x=0.02, y=0.0, phi=0.0, marks=marks)
     assert robot.state().commanded.position == before
+
+
+def test_outputs_are_safe_at_the_end_of_the_service(service: Service, robot: Robot) -> None:
+    robot.set_output("valve", True)
+    until(robot, lambda state: state.outputs["valve"])
+    assert service.end() == 0
+    sent = [int.from_bytes(data, "little") >> 16 & 1 for identifier, data in service.frames() if identifier == 0x401]
+    assert sent[-2:] == [1, 0]

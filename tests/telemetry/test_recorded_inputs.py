@@ -7,10 +7,18 @@ import pytest
 from trirail.errors import RefusalCode
 from trirail.telemetry.recorded_inputs import decode_input, encode_input
 from trirail.wire.event_codes import EventCode, coded
-from trirail.wire.goals import PoseGoal
+from trirail.wire.goals import PoseGoal, SlidersGoal
 from trirail.wire.looks import AlignmentLook, alignment_event_text
 from trirail.wire.messages import GoalReply, Notice
-from trirail.wire.packets import Announcement, CommandRequest, ControlInput, Disturbance, GivenInput, GoalRequest
+from trirail.wire.packets import (
+    Announcement,
+    CheckRequest,
+    CommandRequest,
+    ControlInput,
+    Disturbance,
+    GivenInput,
+    GoalRequest,
+)
 from trirail.wire.plan_packets import NotPlanned, PackedPath, PackedRun, PathExtension, PreemptingMotion
 from trirail.wire.vocabulary import Command, Override
 
@@ -55,6 +63,11 @@ LINES: list[tuple[GivenInput, str]] = [
         '{"type":"GoalRequest","ticket":1,"user":"ann","id":"g","goal":{"kind":"pose","x":0.01,"y":0.0,"phi":0.0,'
         '"id":null,"speed":1.0,"valid_for":null,"limits":null,"blend":null,"tool":null,"frame":"base"},'
         '"received_ns":5,"withdrawn":null,"age":0.0}',
+    ),
+    (
+        CheckRequest(1, "ann", SlidersGoal((0.01, 0.0, 0.0))),
+        '{"type":"CheckRequest","ticket":1,"user":"ann","goal":{"kind":"sliders","position":[0.01,0.0,0.0],'
+        '"id":null,"speed":1.0,"valid_for":null,"marks":[],"stop_at":null}}',
     ),
     (
         CommandRequest(2, "ann", Command.OVERRIDE, Override(50.0)),

@@ -12,7 +12,7 @@ import pytest
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
-from trirail.config import SIM, FramesTable, LegTable, load
+from trirail.config import SIM, FramesTable, Input, LegTable, Output, load
 from trirail.kinematics.geometry import Geometry, Leg
 from trirail.processes.publications import info
 from trirail.telemetry.drawn_robot import DrawnRobot
@@ -243,3 +243,28 @@ def test_tools_and_work_frames_are_drawn_with_their_names_as_a_service_tells_the
     assert (x[1] - x[0])[0] == pytest.approx(0.0, abs=1e-6)
     assert (x[1] - x[0])[1] > 0.0
     assert (y[1] - y[0])[0] < 0.0
+
+
+def test_outputs_and_inputs_are_drawn_where_they_change() -> None:
+    config = msgspec.structs.replace(
+        CONFIG, outputs={"valve": Output("A", 16), "lamp": Output("A", 17)}, inputs={"part": Input("C", 20)}
+    )
+    records = made.records(0.2)
+    on = np.arange(len(records)) % 40 >= 25
+    records["outputs"], records["inputs"] = 1 << 18, 1 << 21  # bits that nobody has named
+    records["outputs"][:, 0] |= np.where(on, 1 << 16, 0).astype(np.uint32)
+    records["inputs"][:, 2] |= np.where(on, 0, 1 << 20).astype(np.uint32)
+    for robot in (DrawnRobot.from_config(config), DrawnRobot.from_info(info(config))):
+        drawn = by_entity(Scene(robot, 0).drawn(records, ReadoutState()))
+        valve = drawn["/signals/outputs/valve"].to_record_batch()
+        changes = np.flatnonzero(np.diff(on, prepend=not on[0]))
+        assert valve.column("t").to_numpy().astype(int).tolist() == (records["cycle"][changes] * 1_000_000).tolist()
+        levels = valve.column("StateChange:state").to_pylist()
+        assert levels == [["on" if each else "off"] for each in on[changes]]
+        part = drawn["/signals/inputs/part"].to_record_batch().column("StateChange:state").to_pylist()
+        assert part == [["off" if level == ["on"] else "on"] for level in levels]
+        assert drawn["/signals/outputs/lamp"].to_record_batch().column("StateChange:state").to_pylist() == [["off"]]
+        still = dict(Scene(robot, 0).still())
+        assert {path for path in still if path.startswith("/signals")} == {
+            path for path in drawn if path.startswith("/signals")
+        }

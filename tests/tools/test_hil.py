@@ -129,6 +129,7 @@ def test_the_second_robot_has_another_rate_a_drive_to_home_and_one_that_others_m
     assert second.zenoh.listen != first.zenoh.listen
     assert second.telemetry.directory != first.telemetry.directory
     assert [drive.homing is not None for drive in second.drives.each] == [True, False, False]
+    assert (second.outputs["valve"].drive, 1 << second.outputs["valve"].bit) == ("C", hil_second.VALVE)
     assert second.drives.C.revolutions_per_metre == hil_second.REVOLUTIONS
     assert second.limits.slider.following_error < second.drives.following_error
     assert hil_second.MAKE in MAKES
@@ -161,6 +162,14 @@ def test_the_foreign_drive_says_its_units_and_what_it_lacks() -> None:
         for end in ends:
             end.shutdown()
     assert said == ["C switch on disabled, 0.000 mm"]
+
+
+def test_changes_of_the_foreign_drives_outputs_are_compared_with_the_table() -> None:
+    log = "C operation enabled, 0.1 mm\noutputs 00010000 at SYNC 71, 3.500\noutputs 00000000 at SYNC 74, 3.800\n"
+    changes = [(each.sync, each.on) for each in hil_second.changes(log)]
+    assert hil_second.cycles_problem([(170, True), (173, False)], changes) == ""
+    assert "[-99, -100] SYNCs" in hil_second.cycles_problem([(170, True), (174, False)], changes)
+    assert "in the table to [True]" in hil_second.cycles_problem([(170, True)], changes)
 
 
 def test_the_time_limit_says_what_was_heard_last() -> None:

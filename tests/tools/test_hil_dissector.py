@@ -58,3 +58,14 @@ def test_a_node_that_was_told_to_leave_operational_has_not_fallen(tmp_path: Path
 
 def test_what_comes_of_a_disturbance_is_no_problem(tmp_path: Path) -> None:
     assert problems(tmp_path, "(2.0) can1 702#7F\n(2.1) can1 082#8130110000000000\n", until=1.5) == []
+
+
+def test_switches_are_pdos_that_change_an_output(tmp_path: Path) -> None:
+    log = tmp_path / "bus.log"
+    log.write_text(
+        "(1.00) can1 080#\n(1.01) can1 403#00000000\n(2.00) can1 080#\n(2.01) can1 403#00000100\n"
+        "(2.02) can1 402#00000000\n(3.00) can1 080#\n(3.01) can1 403#00000300\n(4.00) can1 080#\n"
+        "(4.01) can1 403#00000200\n(4.02) can1 083#3081000000000000\n(5.00) can1 080#\n"
+    )
+    found = hil_dissector.switches(hil_dissector.dissect(log), 3, 1 << 16)
+    assert found == [(2, True, 3.0), (4, False, 5.0)]

@@ -14,6 +14,8 @@ from trirail.wire.packets import (
     Accepted,
     Announcement,
     Answer,
+    Checked,
+    CheckRequest,
     CommandDone,
     CommandRequest,
     EventReport,
@@ -33,6 +35,7 @@ from trirail.wire.vocabulary import Command
     "request_",
     [
         GoalRequest(1, "ann", "g", PoseGoal(x=0.1, y=0.2, phi=0.3, speed=0.5, valid_for=1.0), 5),
+        CheckRequest(1, "ann", PoseGoal(x=0.1, y=0.2, phi=0.3)),
         CommandRequest(2, "ann", Command.STOP),
         Announcement(Notice("refused", "warning", "no", user="ann", code=RefusalCode.BUSY)),
         Announcement(Notice("pose", "info", "pose pick removed by ann", user="ann")),
@@ -50,6 +53,7 @@ def test_requests(request_: Request) -> None:
     "answer",
     [
         Accepted(1, GoalReply("g", 0.5, queued=True)),
+        Checked(1, GoalReply("", 0.5)),
         CommandDone(2, Command.STOP, "holding", 1),
         Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
         EventReport(Event("goal", "info", "goal g done", id="g", outcome="done", seq=1, t=0.5, cycle=500, time=1.0)),

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, cast
 
-from bluesky.protocols import EventCollectable, Flyable, Reading
+from bluesky.protocols import EventCollectable, Flyable, Pausable, Reading
 from event_model import DataKey, PartialEvent
 from ophyd_async.core import AsyncStatus, Device
 
@@ -35,10 +35,11 @@ COLUMNS: dict[str, tuple[str, str]] = {
 """Type and unit of each column of the table of switches."""
 
 
-class Flight(Device, Flyable, EventCollectable):
+class Flight(Device, Flyable, EventCollectable, Pausable):
     """A fly scan of a stage: `kickoff` starts the path, `complete` is done with it, `collect` yields its data.
 
-    `send` sends its goal. `first` are the coordinates to which the robot moves before, by their index.
+    `send` sends its goal. `first` are the coordinates to which the robot moves before, by their index. A path ends at
+    the latest with the plan that has started it: the RunEngine itself stops only what was set.
     """
 
     def __init__(
@@ -55,8 +56,13 @@ class Flight(Device, Flyable, EventCollectable):
         self._first = first
         self._goal: AsyncGoalHandle | None = None
         self._sampling: asyncio.Task[None] | None = None
-        self._samples: list[dict[str, Reading[Any]]] = []
-        self._interrupted = self._stopped = False
+        self._samples: list[tuple[str, dict[str, Reading[Any]]]] = []
+        """Readings, each with the id of the goal under way: states can arrive before the acceptance of the path."""
+        self._sending = asyncio.Lock()
+        self._interrupted: AsyncGoalHandle | None = None
+        """Goal whose stop was requested, and is no failure."""
+        self._stopped = False
+        self._stopping: asyncio.Task[None] | None = None
         super().__init__(name)
 
     @property
@@ -67,44 +73,66 @@ class Flight(Device, Flyable, EventCollectable):
         """Connect the stage."""
         await self._stage.link()
 
-    @AsyncStatus.wrap
-    async def kickoff(self) -> None:
-        """Move to the first point; done when the service has accepted the path."""
+    def kickoff(self) -> AsyncStatus[None]:
+        """Move to the first point; done when the service has accepted the path.
+
+        The path is stopped if it is still under way when the running task ends, which is that of the plan.
+        """
+        status = AsyncStatus(self._kickoff())
+        if (plan := asyncio.current_task()) is not None:
+            plan.add_done_callback(lambda _: self._end_with_plan(status))
+        return status
+
+    async def _kickoff(self) -> None:
         link = await self._stage.link()
         self._goal, self._samples = None, []
-        self._interrupted = self._stopped = False
+        self._stopped = False
+        self._sending = asyncio.Lock()  # of this event loop
         if self._first is not None:
             await link.mover.start(self._first).end
-        if self._stopped:  # mypy cannot know that stop() runs meanwhile
-            raise TrirailError("stopped before its goal was sent")
-        if not self._has_marks:
-            self._sampling = asyncio.create_task(self._sample(link.robot))
-        try:
-            self._goal = await self._send(link.robot)
-        except BaseException:
-            self._end_sampling()
-            raise
+        async with self._sending:
+            if self._stopped:  # mypy cannot know that stop() runs meanwhile
+                raise TrirailError("stopped before its goal was sent")
+            if not self._has_marks:
+                self._sampling = asyncio.create_task(self._sample(link.robot))
+                self._sampling.add_done_callback(lambda task: task.cancelled() or task.exception())
+            try:
+                self._goal = await self._send(link.robot)
+            except BaseException:
+                self._end_sampling()
+                raise
 
     @AsyncStatus.wrap
     async def complete(self) -> None:
         """Done when the robot is measured to be at the end; fails with the reason if the path ends otherwise."""
-        if self._goal is None:
+        goal = self._goal
+        if goal is None:
             raise TrirailError(f"{self.name}: complete before kickoff")
         link = await self._stage.link()
         try:
-            result = await link.mover.settle(self._goal)
+            result = await link.mover.settle(goal)
         finally:
             self._end_sampling()
-        if not self._interrupted:
+        if goal is not self._interrupted:
             check_done(result)
 
     async def stop(self, success: bool = True) -> None:
         """Stop the path; return when the robot is at rest."""
         self._stopped = True
         await (await self._stage.link()).mover.stop(success)
-        if self._goal is not None and self._goal.result is None:
-            self._interrupted |= success
-            await cancel(self._goal)
+        async with self._sending:  # a goal that is being sent is first accepted
+            goal = self._goal
+        if goal is not None and goal.result is None:
+            self._interrupted = goal if success else None
+            await cancel(goal)
+        self._end_sampling()
+
+    async def pause(self) -> None:
+        """Stop the path; a plan that resumes from a checkpoint before `kickoff` repeats it from its start."""
+        await self.stop()
+
+    async def resume(self) -> None:
+        """Do nothing: the plan repeats `kickoff`."""
 
     async def describe_collect(self) -> dict[str, dict[str, DataKey]]:
         """Return the columns of the collected data, in a stream of the flight's name."""
@@ -115,11 +143,25 @@ class Flight(Device, Flyable, EventCollectable):
 
     async def collect(self) -> AsyncIterator[PartialEvent]:
         """Yield a row per switch on the path; without marks, one per state."""
-        rows = self._switches() if self._has_marks else self._samples
+        goal_id = self._goal.id if self._goal is not None else ""
+        sampled = [readings for during, readings in self._samples if during == goal_id]
+        rows = self._switches() if self._has_marks else sampled
         for row in rows:
             values = {name: reading["value"] for name, reading in row.items()}
             stamps = {name: reading["timestamp"] for name, reading in row.items()}
             yield {"time": next(iter(stamps.values())), "data": values, "timestamps": stamps}
+
+    def _end_with_plan(self, begun: AsyncStatus[None]) -> None:
+        """Stop what the plan that has ended leaves under way."""
+        under_way = self._goal is not None and self._goal.result is None
+        if under_way or not begun.done:
+            self._stopping = asyncio.create_task(self._stop_late())
+
+    async def _stop_late(self) -> None:
+        try:
+            await self.stop()
+        except TrirailError:
+            self.log.exception("%s is not stopped", self.name)
 
     def _switches(self) -> list[dict[str, Reading[Any]]]:
         result = self._goal.result if self._goal is not None else None
@@ -132,8 +174,8 @@ class Flight(Device, Flyable, EventCollectable):
     async def _sample(self, robot: AsyncRobot) -> None:
         async with aclosing(robot.states()) as states:
             async for state in states:
-                if self._goal is not None and state.goal is not None and state.goal.id == self._goal.id:
-                    self._samples.append(self._stage.readings(state))
+                if state.goal is not None:
+                    self._samples.append((state.goal.id, self._stage.readings(state)))
 
     def _end_sampling(self) -> None:
         if self._sampling is not None:

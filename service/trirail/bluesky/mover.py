@@ -83,6 +83,9 @@ class Mover:
     def __init__(self, robot: AsyncRobot) -> None:
         self._robot = robot
         self._gathered: list[AxisMove] = []
+        """Sets that others may join; a change of the list ends that."""
+        self._unsent: list[AxisMove] = []
+        """The same, and sets that wait for their turn: a stop ends these before their goal is sent."""
         self._motion: _Motion | None = None
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -96,16 +99,23 @@ class Mover:
         if any(move.shares_axis(other) for other in self._gathered):
             self._start_task()  # a goal of the earlier sets goes first
         self._gathered.append(move)
+        self._unsent.append(move)
         if len(self._gathered) == 1:
             self._start_task(GATHERING_S)
         return move
 
     async def progress(self, move: AxisMove) -> AsyncIterator[Pose]:
-        """Yield measured poses until a set has ended. Raises its error."""
-        while not move.end.done():
-            await asyncio.wait({move.end}, timeout=PROGRESS_S)
-            if self.pose is not None:
-                yield self.pose
+        """Yield measured poses until a set has ended. Raises its error.
+
+        Cancelling it cancels a set whose goal has not been sent; a goal under way continues.
+        """
+        try:
+            while not move.end.done():
+                await asyncio.wait({move.end}, timeout=PROGRESS_S)
+                if self.pose is not None:
+                    yield self.pose
+        finally:
+            move.end.cancel()  # without effect on a set that has ended
         move.end.result()
 
     async def stop(self, success: bool) -> None:
@@ -113,9 +123,8 @@ class Mover:
 
         With `success` the sets end as if they had arrived: a plan that pauses repeats them.
         """
-        gathered, self._gathered = self._gathered, []
-        for move in gathered:
-            move.finish(None if success else TrirailError("stopped before its goal was sent"))
+        unsent, self._unsent, self._gathered = self._unsent, [], []
+        end_all(unsent, None if success else TrirailError("stopped before its goal was sent"))
         async with self._sending:  # a goal that is being sent is first accepted
             motion = self._motion
         if motion is None or motion.goal.result is not None:
@@ -132,6 +141,7 @@ class Mover:
         finally:
             ended.cancel()
             lost.cancel()
+            await asyncio.gather(ended, lost, return_exceptions=True)  # neither outlives this call
 
     def _start_task(self, delay: float = 0.0) -> None:
         task = asyncio.create_task(self._send_later(self._gathered, delay))
@@ -149,6 +159,10 @@ class Mover:
             self._gathered = []
         try:
             async with self._sending:
+                self._unsent = [move for move in self._unsent if move not in moves]
+                moves = [move for move in moves if not move.end.done()]
+                if not moves:
+                    return  # stopped or cancelled meanwhile
                 motion = self._motion = await self._send_goal(moves, self._motion)
         except Exception as error:  # noqa: BLE001 - whatever it is, those who wait for the sets get it
             end_all(moves, error)
@@ -187,7 +201,7 @@ class Mover:
 
     async def _watch(self) -> ServiceError:
         """Keep the measured pose; return the error when the service is lost."""
-        cycle = -1
+        cycle, self.pose = -1, None
         async with aclosing(self._robot.states(SILENCE_S)) as states:
             async for state in states:
                 if state.seq < cycle:

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from contextlib import aclosing
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
-from bluesky.protocols import HasHints, Hints, Location, Reading
+from bluesky.protocols import HasHints, Hints, Location
 from event_model import DataKey
 from numpy.typing import NDArray
-from ophyd_async.core import AsyncLocatable, AsyncReadable, Device, WatchableAsyncStatus, WatcherUpdate
+from ophyd_async.core import AsyncLocatable, AsyncReadable, WatchableAsyncStatus, WatcherUpdate
 
 from trirail.bluesky.flight import Flight
+from trirail.bluesky.monitor import Monitored, Readings
 from trirail.bluesky.mover import Mover
 from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
-from trirail.client.path_check import check_goal
 from trirail.client.trajectory import Points, points_of
 from trirail.telemetry.drawn_robot import DrawnRobot
 from trirail.wire.goals import PoseGoal
@@ -31,7 +31,6 @@ UNNAMED = "stage"
 """Name of a stage that is used without one."""
 T = TypeVar("T", float, NDArray[np.float64])
 Keys = dict[str, DataKey]
-Readings = dict[str, Reading[Any]]
 
 
 class StageLink(NamedTuple):
@@ -43,7 +42,7 @@ class StageLink(NamedTuple):
     mover: Mover
 
 
-class Stage(Device, AsyncReadable, HasHints):
+class Stage(Monitored, AsyncReadable, HasHints):
     """A robot as a device of Bluesky, with the movable axes `x`, `y`, `phi`, and `pose` for all three together.
 
     Lengths are in metres, angles in radians. A reading is of one state, published after every event that this client
@@ -76,12 +75,16 @@ class Stage(Device, AsyncReadable, HasHints):
         task = self._linking
         failed = task is not None and task.done() and (task.cancelled() or task.exception() is not None)
         if task is None or task.get_loop() is not loop or failed:
-            task = self._linking = asyncio.create_task(self._connect(loop))
+            over = task is not None and task.done() and not failed and task.get_loop().is_closed()
+            task = self._linking = asyncio.create_task(self._connect(loop, task.result() if task and over else None))
         return await asyncio.shield(task)
 
     async def describe(self) -> Keys:
-        """Return units, limits and precision of every reading."""
-        shown = (await self.link()).shown
+        """Return units, limits and precision of every reading, as the service has them now."""
+        return self._keys(DrawnRobot.from_info(await (await self.link()).robot.info()))
+
+    def _keys(self, shown: DrawnRobot) -> Keys:
+        """Return units, limits and precision of every reading of a robot."""
         keys = [self._key(shown, axis) for axis in range(3)]
         source = keys[0]["source"]
         vector = DataKey(source=source, dtype="array", dtype_numpy="<f8", shape=[3], units="m")
@@ -102,14 +105,12 @@ class Stage(Device, AsyncReadable, HasHints):
         await (await self.link()).mover.stop(success)
 
     async def check(self, pose: Sequence[float]) -> None:
-        """Check the whole path to a pose against every limit, as the service does; nothing moves.
+        """Have the service check the whole path to a pose against every limit; nothing moves.
 
         Raises RefusedError with the limit and the value where the service would refuse the pose.
         """
-        link = await self.link()
-        start = (await link.robot.state()).commanded.pose
         x, y, phi = (float(value) for value in pose)
-        await asyncio.to_thread(check_goal, link.shown, start, PoseGoal(x=x, y=y, phi=phi))
+        await (await self.link()).robot.check(PoseGoal(x=x, y=y, phi=phi))
 
     def follow(
         self, points: Points, *, marks: Sequence[MarkLike] = (), stretch: bool = False, name: str = "flight"
@@ -135,7 +136,6 @@ class Stage(Device, AsyncReadable, HasHints):
 
     def readings(self, state: State) -> Readings:
         """Return all readings of a state."""
-        now = time.time()  # a state has no wall clock of its own; t is its exact time
         values: dict[str, Any] = {
             **dict(zip((self.x.name, self.y.name, self.phi.name), state.pose, strict=True)),
             self.pose.name: np.array(state.pose),
@@ -143,7 +143,15 @@ class Stage(Device, AsyncReadable, HasHints):
             self.key("following_error"): np.array(state.sliders.following_error),
             self.key("t"): state.t,
         }
-        return {name: {"value": value, "timestamp": now} for name, value in values.items()}
+        return {name: {"value": value, "timestamp": state.time} for name, value in values.items()}
+
+    async def _states(self) -> AsyncGenerator[State]:
+        async with aclosing((await self.link()).robot.states()) as states:
+            async for state in states:
+                yield state
+
+    def _readings(self, state: State) -> Readings:
+        return self.readings(state)
 
     def _key(self, shown: DrawnRobot, axis: int) -> DataKey:
         limits, name = shown.limits, COORDINATES[axis]
@@ -159,13 +167,16 @@ class Stage(Device, AsyncReadable, HasHints):
             "limits": {"control": {"low": low, "high": high}},
         }
 
-    async def _connect(self, loop: asyncio.AbstractEventLoop) -> StageLink:
+    async def _connect(self, loop: asyncio.AbstractEventLoop, before: StageLink | None) -> StageLink:
+        """Return a connection in the running event loop; close the one before, whose event loop is closed."""
+        if before is not None:
+            await before.robot.close()
         robot = await self._robot._for_running_loop()
         shown = DrawnRobot.from_info(await robot.info())
         return StageLink(loop, robot, shown, Mover(robot))
 
 
-class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
+class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
     """Axes of a stage that one value sets."""
 
     def __init__(self, coordinate: str) -> None:
@@ -198,13 +209,12 @@ class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
 
     async def read(self) -> Readings:
         """Return the measured value of the next state."""
-        return {self.name: (await self._stage.read())[self.name]}
+        return self._own(await self._stage.read())
 
     async def locate(self) -> Location[T]:
         """Return the target of the goal under way, or the commanded value at rest, and the measured value."""
         state = await (await self._stage.link()).robot.state()
-        target = state.goal.target if state.goal is not None else None
-        return Location(setpoint=self._value(target or state.commanded.pose), readback=self._value(state.pose))
+        return Location(setpoint=self._value(_setpoint(state)), readback=self._value(state.pose))
 
     @WatchableAsyncStatus.wrap
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:
@@ -214,11 +224,11 @@ class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
         milliseconds are one straight move.
         """
         targets = self._targets(value)
-        mover = (await self._stage.link()).mover
-        move = mover.start(targets)
+        link = await self._stage.link()
+        move = link.mover.start(targets)
         initial: T | None = None
-        key = (await self.describe())[self.name]
-        async for pose in mover.progress(move):
+        key = self._stage._keys(link.shown)[self.name]
+        async for pose in link.mover.progress(move):
             current = self._value(pose)
             initial = current if initial is None else initial
             yield WatcherUpdate(
@@ -229,6 +239,15 @@ class _Movable(Device, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
     async def stop(self, success: bool = True) -> None:
         """Stop the goal of the stage's axes; return when the robot is at rest."""
         await self._stage.stop(success)
+
+    def _states(self) -> AsyncGenerator[State]:
+        return self._stage._states()
+
+    def _readings(self, state: State) -> Readings:
+        return self._own(self._stage.readings(state))
+
+    def _own(self, readings: Readings) -> Readings:
+        return {self.name: readings[self.name]}
 
     def _targets(self, value: T) -> dict[int, float]:
         raise NotImplementedError
@@ -245,8 +264,8 @@ class MovableAxis(_Movable[float]):
         super().__init__(COORDINATES[index])
 
     async def check_value(self, value: float) -> None:
-        """Check the path to a value with the other coordinates as they are; see Stage.check."""
-        pose = list((await (await self._stage.link()).robot.state()).commanded.pose)
+        """Check the path to a value with the other coordinates as they are commanded; see Stage.check."""
+        pose = list(_setpoint(await (await self._stage.link()).robot.state()))
         pose[self._index] = float(value)
         await self._stage.check(pose)
 
@@ -273,3 +292,9 @@ class MovablePose(_Movable[NDArray[np.float64]]):
 
     def _value(self, pose: Pose) -> NDArray[np.float64]:
         return np.array(pose)
+
+
+def _setpoint(state: State) -> Pose:
+    """Return the target of the goal under way; without one the commanded pose."""
+    target = state.goal.target if state.goal is not None else None
+    return target or state.commanded.pose

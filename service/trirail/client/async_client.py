@@ -25,7 +25,16 @@ from trirail.client.connection import REPLY_WITHIN, Connection
 from trirail.client.goal import AsyncGoalHandle, AsyncJog, OpenGoals, result_of
 from trirail.client.identity import identity
 from trirail.client.lease import AsyncLease
-from trirail.client.outgoing import content_message, goal_message, goal_messages, id_of, made_content, number, seconds
+from trirail.client.outgoing import (
+    check_message,
+    content_message,
+    goal_message,
+    goal_messages,
+    id_of,
+    made_content,
+    number,
+    seconds,
+)
 from trirail.client.track import AsyncTrack, Taker
 from trirail.client.trajectory import Points, check_arrived, first_pose, points_of
 from trirail.errors import ServiceError
@@ -338,6 +347,15 @@ class AsyncRobot:
             raise
         self._goals.accept(goal, reply)
         return goal
+
+    async def check(self, goal: Goal) -> GoalReply:
+        """Plan a trirail.wire.goals.Goal without moving; return the reply of the service if it could be accepted now.
+
+        The whole path is checked against every limit. It begins at rest, at the end of the goals under way or at the
+        commanded pose. Neither mode nor lease matters. A jog or a track has no path to check; a trajectory is checked
+        up to the points of one message. Raises RefusedError as for the goal itself.
+        """
+        return await self._connection.fetch(("check", self.user), GoalReply, check_message(goal))
 
     async def calibrate_camera(
         self,

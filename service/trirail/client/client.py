@@ -211,6 +211,7 @@ class Robot:
     move_to_named = _goal(AsyncRobot.move_to_named)
     move_sliders = _goal(AsyncRobot.move_sliders)
     send = _goal(AsyncRobot.send)
+    check = _call(AsyncRobot.check)
     jog = _context(AsyncRobot.jog, Jog)
     track = _context(AsyncRobot.track, Track)
     calibrate_camera = _conversation(AsyncRobot.calibrate_camera)

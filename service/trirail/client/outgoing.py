@@ -20,7 +20,7 @@ from msgspec import structs
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire import boundary
-from trirail.wire.goals import Goal, TrajectoryGoal
+from trirail.wire.goals import Goal, PathGoal, TrajectoryGoal
 from trirail.wire.kinds.trajectory import parts
 from trirail.wire.sizes import MAX_POINTS
 from trirail.wire.text import quoted
@@ -60,6 +60,11 @@ def goal_messages(make: Goal | Callable[[str], Goal], goal_id: str) -> list[byte
     if isinstance(goal, TrajectoryGoal) and (why := too_many(len(goal.points))):
         raise RefusedError(RefusalCode.MALFORMED, f"not a goal: points: {why}")
     return [message(partial(_itself, part), Goal, "not a goal") for part in sent]
+
+
+def check_message(goal: Goal) -> bytes:
+    """Return a goal to be checked, as JSON. Raises RefusedError for an invalid one, or one without a path."""
+    return message(partial(_itself, goal), PathGoal, "not a goal to check")
 
 
 def _itself(goal: Goal) -> Goal:

@@ -16,7 +16,7 @@ from trirail.motion.runs import centre_motion, nominal_motion, rest, tool_motion
 from trirail.motion.schedule import Schedule
 from trirail.motion.tool_frames import NamedFrames, rotated
 from trirail.telemetry.drawn_robot import DrawnRobot
-from trirail.wire.goals import PoseGoal, Tool, TrajectoryGoal
+from trirail.wire.goals import Tool, TrajectoryGoal
 from trirail.wire.packed_trajectory import packed
 from trirail.workspace.violations import violations
 
@@ -83,16 +83,6 @@ def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | No
             code = least.quantity.replace(" ", "_")
             return Obstacle(str(least), bool(share < 1.0), code, least.label, least.value, least.limit, least.unit)
     return None
-
-
-def check_goal(robot: DrawnRobot, start: Triple, goal: PoseGoal) -> float:
-    """Plan a goal of the centre from a pose at rest, as the service would; return the duration of its path [s].
-
-    The whole path is checked against every limit; nothing moves. Raises RefusedError as the service.
-    """
-    period = 1.0 / robot.rate_hz
-    planner = GoalPlanner(robot.geometry, robot.limits, period)
-    return planner.plan(goal, Schedule(rest(start), period), 1.0, 0).duration
 
 
 class CheckedPath(Struct, frozen=True, omit_defaults=True):

@@ -22,6 +22,7 @@ from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger
 from trirail.control.modes import ModeEvent, ModeState
 from trirail.control.outputs import Outputs
+from trirail.control.path_checks import PathChecks
 from trirail.control.plan_requests import PlannerPort, PlanRequests
 from trirail.control.returning_drives import ReturningDrives
 from trirail.control.setpoints import Setpoints
@@ -37,6 +38,7 @@ from trirail.wire.marks import StopAt
 from trirail.wire.messages import FaultDetail, Notice, Outcome
 from trirail.wire.packets import (
     Announcement,
+    CheckRequest,
     CommandRequest,
     Disturbance,
     GoalRequest,
@@ -87,6 +89,7 @@ class Control:
         self.goal_queue = GoalQueue(
             self.ledger, self.lease, self._planner, self.schedule, frames, queue, config.period, self.outputs
         )
+        self._checks = PathChecks(config, planner, self._planner, self.schedule, self.ledger, frames, self.outputs)
         legs, step_length = robot.packed(), config.limits.slider.fastest * config.period
         self._following_error_limit = config.limits.slider.following_error
         take_up = reserve_for_backlash(config.correction.backlash, config.limits.slider)
@@ -130,7 +133,7 @@ class Control:
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
-        if stopped_now or self.ledger.busy or mode in (Mode.ENABLING, Mode.HOMING):
+        if stopped_now or self.ledger.busy or self._checks.due or mode in (Mode.ENABLING, Mode.HOMING):
             return None
         if self.outputs.any:
             self.outputs.follow_mode(mode)
@@ -358,7 +361,10 @@ class Control:
         self.modes.cycle += 1
 
     def decide(self, inputs: Iterable[TimedInput]) -> None:
-        """Prepare the next cycle: handle inputs, end a lease or jog that is not renewed, begin a planned motion."""
+        """Prepare the next cycle.
+
+        Handle inputs, end a lease or jog that is not renewed, begin a planned motion, and request a check.
+        """
         try:
             for each, now_ns in inputs:
                 self.handle(each, now_ns)
@@ -373,6 +379,7 @@ class Control:
                 words = f"goal {beginning.id} of {beginning.user}"
                 begun = coded(words, EventCode.GOAL_STARTED, goal=beginning.id, user=beginning.user)
                 self.modes.apply_event(ModeEvent.GOAL, begun, beginning)
+            self._checks.step(self._place_of_check)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
@@ -382,14 +389,20 @@ class Control:
             match received:
                 case Disturbance():
                     self.modes.handle_disturbance(ModeEvent[received.event], received.text)
+                    if received.event == ModeEvent.GATEWAY_LOST.name:
+                        self._checks.withdraw(received.reason)
+                case CheckRequest():
+                    self._checks.enqueue(received)
                 case GoalRequest() | CommandRequest():
                     self._answer(received, now_ns)
                 case Announcement(notice):
                     self.ledger.notices.append(notice)
                 case PlannerLost():
                     self._planner.fail(received.reason)
+                    self._checks.fail(received.reason)
                 case answer:
                     self._planner.receive(answer)
+                    self._checks.receive(answer)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
@@ -431,9 +444,12 @@ class Control:
     def _admit(self) -> bool:
         """Return whether the robot is moving to a goal. Raises RefusedError if it accepts no goal now."""
         self.modes.check(ModeEvent.GOAL)
+        self._check_homed()
+        return self.state.mode is Mode.MOVING
+
+    def _check_homed(self) -> None:
         if not self.measured.homed:
             raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
-        return self.state.mode is Mode.MOVING
 
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
         """Return the pose from which a move begins: the end of the goals before it, or the measured pose.
@@ -449,6 +465,16 @@ class Control:
                 "a goal waits half-way, and a move would count from its end: send stop first, or resume it, or move "
                 "from where the robot is measured to be",
             )
+        return self._end_pose
+
+    def _place_of_check(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
+        """Return the pose from which a check plans: as `_place`, but of a goal that waits half-way the end."""
+        self._check_homed()
+        return self.measured.pose if origin == "measured" else self._end_pose
+
+    @property
+    def _end_pose(self) -> Sequence[float]:
+        """Pose at the end of the goals under way; the commanded one without such an end."""
         last, goal = self.schedule.last, self.ledger.goal
         if last is None or goal is None or goal.kind.renewed:
             return self.commanded.pose

@@ -172,6 +172,10 @@ class Ledger:
             self.pass_on()
         if goal.renewed:
             self._renew(request, plan)
+        if marks := plan.reply.marks:
+            words = f"goal {request.id} switches outputs at {len(marks)} mark{'s' * (len(marks) > 1)} on its path"
+            text = coded(words, EventCode.MARKS_PLANNED, goal=request.id, number=len(marks))
+            self.notices.append(Notice("output", "info", text.text, goal=request.id, planned=marks, **text.fields))
 
     def _renew(self, request: GoalRequest, plan: AcceptedPlan) -> None:
         """Update the goal under way by a renewal; announce a target that is out of reach."""

@@ -63,6 +63,7 @@ SWITCHED: Final = np.dtype(
         ("goal", "<i8"),
         ("mark", "<i8"),
         ("closed", "<i8"),
+        ("deadline_ns", "<i8"),  # of the cycle, on the monotonic clock; 0 until its record is made
         ("commanded", "<f8", 3),
         ("measured", "<f8", 3),
     ],
@@ -92,18 +93,27 @@ def _set(words: NDArray[np.int64], output: NDArray[np.void], on: int) -> None:
 
 @compiled()
 def _note(
-    log: NDArray[np.void], number: int, cycle: int, output: int, on: int, goal: int, mark: int, record: NDArray[np.void]
+    log: NDArray[np.void],
+    number: int,
+    cycle: int,
+    deadline_ns: int,
+    output: int,
+    on: int,
+    goal: int,
+    mark: int,
+    record: NDArray[np.void],
 ) -> int:
     """Append a switch to the log; return the number of its rows. A full log keeps its first rows."""
     if number < len(log):
         row = log[number]
         row.cycle, row.output, row.on, row.goal, row.mark, row.closed = cycle, output, on, goal, mark, 0
+        row.deadline_ns = deadline_ns
         row.commanded[:] = record[0].commanded_pose
         row.measured[:] = record[0].pose
     return min(number + 1, len(log))
 
 
-@compiled(i8(OUTPUTS, PLAN, i8[::1], LOG, i8, f8[::1], f8[:, :, ::1], b1, f8, f8, i8, RECORDS))
+@compiled(i8(OUTPUTS, PLAN, i8[::1], LOG, i8, f8[::1], f8[:, :, ::1], b1, f8, f8, i8, i8, RECORDS))
 def switch(
     outputs: NDArray[np.void],
     planned: NDArray[np.void],
@@ -116,6 +126,7 @@ def switch(
     time: float,
     period: float,
     cycle: int,
+    deadline_ns: int,
     record: NDArray[np.void],
 ) -> int:
     """Switch the outputs that are due in a cycle; return the number of rows in the log.
@@ -130,8 +141,8 @@ def switch(
         Room for the switches that happen, and the number of its rows in use.
     law_knots, law_pieces, moves, time
         Law of the motion under way, whether there is one, and the time of the law in this cycle [s].
-    period, cycle
-        Period [s] and number of the cycle.
+    period, cycle, deadline_ns
+        Period [s], number of the cycle, and its deadline on the monotonic clock [ns], 0 where it is not known yet.
     record
         The cycle's record, with the commanded and measured pose.
     """
@@ -139,7 +150,7 @@ def switch(
         output = outputs[k]
         if output.until != 0 and cycle >= output.until:
             _set(words, output, 1 - output.opened)
-            number = _note(log, number, cycle, k, 1 - output.opened, output.goal, output.mark, record)
+            number = _note(log, number, cycle, deadline_ns, k, 1 - output.opened, output.goal, output.mark, record)
             output.until, output.goal = 0, 0
         if not moves or output.next >= output.end:
             continue
@@ -150,7 +161,7 @@ def switch(
         while output.next < output.end and planned[output.next].s <= (here + there) / 2.0:
             due = planned[output.next]
             _set(words, output, due.on)
-            number = _note(log, number, cycle, k, due.on, due.goal, due.mark, record)
+            number = _note(log, number, cycle, deadline_ns, k, due.on, due.goal, due.mark, record)
             output.until = cycle + due.cycles if due.cycles else 0
             output.goal, output.mark, output.opened = (due.goal if due.opens else 0), due.mark, due.on
             output.next += 1
@@ -323,8 +334,13 @@ class Outputs:
         law = run.law if run is not None else _AT_REST
         self.logged = switch(
             *(self.state, self.planned, self.words, self.log, self.logged, law.knots, law.pieces),
-            *(run is not None, time, self._period, cycle, record),
+            *(run is not None, time, self._period, cycle, 0, record),
         )
+
+    def stamp(self, deadline_ns: int) -> None:
+        """Note the deadline of the newest cycle for its switches."""
+        for row in self.log[: self.logged]:
+            row["deadline_ns"] = row["deadline_ns"] or deadline_ns
 
     @property
     def report_after(self) -> int:
@@ -353,12 +369,15 @@ class Outputs:
             self._write(k, value)
             if self.logged < len(self.log):
                 pose, measured = record[0]["commanded_pose"], record[0]["pose"]
-                self.log[self.logged] = cycle, k, value, number, row["mark"], 1, pose, measured
+                self.log[self.logged] = cycle, k, value, number, row["mark"], 1, 0, pose, measured
                 self.logged += 1
             row["goal"] = row["until"] = 0
 
     def pop_switches(self, cycle: int, *, all_: bool = False) -> list[tuple[Switch, ...]]:
-        """Return the switches to report now, in tables for one message each, without their wall clock."""
+        """Return the switches to report now, in tables for one message each.
+
+        Their times are of the monotonic clock, or NaN where the record of the cycle is not made yet.
+        """
         due = all_ or self.logged >= TABLE_LENGTH or (cycle - self._reported) * self._period >= TABLE_DELAY
         if self.logged and not due:
             return []
@@ -373,7 +392,7 @@ class Outputs:
                 bool(row["on"]),
                 int(row["cycle"]),
                 int(row["cycle"]) * self._period,
-                math.nan,
+                int(row["deadline_ns"]) * 1e-9 or math.nan,
                 tuple(row["commanded"].tolist()),
                 tuple(row["measured"].tolist()),
                 bool(row["closed"]),

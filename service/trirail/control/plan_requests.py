@@ -101,6 +101,11 @@ class PlanRequests:
         return self._goal is not None
 
     @property
+    def requests(self) -> int:
+        """Number of requests sent to the planner."""
+        return self._number
+
+    @property
     def awaits_answer(self) -> bool:
         """Whether the planner has not answered the present request."""
         return self._goal is not None and self._request is not None and self._answer is None

@@ -34,14 +34,16 @@ from trirail.processes.session_guard import Guard
 from trirail.processes.trajectory_parts import TrajectoryParts
 from trirail.processes.zenoh_links import LinkMonitor, RouterLinks
 from trirail.wire import boundary, zenoh_session
-from trirail.wire.goals import Goal, TrajectoryGoal
+from trirail.wire.goals import Goal, PathGoal, TrajectoryGoal
 from trirail.wire.links import LinkClosed, PacketLink
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, ErrorReply, Event, Notice, RoleReply
+from trirail.wire.packed_trajectory import packed
 from trirail.wire.packets import (
     Accepted,
     Announcement,
     Answer,
+    Checked,
     CommandDone,
     EventReport,
     Kind,
@@ -52,14 +54,16 @@ from trirail.wire.packets import (
     message,
 )
 from trirail.wire.records import unpack
+from trirail.wire.sizes import MAX_PART
 from trirail.wire.state import summary_of
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Mode, NoContent
 
 SWITCH_EVERY = 0.0005
-"""Interval after which a thread yields the interpreter [s]; Zenoh's threads need it to deliver a message."""
+"""Interval after which a thread yields the interpreter: Zenoh's threads need it to hand a message over [s]."""
 MESSAGES_PER_TURN = 256
 """Messages from Zenoh handled between two reads of the loop's messages."""
+NOT_CHECKED = "not a goal to check"
 SUMMARY_EVERY = 1.0
 """Interval between two summaries [s]."""
 
@@ -215,6 +219,16 @@ class Gateway:
             except RefusedError as refusal:
                 self._refusals.refuse(parts, refusal)
 
+    def _check_goal(self, message: RoutedMessage) -> None:
+        incoming, (user,), sent = message
+        if not isinstance(sent, TrajectoryGoal):
+            self._requests.check(incoming, user, self._poses.resolve_name(sent))
+        elif sent.part is None:
+            self._requests.check(incoming, user, packed(sent))
+        else:
+            problem = f"{NOT_CHECKED}: part: a trajectory that is checked is one message, of {MAX_PART} points at most"
+            raise RefusedError(RefusalCode.MALFORMED, problem)
+
     def _announce(self, notice: Notice) -> bool:
         """Have the loop announce a notice; return whether it accepts that now."""
         return self._link.send(message(Announcement(notice)))
@@ -250,7 +264,7 @@ class Gateway:
                 self._handle_event(event)
             case Status() | Welcome():
                 self._states.update(answer)
-            case Accepted(ticket, reply):
+            case Accepted(ticket, reply) | Checked(ticket, reply):
                 self._requests.answer(ticket, reply)
             case CommandDone(ticket, name, mode, cycle):
                 self._commands.confirmed(ticket)
@@ -338,6 +352,7 @@ class Route(NamedTuple):
 
 ROUTES: dict[str, Route] = {
     "goal": Route(("user",), Gateway._goal, Goal, "not a goal"),
+    "check": Route(("user",), Gateway._check_goal, PathGoal, NOT_CHECKED),
     "cmd": Route(("user", "command"), Gateway._command),
     "info": Route((), lambda gateway, _: gateway._info),
     "role": Route(("user",), Gateway._user_role),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from trirail.wire.messages import Event
 from trirail.wire.packets import Status, Welcome
 from trirail.wire.state import (
     CommandedMotion,
+    DigitalLine,
     FrameCounts,
     GoalState,
     Info,
@@ -93,11 +95,20 @@ _ENABLED = [MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPP
 _NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
 
 
-class StateMaker:
-    """Builder of states from the newest record and the loop's other messages, with timing statistics."""
+def wall_offset_ns() -> int:
+    """Return the wall clock minus the monotonic one, now: the wall clock may be set while the service runs."""
+    return time.time_ns() - time.monotonic_ns()
 
-    def __init__(self, config: Config) -> None:
+
+class StateMaker:
+    """Builder of states from the newest record and the loop's other messages, with timing statistics.
+
+    `offset_ns` returns the wall clock minus the monotonic one.
+    """
+
+    def __init__(self, config: Config, offset_ns: Callable[[], int] = wall_offset_ns) -> None:
         self._period = config.period
+        self._offset_ns = offset_ns
         self._outputs = {name: (NAMES.index(each.drive), 1 << each.bit) for name, each in config.outputs.items()}
         self._inputs = {name: (NAMES.index(each.drive), 1 << each.bit) for name, each in config.inputs.items()}
         self._rate_hz = config.loop.rate_hz
@@ -157,6 +168,7 @@ class StateMaker:
         return State(
             seq=int(row["cycle"]),
             t=round(int(row["cycle"]) * self._period, 9),
+            time=round((int(row["deadline_ns"]) + self._offset_ns()) * 1e-9, 6),
             mode=MODES[row["mode"]],
             pose=Pose(*row["pose"].tolist()),
             velocity=_triple(self._velocity),
@@ -251,6 +263,8 @@ def info(config: Config) -> Info:
         takeover=config.control.takeover.value,
         outputs=tuple(config.outputs),
         inputs=tuple(config.inputs),
+        output_lines={name: DigitalLine(each.drive, each.bit) for name, each in config.outputs.items()},
+        input_lines={name: DigitalLine(each.drive, each.bit) for name, each in config.inputs.items()},
         homes=tuple(name for name, drive in zip(NAMES, config.drives.each, strict=True) if drive.homing is not None),
         versions=versions(),
         correction=as_built.summary(config.correction.map, config.correction.as_built, config.correction.backlash),

@@ -338,7 +338,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
                 s.report_due = s.cycle + s.report_after
             s.logged = outputs.switch(
                 *(switches, planned, words, log, s.logged, law_knots, law_pieces, s.source == COMMAND),
-                *(s.time, s.period, s.cycle + 1, record),
+                *(s.time, s.period, s.cycle + 1, s.deadline_ns, record),
             )
             s.called |= s.logged >= outputs.TABLE_LENGTH or (s.logged > 0 and s.cycle + 1 >= s.report_due)
             for i in range(3):

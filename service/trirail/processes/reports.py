@@ -112,6 +112,7 @@ class Reports:
         """Append the newest cycle's record."""
         control = self._control
         ticks = control.modes.cycle, tick.deadline_ns, tick.lateness_ns, overruns
+        control.outputs.stamp(tick.deadline_ns)
         HEADER.pack_into(self._made, 0, *ticks, *parts_ns, MODES.index(control.state.mode))
         begin = 1 + self.batched * SIZE
         self._batch[begin : begin + SIZE] = self._made
@@ -229,7 +230,8 @@ class Reports:
         for number, notice in enumerate(ledger.notices):
             self._events += 1
             cycle = earlier if number < postponed else control.modes.cycle
-            packet = event_packet(notice.event(self._events, cycle * self._period, cycle, time.time()))
+            wall, offset = time.time(), time.time() - time.monotonic()
+            packet = event_packet(notice.event(self._events, cycle * self._period, cycle, wall, offset))
             self._kept.append(packet)
             self._recorder.send(packet)
         ledger.notices.clear()

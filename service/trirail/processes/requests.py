@@ -1,6 +1,7 @@
-"""Requests of clients to the loop, each answered exactly once: goals in turn, commands immediately; alignment reports.
+"""Requests of clients to the loop, each answered exactly once; alignment reports.
 
-A command that stops the robot is carried out even if its content is invalid.
+Goals are sent in turn, commands and checks immediately. A command that stops the robot is carried out even if it cannot
+be read.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from trirail.processes.loop_death import LoopDeath
 from trirail.processes.publications import StateMaker
 from trirail.processes.replies import Replies
 from trirail.processes.session_guard import Guard
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, LoopGoal
 from trirail.wire.links import PacketLink
 from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, alignment_event_text, in_words
 from trirail.wire.messages import CommandReply, ErrorReply, Level, Notice
-from trirail.wire.packets import CommandRequest, GoalRequest, message
+from trirail.wire.packets import CheckRequest, CommandRequest, GoalRequest, message
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
@@ -38,7 +39,7 @@ both have the same target. Further goals wait in the gateway, where commands ove
 MAX_GOALS = 16
 """Most goals of all users in the loop: as many as it reads in four cycles."""
 MAX_COMMANDS_OF_USER = 8
-"""Most commands of one user in the loop; further ones are refused, except those that stop the robot."""
+"""Most commands and checks of one user in the loop; further ones are refused, except commands that stop the robot."""
 MAX_COMMANDS = 64
 """The same for all users."""
 REPLY_TIMEOUT_S = 15.0
@@ -79,7 +80,7 @@ class Requests:
         self._goals: dict[int, str] = {}
         """User of each goal in the loop, by ticket."""
         self._commands: dict[int, str] = {}
-        """User of each command in the loop, by ticket."""
+        """Users of the commands and checks that the loop has, by ticket."""
         self._pending: dict[int, _PendingRequest] = {}
         self._tickets = 0
 
@@ -129,21 +130,29 @@ class Requests:
         self._tickets += 1
         request = CommandRequest(self._tickets, user, name, content)
         with self._urgent_section() if name.stops else nullcontext():
-            sent = self._link.send(message(request))
-        if not sent:
-            raise RefusedError(RefusalCode.BUSY, "too many requests: send it again")
-        self._commands[request.ticket] = user
-        within = self._home_within if name is Command.HOME else REPLY_TIMEOUT_S
-        self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + within)
+            self._send(incoming, request, self._home_within if name is Command.HOME else REPLY_TIMEOUT_S)
         return request.ticket
 
+    def check(self, incoming: Incoming, user: str, goal: LoopGoal) -> None:
+        """Request the plan of a goal without moving to it. Raises RefusedError if too many requests are under way."""
+        self._check_command_count(user)
+        self._tickets += 1
+        self._send(incoming, CheckRequest(self._tickets, user, goal), REPLY_TIMEOUT_S)
+
+    def _send(self, incoming: Incoming, request: CommandRequest | CheckRequest, within: float) -> None:
+        """Send the loop a request, to be answered within a time [s]. Raises RefusedError if its queue is full."""
+        if not self._link.send(message(request)):
+            raise RefusedError(RefusalCode.BUSY, "too many requests: send it again")
+        self._commands[request.ticket] = request.user
+        self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + within)
+
     def _check_command_count(self, user: str) -> None:
-        """Raise RefusedError if too many commands are under way, of this user or in total."""
-        own = sum(sender == user for sender in self._commands.values())
+        """Raise RefusedError if too many commands and checks are under way, of this user or in total."""
+        own, all_ = sum(sender == user for sender in self._commands.values()), len(self._commands)
         if own >= MAX_COMMANDS_OF_USER:
             raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
-        if len(self._commands) >= MAX_COMMANDS:
-            raise RefusedError(RefusalCode.BUSY, f"{len(self._commands)} commands are under way already: send fewer")
+        if all_ >= MAX_COMMANDS:
+            raise RefusedError(RefusalCode.BUSY, f"{all_} commands are under way already: send fewer")
 
     # ------------------------------------------------------------------ answers
 

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from trirail.telemetry import curves, journal, readout, shown_alignment
-from trirail.telemetry.drawn_robot import DrawnRobot
+from trirail.telemetry.drawn_robot import DIGITAL, DrawnRobot
 from trirail.workspace.part_positions import Points
 
 WINDOW = 8.0
@@ -48,7 +48,7 @@ def layout(shown: RobotView) -> rrb.Blueprint:
         _plot("Loop timing  [µs]", curves.TIMING, window, legend=True),
         row_shares=[18, 19, 25, 20],
     )
-    left = rrb.Vertical(*_situation(shown, window, "t"), row_shares=[53, 23, 11, 21])
+    left = rrb.Vertical(*_situation(shown, window, "t"), row_shares=[53, 23, 11 + 6 * len(shown.robot.digital), 21])
     return _blueprint(rrb.Horizontal(left, sliders, platform, column_shares=[8, 6, 6]), "t")
 
 
@@ -91,9 +91,21 @@ def _situation(shown: RobotView, window: rrb.TimeAxis, timeline: str) -> list[rr
     return [
         _robot(shown, timeline),
         rrb.TextDocumentView(name="Now", origin=f"{shown.root}{readout.PATH}"),
-        rrb.StateTimelineView(name="Mode", origin=f"{shown.root}/mode", time_view=window),
+        _states(shown, window),
         rrb.Tabs(events, rrb.TextDocumentView(name="Alignment", origin=aligned)),
     ]
+
+
+def _states(shown: RobotView, window: rrb.TimeAxis) -> rrb.StateTimelineView:
+    """Return the view of the mode, and of the outputs and inputs of a robot that has some."""
+    if not shown.robot.digital:
+        return rrb.StateTimelineView(name="Mode", origin=f"{shown.root}/mode", time_view=window)
+    return rrb.StateTimelineView(
+        name="Mode, outputs and inputs",
+        origin=shown.root or "/",
+        contents=[f"{shown.root}/mode", f"{shown.root}{DIGITAL}/**"],
+        time_view=window,
+    )
 
 
 def _robot(shown: RobotView, timeline: str) -> rrb.Spatial2DView:

@@ -18,7 +18,7 @@ from trirail.errors import ConfigError, EmptyRecordingError, ServiceError
 from trirail.telemetry.retention import BLACK_BOX, sidecar
 from trirail.wire.decoding import decoded, prepare
 from trirail.wire.messages import Event, FaultDetail, Notice
-from trirail.wire.packets import Announcement, CommandRequest, ControlInput, GoalRequest
+from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, ControlInput, GoalRequest
 
 _PART = re.compile(r"-part\d+(-\d+)?$")
 STAMP = "%Y%m%d-%H%M%S"
@@ -86,7 +86,7 @@ class Contents(msgspec.Struct):
     def control_input(self, item: ControlInput) -> None:
         """Add the user of an input of the control."""
         match item.given:
-            case GoalRequest(user=user) | CommandRequest(user=user) if user:
+            case GoalRequest(user=user) | CheckRequest(user=user) | CommandRequest(user=user) if user:
                 self.users.add(user)
             case Announcement(notice=Notice(kind="refused" | "alignment", user=str(user))) if user:
                 self.users.add(user)

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from trirail_drivers.interface import NAMES
 
 from trirail import config
 from trirail.config import Config, FramesTable, Limits
@@ -12,6 +17,29 @@ from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import Info
 
 prepare(GeometryTable)
+
+DIGITAL = "/signals"
+"""Entity above those of outputs and inputs: views list lanes by name, and the mode first."""
+
+
+class DigitalSignal(NamedTuple):
+    """A digital output or input, and where a cycle's record has it."""
+
+    kind: Literal["output", "input"]
+    name: str
+    axis: int
+    mask: int
+    """Its bit in the word of its drive."""
+
+    @property
+    def path(self) -> str:
+        """Entity of its values."""
+        return f"{DIGITAL}/{self.kind}s/{self.name}"
+
+    def values(self, records: NDArray[np.void]) -> NDArray[np.bool_]:
+        """Return its value in each record, (N,)."""
+        on: NDArray[np.bool_] = records[f"{self.kind}s"][:, self.axis] & self.mask != 0
+        return on
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,16 +51,21 @@ class DrawnRobot:
     limits: Limits
     rate_hz: int
     frames: FramesTable
+    digital: tuple[DigitalSignal, ...] = ()
+    """Outputs, then inputs."""
 
     @classmethod
     def from_config(cls, settings: Config) -> DrawnRobot:
         """Return the robot of a configuration."""
+        outputs = [_signal("output", name, each.drive, each.bit) for name, each in settings.outputs.items()]
+        inputs = [_signal("input", name, each.drive, each.bit) for name, each in settings.inputs.items()]
         return cls(
             settings.robot.name,
             config.geometry(settings.geometry),
             settings.limits,
             settings.loop.rate_hz,
             settings.frames,
+            (*outputs, *inputs),
         )
 
     @classmethod
@@ -41,7 +74,13 @@ class DrawnRobot:
         each = [_leg(leg) for leg in info.geometry]
         legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
         limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)
-        return cls(info.robot, config.geometry(legs), limits, info.rate_hz, frames)
+        outputs = [_signal("output", name, line.drive, line.bit) for name, line in info.output_lines.items()]
+        inputs = [_signal("input", name, line.drive, line.bit) for name, line in info.input_lines.items()]
+        return cls(info.robot, config.geometry(legs), limits, info.rate_hz, frames, (*outputs, *inputs))
+
+
+def _signal(kind: Literal["output", "input"], name: str, drive: str, bit: int) -> DigitalSignal:
+    return DigitalSignal(kind, name, NAMES.index(drive), 1 << bit)
 
 
 def _leg(table: dict[str, object]) -> dict[str, object]:

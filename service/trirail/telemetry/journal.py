@@ -21,6 +21,7 @@ from trirail.wire.goals import kind_name
 from trirail.wire.messages import Event, Level
 from trirail.wire.packets import (
     Announcement,
+    CheckRequest,
     CommandRequest,
     ControlInput,
     Disturbance,
@@ -108,6 +109,8 @@ def _input_text(item: ControlInput) -> str:
     match item.given:
         case GoalRequest(id=name, user=user, goal=goal):
             return f"goal {name} of {user}: {kind_name(goal)}"
+        case CheckRequest(user=user, goal=goal):
+            return f"check of {user}: {kind_name(goal)}"
         case CommandRequest(name=name, user=user):
             return f"{name} by {user}"
         case Disturbance(event=event, reason=reason):

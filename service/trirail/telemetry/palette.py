@@ -32,6 +32,10 @@ BUS: Colour = (92, 132, 186)
 BUDGET: Colour = (226, 82, 82)
 LIMIT: Colour = (196, 148, 64)
 
+OFF: Colour = (58, 62, 72)
+OUTPUT: Colour = (56, 146, 84)
+INPUT: Colour = (66, 120, 196)
+
 MODES: dict[Mode, Colour] = {
     Mode.DISABLED: (96, 102, 114),
     Mode.ENABLING: (190, 140, 50),

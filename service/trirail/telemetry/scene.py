@@ -153,6 +153,8 @@ MARKDOWN = rr.components.MediaType.MARKDOWN
 TEXT = rr.TextDocument.descriptor_text()
 SCALARS = rr.Scalars.descriptor_scalars()
 STATE = rr.StateChange.descriptor_state()
+LEVELS = ("off", "on")
+"""Values of outputs and inputs."""
 
 
 class Scene:
@@ -165,6 +167,7 @@ class Scene:
         self._parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
         self._reach = Reach(robot.geometry, robot.limits)
         self._plots = curves.plots(robot)
+        self._digital = robot.digital
         self.bounds = self._parts.bounds
         """Bounds of the robot, (2, 2): lowest and highest x and y [m]."""
 
@@ -183,6 +186,9 @@ class Scene:
                 colors=[palette.MODES[mode] for mode in MODES],
             ),
         )
+        for signal in self._digital:
+            colours = [palette.OFF, palette.OUTPUT if signal.kind == "output" else palette.INPUT]
+            yield signal.path, rr.StateConfiguration(values=list(LEVELS), labels=list(LEVELS), colors=colours)
 
     def bus_load(self, share: float) -> Iterator[tuple[str, rr.AsComponents]]:
         """Set the bus load, 1 for a full bus; yield the static parts that change with it."""
@@ -203,7 +209,7 @@ class Scene:
             table = curves.with_limits(values, self._plots[path])
             parts.append(Column(path, SCALARS, columns.scalars(table)))
         chunks = columns.chunks(self._timelines.for_records(newest), parts)
-        return chunks + self._status(records) + self._readout(records[-1], standing)
+        return chunks + self._status(records) + self._switched(records) + self._readout(records[-1], standing)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
         """Return the drawing of the goal's pose from the time of `record` on; `pose` is None without a goal."""
@@ -225,6 +231,17 @@ class Scene:
         outlines = columns.ragged([[self._reach.outline(index)] for index in indices])
         parts = [Column("/mode", STATE, modes), Column("/robot/workspace", STRIPS, outlines)]
         return columns.chunks(self._timelines.for_records(at), parts)
+
+    def _switched(self, records: NDArray[np.void]) -> list[Chunk]:
+        """Return the outputs and inputs at the first record, and in the cycles in which they changed."""
+        drawn: list[Chunk] = []
+        for signal in self._digital:
+            on = signal.values(records).astype(int)
+            changed = np.diff(on, prepend=-1) != 0
+            levels = pa.array([[LEVELS[level]] for level in on[changed]])
+            times = self._timelines.for_records(records[changed])
+            drawn += columns.chunks(times, [Column(signal.path, STATE, levels)])
+        return drawn
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

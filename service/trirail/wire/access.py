@@ -15,7 +15,7 @@ from trirail.wire.vocabulary import Command, Role
 from trirail.wire.zenoh_session import key
 
 GOAL_ROLE = Role.OPERATOR
-"""Lowest role that may send goals, and report the looks of an alignment, which sends goals."""
+"""Lowest role that may send and check goals, and report the looks of an alignment, which sends goals."""
 POSE_ROLE = Role.MAINTAINER
 """Lowest role that may teach and remove poses."""
 
@@ -27,7 +27,7 @@ _Rule = dict[str, Any]
 
 def least_role(*parts: str) -> Role:
     """Return the lowest role that may use a resource, given as parts of its key, such as ("cmd", user, "enable")."""
-    if parts[0] in ("goal", "alignment"):
+    if parts[0] in ("goal", "check", "alignment"):
         return GOAL_ROLE
     if parts[0] in ("teach", "forget"):
         return POSE_ROLE
@@ -115,7 +115,8 @@ def _viewer_rules(robot: str) -> Iterator[_Rule]:
     past, alive = key(robot, "event", "@adv", "**"), key(robot, "alive")
     info_keys = [key(robot, "info"), key(robot, "poses")]
     taught = [key(robot, name, "*", "*") for name in ("teach", "forget")]
-    asked = [key(robot, "goal", "*"), key(robot, "alignment", "*"), key(robot, "cmd", "*", "*"), *taught, *info_keys]
+    sent = [key(robot, name, "*") for name in ("goal", "check", "alignment")]
+    asked = [*sent, key(robot, "cmd", "*", "*"), *taught, *info_keys]
     yield _rule("publish", "egress", ("put",), *published, past)
     yield _rule("subscribe", "ingress", ("declare_subscriber",), *published, past)
     # A fleet client subscribes to all robots with one key expression; it receives only this robot's publications.
@@ -141,6 +142,7 @@ def _user_rules(robot: str, user: str, role: Role) -> Iterator[_Rule]:
         yield _rule(f"{user} teaches poses", "ingress", ("query",), *poses)
     if role.includes(GOAL_ROLE):
         yield _rule(f"{user} sends goals", "ingress", ("query", "put"), key(robot, "goal", user))
+        yield _rule(f"{user} checks goals", "ingress", ("query",), key(robot, "check", user))
         yield _rule(f"{user} aligns", "ingress", ("query",), key(robot, "alignment", user))
 
 

@@ -12,7 +12,7 @@ import msgspec
 
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.decoding import decoded, decoder, prepare
-from trirail.wire.goals import Goal
+from trirail.wire.goals import Goal, PathGoal
 from trirail.wire.looks import AlignmentLook
 from trirail.wire.messages import CommandReply, ErrorReply, Event, GoalReply, RoleReply
 from trirail.wire.sizes import MAX_MESSAGE
@@ -33,7 +33,7 @@ _READ_AS = {
 
 _NULL = {JSON: b"null", MSGPACK: b"\xc0"}
 
-prepare(Goal, *(command.accepts for command in Command), GoalReply, CommandReply, RoleReply, ErrorReply)
+prepare(Goal, PathGoal, *(command.accepts for command in Command), GoalReply, CommandReply, RoleReply, ErrorReply)
 prepare(State, Event, Info, NamedPose, NamedPoses, RobotSummary, AlignmentLook)
 
 

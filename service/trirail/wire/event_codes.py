@@ -71,6 +71,7 @@ class EventCode(StrEnum):
 
     # Outputs and inputs.
     OUTPUT_SET = "output_set", "a user has set an output", "output", "on", "user"
+    MARKS_PLANNED = "marks_planned", "an accepted goal switches outputs on its path", "goal", "number"
     OUTPUTS_SWITCHED = "outputs_switched", "outputs have switched on the path of a goal", "goal", "number"
     INPUT_CHANGED = "input_changed", "an input has changed", "input", "on", "x", "y", "phi"
     INPUT_REACHED = "input_reached", "an input has changed at which the goal was to end", "input", "x", "y", "phi"

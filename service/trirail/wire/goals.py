@@ -23,6 +23,7 @@ __all__ = [
     "MoveGoal",
     "NamedGoal",
     "OwnLimits",
+    "PathGoal",
     "PoseGoal",
     "SlidersGoal",
     "Tool",
@@ -41,11 +42,14 @@ KINDS: tuple[type[GoalKind], ...] = tuple(
 
 if TYPE_CHECKING:
     Goal = GoalKind
+    PathGoal = GoalKind
     LoopGoal = GoalKind
 else:
     Goal = Union[KINDS]  # noqa: UP007 - from a tuple of types
+    PathGoal = Union[tuple(kind for kind in KINDS if not kind.renewed)]  # noqa: UP007 - as above
     LoopGoal = Union[(*KINDS, PackedTrajectory)]
-"""A goal of any kind, as clients send it; and as gateway, loop, planner and recordings represent it."""
+"""A goal of any kind, as clients send it; of a kind whose whole path is known when it arrives; and of any kind, as
+gateway, loop, planner and recordings represent it."""
 
 
 def kind_name(goal: GoalKind) -> str:

@@ -168,7 +168,7 @@ class Switch(Struct, frozen=True, omit_defaults=True):
     t: float
     """Nominal time since the start of the loop [s], as in records."""
     time: float
-    """Wall clock [s since 1970]."""
+    """Wall clock [s since 1970] when the cycle was due; drives switch a period later, at the next SYNC."""
     commanded: Triple
     """Commanded pose in that cycle: x, y [m], phi [rad]."""
     measured: Triple

@@ -25,10 +25,10 @@ REMEMBERED_IDS = 10_000
 
 
 class GoalReply(Struct, frozen=True):
-    """Acceptance of a goal, which ends with exactly one event."""
+    """Acceptance of a goal, which ends with exactly one event; or of a check, which moves nothing and has no event."""
 
     id: str
-    """Id of the goal, from the client or generated."""
+    """Id of the goal, from the client or generated; of a check that of its goal, empty if absent."""
     duration: float | None
     """Expected time from now to the end of the path [s]. None if the end is unknown: at override zero, and for a target
     that a newer one has replaced. The goal is done when the robot has then been in position for the dwell of
@@ -158,10 +158,15 @@ class Notice(Struct, frozen=True, omit_defaults=True):
     """Values in the message, by the names that the event code defines; SI units and radians."""
     marks: tuple[Switch, ...] = ()
     """Switches on the path of a goal, with kind output, in the order in which they happened."""
+    planned: tuple[PlacedMark, ...] = ()
+    """Marks of an accepted goal, with kind output, and the places at which they will switch first."""
 
-    def event(self, seq: int, t: float, cycle: int, time: float) -> Event:
-        """Return the event with its number and time."""
-        marks = tuple(structs.replace(switch, time=time - (t - switch.t)) for switch in self.marks)
+    def event(self, seq: int, t: float, cycle: int, time: float, offset: float = 0.0) -> Event:
+        """Return the event with its number and time; `offset` is the wall clock less the monotonic one [s]."""
+        marks = tuple(
+            structs.replace(each, time=time - (t - each.t) if math.isnan(each.time) else each.time + offset)
+            for each in self.marks
+        )
         return Event(**structs.asdict(structs.replace(self, marks=marks)), seq=seq, t=t, cycle=cycle, time=time)
 
 

@@ -43,6 +43,14 @@ class GoalRequest(Struct, frozen=True, tag=True):
     """Age of a track's target at its arrival, negative for a target in the future [s]."""
 
 
+class CheckRequest(Struct, frozen=True, tag=True):
+    """Gateway to loop: a goal to plan without moving to it."""
+
+    ticket: int
+    user: str
+    goal: LoopGoal
+
+
 class CommandRequest(Struct, frozen=True, forbid_unknown_fields=True, tag=True):
     """Gateway to loop: a command and its content."""
 
@@ -71,6 +79,13 @@ class Accepted(Struct, frozen=True, tag=True):
     reply: GoalReply
 
 
+class Checked(Struct, frozen=True, tag=True):
+    """Loop to gateway: the goal of a check could be accepted."""
+
+    ticket: int
+    reply: GoalReply
+
+
 class CommandDone(Struct, frozen=True, tag=True):
     """Loop to gateway: the command has been carried out."""
 
@@ -82,7 +97,7 @@ class CommandDone(Struct, frozen=True, tag=True):
 
 
 class Refused(Struct, frozen=True, tag=True):
-    """Loop to gateway: the goal or command was refused."""
+    """Loop to gateway: the goal, check or command was refused."""
 
     ticket: int
     code: RefusalCode
@@ -167,7 +182,7 @@ class PlannerLost(Struct, frozen=True, tag=True):
     reason: str
 
 
-Request = GoalRequest | CommandRequest | Announcement
+Request = GoalRequest | CheckRequest | CommandRequest | Announcement
 GivenInput = Request | Disturbance | DrivesFault | PlanAnswer | PlannerLost
 
 
@@ -196,7 +211,7 @@ class Unrecorded(Struct, frozen=True, tag=True):
 
 
 RecorderMessage = Announcement | Unrecorded
-Answer = Accepted | CommandDone | Refused | Welcome | Farewell | EventReport | Status | ControlInput
+Answer = Accepted | Checked | CommandDone | Refused | Welcome | Farewell | EventReport | Status | ControlInput
 
 prepare(Request, Answer, RecorderMessage, *(command.content for command in Command))
 encode = msgpack.Encoder().encode

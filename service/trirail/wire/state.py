@@ -131,6 +131,8 @@ class State(Struct, frozen=True):
     """Cycle of its record."""
     t: float
     """Nominal time since the loop's start [s]; the same as in records and events."""
+    time: float
+    """Wall clock when its cycle was due [s since 1970]."""
     mode: str
     """A trirail.wire.vocabulary.Mode."""
     pose: Pose
@@ -219,6 +221,15 @@ class CorrectionInfo(Struct, frozen=True):
     """Compensated backlash of the sliders A, B, C [m]."""
 
 
+class DigitalLine(Struct, frozen=True):
+    """Place of a digital output or input in the drives' words, which each cycle's record contains."""
+
+    drive: str
+    """Drive A, B or C."""
+    bit: int
+    """Bit of object 60FEh for an output, of 60FDh for an input."""
+
+
 class Info(Struct, frozen=True):
     """Description of the robot, in reply to …/info."""
 
@@ -258,6 +269,10 @@ class Info(Struct, frozen=True):
     """Names of the outputs of the configuration."""
     inputs: tuple[str, ...] = ()
     """Names of the inputs of the configuration."""
+    output_lines: dict[str, DigitalLine] = {}
+    """Drive and bit of each output; empty from services of earlier versions."""
+    input_lines: dict[str, DigitalLine] = {}
+    """Drive and bit of each input; empty from services of earlier versions."""
     takeover: str = Role.MAINTAINER.value
     """Lowest trirail.wire.vocabulary.Role that may take over the lease: key [control] takeover of the configuration."""
 

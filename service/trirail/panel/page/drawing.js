@@ -82,11 +82,11 @@ export class Drawing {
     this.route.setAttribute("points", points(poses));
   }
 
-  // Mark where an output has switched: filled where it has switched on.
-  tick([x, y], on, title) {
+  // Mark where an output switches: dashed where planned, filled where it has switched on.
+  tick([x, y], kind, title) {
     if (this.ticks.childElementCount >= TICKS) this.ticks.firstChild.remove();
     const dot = this.ticks.appendChild(document.createElementNS(SVG, "circle"));
-    dot.setAttribute("class", on ? "tick on" : "tick");
+    dot.setAttribute("class", `tick ${kind}`);
     dot.setAttribute("r", this.tickSize);
     dot.setAttribute("cx", x);
     dot.setAttribute("cy", -y);

@@ -4,6 +4,9 @@ import { say } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 
+const label = (output, value, number) =>
+  `${number > 1 ? `${number} × ` : ""}${output} ${say(value ? "input.on" : "input.off")}`;
+
 export class Outputs {
   // `send` says a message to the server; `answer` shows what was asked.
   constructor(send, answer) {
@@ -37,12 +40,13 @@ export class Outputs {
     }
   }
 
-  // Draw where the outputs have switched on the path of a goal, until the next goal's switches come.
-  event({ kind, goal, marks }, drawing) {
-    if (kind !== "output" || !marks?.length || !drawing) return;
+  // Draw where outputs will switch on the path of a goal, and where they have, until another goal has marks.
+  event({ kind, goal, marks = [], planned = [] }, drawing) {
+    if (kind !== "output" || marks.length + planned.length === 0 || !drawing) return;
     if (goal !== this.goal) drawing.clearTicks();
     this.goal = goal;
-    for (const { output, value, commanded } of marks) drawing.tick(commanded, value, `${output} ${say(value ? "input.on" : "input.off")}`);
+    for (const { output, value, pose, number = 1 } of planned) drawing.tick(pose, "planned", label(output, value, number));
+    for (const { output, value, commanded } of marks) drawing.tick(commanded, value ? "on" : "off", label(output, value, 1));
   }
 
   #made(kind, name) {

@@ -1,0 +1,67 @@
+"""Monitors: functions that get the readings of every state, as of bps.monitor."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, Callable
+from contextlib import aclosing
+from typing import Any
+
+from bluesky.protocols import Reading
+from ophyd_async.core import Device
+
+from trirail.wire.state import State
+
+Readings = dict[str, Reading[Any]]
+Monitor = Callable[[Readings], None]
+
+
+class Monitored(Device):
+    """A device whose readings can be monitored: Subscribable of bluesky.protocols."""
+
+    def __init__(self, name: str = "") -> None:
+        self._monitors: dict[Monitor, asyncio.Task[None]] = {}
+        super().__init__(name)
+
+    def subscribe_reading(self, function: Monitor) -> None:
+        """Call a function with the readings of every state, only the newest if it is slow, in the running event loop.
+
+        Raises ValueError for a function that has been subscribed already.
+        """
+        if function in self._monitors:
+            raise ValueError(f"{self.name}: {function!r} has been subscribed already; call clear_sub first")
+        self._monitors[function] = asyncio.get_running_loop().create_task(self._monitor(function))
+
+    subscribe = subscribe_reading
+
+    def clear_sub(self, function: Monitor) -> None:
+        """End a subscription; from any thread. Raises KeyError for a function that is not subscribed."""
+        task = self._monitors.pop(function)
+        with contextlib.suppress(RuntimeError):  # its event loop is closed, and the task with it
+            task.get_loop().call_soon_threadsafe(task.cancel)
+
+    async def _states(self) -> AsyncGenerator[State]:
+        """Yield states as they arrive."""
+        raise NotImplementedError
+        yield
+
+    def _readings(self, state: State) -> Readings:
+        raise NotImplementedError
+
+    async def _monitor(self, function: Monitor) -> None:
+        try:
+            async with aclosing(self._states()) as states:
+                async for state in states:
+                    if self._monitors.get(function) is not asyncio.current_task():
+                        return
+                    self._call(function, self._readings(state))
+        except Exception:
+            self.log.exception("the monitor of %s has ended", self.name)
+
+    def _call(self, function: Monitor, readings: Readings) -> None:
+        """Call a monitor; log its error, which must not end it."""
+        try:
+            function(readings)
+        except Exception:
+            self.log.exception("a monitor of %s failed", self.name)

@@ -1,0 +1,69 @@
+"""Outputs and inputs on the page: switches and lamps, and ticks on the drawing where outputs switch on a path."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from chromium import Page, needs_chromium
+from panel.fake_robot import FakeRobot
+from panel.test_page import until as wait
+from trirail.panel.server import Panel
+from trirail.wire.vocabulary import Role
+
+pytestmark = [pytest.mark.viewer, needs_chromium]
+
+VALVE = "[data-output=valve]"
+TICKS = "[...document.querySelectorAll('#mechanism .tick')].map((tick) => "
+
+
+@pytest.fixture
+def robot() -> FakeRobot:
+    robot = FakeRobot()
+    robot.mode = "holding"
+    robot.told = msgspec.structs.replace(robot.told, outputs=("valve",), inputs=("part",))
+    robot.outputs, robot.inputs = {"valve": False}, {"part": False}
+    return robot
+
+
+def test_a_switch_sets_its_output_and_shows_its_value(page: Page, robot: FakeRobot) -> None:
+    page.until(f"document.querySelector('{VALVE}').ariaChecked === 'false'")
+    page.click(VALVE)
+    wait(lambda: robot.outputs["valve"], "the output is set")
+    page.until(f"document.querySelector('{VALVE}').ariaChecked === 'true'")
+    robot.outputs["valve"] = False  # by a mark, or another user
+    page.until(f"document.querySelector('{VALVE}').ariaChecked === 'false'")
+
+
+def test_a_lamp_shows_its_input(page: Page, robot: FakeRobot) -> None:
+    page.until("document.querySelector('#inputs .lamp') && !document.querySelector('#inputs .on')")
+    robot.inputs["part"] = True
+    page.until("document.querySelector('#inputs .on')?.textContent === 'part'")
+
+
+def test_a_viewer_cannot_switch(browser: Page, robot: FakeRobot) -> None:
+    robot.granted = Role.VIEWER
+    page = browser.another()
+    with Panel(robot.robot()) as panel:
+        page.open(panel.url)
+        page.until("document.querySelector('#inputs .lamp')")
+        page.until("document.body.dataset.contact === 'yes'")
+        assert page.evaluate(f"document.querySelector('{VALVE}').disabled")
+        page.close()
+
+
+def test_ticks_are_where_outputs_will_switch_and_where_they_have(page: Page, robot: FakeRobot) -> None:
+    planned = [{"mark": 0, "output": "valve", "value": True, "pose": [0.02, 0.01, 0.0], "path": 0.01, "time": 0.5}]
+    planned += [planned[0] | {"mark": 1, "pose": [0.03, 0.01, 0.0], "number": 3}]
+    robot.say("two marks", kind="output", goal="g-1", planned=planned)
+    page.until(f"{TICKS} tick.getAttribute('class')).join() === 'tick planned,tick planned'")
+    assert page.evaluate(f"{TICKS} tick.textContent)") == ["valve on", "3 × valve on"]
+    assert page.evaluate(f"{TICKS} [tick.cx.baseVal.value, tick.cy.baseVal.value])") == [
+        pytest.approx([0.02, -0.01]),
+        pytest.approx([0.03, -0.01]),
+    ]
+    switch = {"goal": "g-1", "mark": 0, "output": "valve", "value": False, "cycle": 7, "t": 0.007, "time": 1.7e9}
+    switch |= {"commanded": [0.025, 0.01, 0.0], "measured": [0.025, 0.01, 0.0]}
+    robot.say("1 output switched", kind="output", goal="g-1", marks=[switch])
+    page.until(f"{TICKS} tick.getAttribute('class')).at(-1) === 'tick off'")
+    robot.say("one mark", kind="output", goal="g-2", planned=planned[:1])
+    page.until(f"{TICKS} tick.textContent).join() === 'valve on'")
