@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import fields
 from numpy.typing import NDArray
 from trirail.config import SIM, Config, load
-from trirail.control.control import Control, Given
+from trirail.control.control import Control, TimedInput
 from trirail.control.local_planner import LocalPlanner
 from trirail.motion.paths import LAST_PIECE_S, Path, constant_law
 from trirail.motion.runs import MotionState
@@ -136,7 +136,7 @@ class ControlRig:
         control = self.control
         self.driver.sync()
         now_ns = round(self.now * 1e9)
-        given: list[Given] = [] if request is None else [(request, now_ns)]
+        given: list[TimedInput] = [] if request is None else [(request, now_ns)]
         given += [(answer, now_ns) for answer in self.planner.answers()]
         control.cycle(self.driver.read, given)
         self.rows.append(control.setpoints.rows)

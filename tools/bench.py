@@ -19,14 +19,14 @@ app = App(help="Speed, as ratios within one run: the machines this runs on are n
 # Each command imports its benchmark itself: `frames` also runs in an emulated machine, where imports are slow.
 
 
-def report(found: dict[str, Any], json: bool) -> None:
+def report(results: dict[str, Any], json: bool) -> None:
     """Print the results, as one JSON object or in lines; a list of numbers gives the values at `quantiles`."""
-    print(json_format.dumps(found) if json else "\n".join(lines(found)))
+    print(json_format.dumps(results) if json else "\n".join(lines(results)))
 
 
-def lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
+def lines(results: dict[str, Any], indent: str = "") -> Iterator[str]:
     """Yield the results line by line."""
-    for name, value in found.items():
+    for name, value in results.items():
         parts = value if isinstance(value, list) and any(isinstance(part, dict) for part in value) else [value]
         for part in parts:
             if isinstance(part, dict):

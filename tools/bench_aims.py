@@ -47,16 +47,16 @@ class Aim(NamedTuple):
 
 def at(results: Results, rate: int) -> Results:
     """Return the results of `loop` at a rate."""
-    return next(found for found in results["loop"]["rates"] if found["rate_hz"] == rate)
+    return next(loop for loop in results["loop"]["rates"] if loop["rate_hz"] == rate)
 
 
 def _missed(results: Results, rate: int, of: int | None = None) -> tuple[float, ...]:
     """Return the missed ticks in excess of those that the machine itself lost, in total or per `of` cycles."""
-    found = at(results, rate)
-    if "not_kept" in found:
+    loop = at(results, rate)
+    if "not_kept" in loop:
         return ()
-    missed = max(0, found["missed"] - found["lost_by_the_machine"])
-    return (float(missed if of is None else missed * of / found["cycles"]),)
+    missed = max(0, loop["missed"] - loop["lost_by_the_machine"])
+    return (float(missed if of is None else missed * of / loop["cycles"]),)
 
 
 def _cycle_to_bare(results: Results, rate: int) -> tuple[float, ...]:
@@ -156,8 +156,9 @@ def measure(brief: bool) -> Results:
     failed = []
     for name, options in COMMANDS.items():
         print(f"{name} …", file=sys.stderr, flush=True)
-        given = BRIEF.get(name, ()) if brief else options
-        done = subprocess.run([sys.executable, program, name, "--json", *given], stdout=subprocess.PIPE, check=False)
+        arguments = BRIEF.get(name, ()) if brief else options
+        command = [sys.executable, program, name, "--json", *arguments]
+        done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
         if done.returncode == 0:
             results[name] = json_format.loads(done.stdout)
         else:
@@ -181,12 +182,12 @@ def _show(results: Results) -> None:
     for row in results["aims"]:
         measured, aim = (" / ".join(f"{value:.4g}" for value in row[key]) or "not kept" for key in ("measured", "aim"))
         print(f"{row['name']:68}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
-    for found in results.get("loop", {}).get("rates", ()):
-        if "to_bare" in found:
-            times = " / ".join(f"{value:.1f}" for value in found["to_bare"]["cycle"][:3])
-            print(f"whole cycle at {found['rate_hz']} Hz to the bare loop's, p50 / p99 / p99.9: {times} times")
+    for loop in results.get("loop", {}).get("rates", ()):
+        if "to_bare" in loop:
+            times = " / ".join(f"{value:.1f}" for value in loop["to_bare"]["cycle"][:3])
+            print(f"whole cycle at {loop['rate_hz']} Hz to the bare loop's, p50 / p99 / p99.9: {times} times")
         else:
-            print(f"{found['rate_hz']} Hz are not kept here: {found['not_kept']}")
+            print(f"{loop['rate_hz']} Hz are not kept here: {loop['not_kept']}")
     if "peers" in results:
         off = results["peers"]["deviation_us"]
         print("SYNC's interval off its period, p99.9 [µs]: " + ", ".join(f"{k} {v[2]:.0f}" for k, v in off.items()))

@@ -49,7 +49,7 @@ PLACES, ANGLES = 50e-6, 0.1e-3
 DISTORTION, AXIS_OFF = 0.005, 150.0
 """Maximum distortion at the edge of a picture, as a share, and of the lens's axis from its middle [pixel]."""
 TOLERANCE, ARC = 1e-6, math.radians(5.0 / 3600.0)
-LOOKS = 4
+PICTURES_PER_PLACE = 4
 """Pictures averaged at each place: for calibration, targets and parts, unless a case uses one."""
 PART: dict[str, Pair] = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
 FILES = {"3-PRP": "uvw.toml", "3-PPR": "uvw-ppr.toml"}
@@ -82,7 +82,7 @@ class ComputedStage:
         x, y, phi = forward(self._built, self.sliders * (1.0 + self.scales)).tolist()
         return x, y, phi
 
-    def seen(self, noise: float) -> dict[str, Pair]:
+    def pixels(self, noise: float) -> dict[str, Pair]:
         """Return the pixel coordinates of the part's marks, with `noise` [pixels]."""
         pose = self.true
         exact = {
@@ -94,7 +94,7 @@ class ComputedStage:
     def _is_in_picture(self, u: float, v: float) -> bool:
         return self._field is None or (0.0 <= u < self._field[0] and 0.0 <= v < self._field[1])
 
-    def go(self, motion: StageMotion) -> None:
+    def move(self, motion: StageMotion) -> None:
         """Move to a pose, or relative about a point, according to the model."""
         if motion.tool is None:
             self.pose = motion.by
@@ -103,34 +103,36 @@ class ComputedStage:
         x, y = (to_base_frame(motion.tool, self.pose) + motion.by[:2] - rotation_matrix(phi) @ motion.tool).tolist()
         self.pose = (x, y, phi)
 
-    def drive(self, wishes: Generator[AlignmentRequest, Observation, T], after: Callable[[], None] = lambda: None) -> T:
+    def drive(
+        self, requests: Generator[AlignmentRequest, Observation, T], after: Callable[[], None] = lambda: None
+    ) -> T:
         """Fulfil the requests of a procedure and return its result; `after` is called after each motion."""
         marks: Mapping[str, Pair] = {}
         try:
-            wish = next(wishes)
+            request = next(requests)
             while True:
-                if wish == LOOK:
-                    marks = self.seen(NOISE)
-                elif isinstance(wish, StageMotion):
-                    self.go(wish)
+                if request == LOOK:
+                    marks = self.pixels(NOISE)
+                elif isinstance(request, StageMotion):
+                    self.move(request)
                     after()
                 a, b, c = self.sliders.tolist()
-                wish = wishes.send(Observation(marks, self.pose, 0.0, (a, b, c)))
+                request = requests.send(Observation(marks, self.pose, 0.0, (a, b, c)))
         except StopIteration as end:
             return end.value  # type: ignore[no-any-return]
 
 
 def measure(parts: int, goals: int) -> dict[str, Any]:
     """Return the results of `parts` parts for each kind and case, and the duration of a service's corrections."""
-    found: dict[str, Any] = {"aims": [f"{name}: {aim}, {share:.0%}" for name, (aim, share) in AIMS.items()]}
-    found |= computed(parts)
-    found["seconds of a correction, a service"] = seconds(goals)
-    return found
+    results: dict[str, Any] = {"aims": [f"{name}: {aim}, {share:.0%}" for name, (aim, share) in AIMS.items()]}
+    results |= computed(parts)
+    results["seconds of a correction, a service"] = seconds(goals)
+    return results
 
 
 def computed(parts: int) -> dict[str, Any]:
     """Return the results of `parts` parts for each kind and case."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for kind, file in FILES.items():
         ideal = geometry(load(SIM.with_name(file)).geometry)
         mistaken = other_kind(ideal)
@@ -143,19 +145,19 @@ def computed(parts: int) -> dict[str, Any]:
             "small angles": (lambda _, robot=ideal: robot, small_angles(ideal)),
             "the other kind's model": (lambda _, robot=ideal: robot, other),
         }
-        found[kind] = {name: _case(parts, *case) for name, case in cases.items()}
-    return found
+        results[kind] = {name: _case(parts, *case) for name, case in cases.items()}
+    return results
 
 
 def _case(
-    parts: int, built: Callable[[np.random.Generator], Geometry], model: Model, looks: int = LOOKS
+    parts: int, built: Callable[[np.random.Generator], Geometry], model: Model, looks: int = PICTURES_PER_PLACE
 ) -> dict[str, Any]:
     made, one, left, counts, first_ok, reached, two = [], [], [], [], 0, 0, 0
     for seed in range(parts):
         rng = np.random.default_rng((SEED, seed))
         stage = ComputedStage(built(rng), model, rng)
-        calibration = stage.drive(calibrate_by_moves(looks=LOOKS))
-        views = [stage.seen(NOISE) for _ in range(LOOKS)]
+        calibration = stage.drive(calibrate_by_moves(looks=PICTURES_PER_PLACE))
+        views = [stage.pixels(NOISE) for _ in range(PICTURES_PER_PLACE)]
         targets = {name: tuple(np.mean([view[name] for view in views], axis=0).tolist()) for name in PART}
         aim = np.array([to_base_frame(q, stage.true) for q in PART.values()])
         error = (*rng.uniform(-OFF, OFF, 2), rng.uniform(-TURNED, TURNED))
@@ -235,18 +237,18 @@ def _seconds(robot: Robot, goals: int) -> dict[str, Any]:
     views = {name: _view(rng, place) for name, place in PART.items()}
     part = dict(PART)
 
-    def look() -> dict[str, Pair]:
+    def capture_marks() -> dict[str, Pair]:
         pose = robot.state().pose
         seen = {name: project_points(views[name], to_base_frame(q, pose)[None])[0].tolist() for name, q in part.items()}
         return {name: (u, v) for name, (u, v) in seen.items()}
 
-    targets, calibration = look(), robot.calibrate_camera(look)
+    targets, calibration = capture_marks(), robot.calibrate_camera(capture_marks)
     times, whole = [], []
     for n in range(goals):
         robot.move_to(x=0.0, y=0.0, phi=0.0).wait(30.0)
         way = 5e-4 * np.array((math.cos(n), math.sin(n)))
         part = {name: (float(x + way[0]), float(y + way[1])) for name, (x, y) in PART.items()}
-        result = robot.align(look, targets, calibration)
+        result = robot.align(capture_marks, targets, calibration)
         times.append(result.corrections[0].seconds)
         whole.append(result.seconds)
     quantiles = (50.0, 95.0, 100.0)

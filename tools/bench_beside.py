@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from trirail.processes.clock import Ticker
 
-LONGEST = 100_000
+MAX_LATENESS_US = 100_000
 """Largest lateness that the histogram distinguishes [µs]."""
 
 
@@ -33,18 +33,18 @@ class Beside:
         self.name = "cyclictest" if shutil.which("cyclictest") and os.geteuid() == 0 else "a loop that only sleeps"
         processor = max(os.sched_getaffinity(0))
         if self.name == "cyclictest":
-            options = f"-q -m -p {min(99, priority + 1)} -i {period_us} -a {processor} -t 1 -h {LONGEST}"
+            options = f"-q -m -p {min(99, priority + 1)} -i {period_us} -a {processor} -t 1 -h {MAX_LATENESS_US}"
             command = ["cyclictest", *options.split(), "-D", str(max(1, round(seconds))), f"--json={result}"]
         else:
-            given = (str(value) for value in (seconds, period_us, priority + 1, processor))
-            command = [sys.executable, __file__, *given, str(result)]
+            arguments = (str(value) for value in (seconds, period_us, priority + 1, processor))
+            command = [sys.executable, __file__, *arguments, str(result)]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
 
     def lateness(self) -> NDArray[np.float64]:
         """Wait for its end; return the lateness of each wake-up [µs]."""
         self._process.wait(60)
-        found = json.loads(self._result.read_text(encoding="utf-8"))
-        counts = found["thread"]["0"]["histogram"] if "thread" in found else found
+        result = json.loads(self._result.read_text(encoding="utf-8"))
+        counts = result["thread"]["0"]["histogram"] if "thread" in result else result
         return np.repeat([float(value) for value in counts], list(counts.values()))
 
     def ticks_lost(self, lateness: NDArray[np.float64]) -> int:
@@ -61,11 +61,11 @@ def main() -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
     except OSError as error:
         print(f"without real-time rights: {error}", file=sys.stderr)
-    histogram = np.zeros(LONGEST + 1, dtype=np.int64)
+    histogram = np.zeros(MAX_LATENESS_US + 1, dtype=np.int64)
     ticker, end = Ticker(round(period_us * 1e3)), time.monotonic() + seconds
     while time.monotonic() < end:
         tick = ticker.wait()
-        histogram[min(LONGEST, round((tick.lateness_ns * 1e-3) + tick.missed * period_us))] += 1
+        histogram[min(MAX_LATENESS_US, round((tick.lateness_ns * 1e-3) + tick.missed * period_us))] += 1
     counts = {str(value): int(histogram[value]) for value in np.flatnonzero(histogram)}
     Path(sys.argv[5]).write_text(json.dumps(counts), encoding="utf-8")
 

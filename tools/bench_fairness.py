@@ -28,7 +28,7 @@ SESSIONS = 8
 """Number of sessions per flooding process."""
 PENDING = 100
 """Maximum number of unanswered messages per flooding process."""
-ROUNDS = 10
+ALTERNATIONS = 10
 """Number of alternations of quiet and flood, so that other load of the machine affects both."""
 SETTLE = 0.5
 """Time from the beginning or end of a flood to the measurement [s]."""
@@ -79,7 +79,7 @@ def flooders(locator: str) -> Iterator[tuple[Event, Any]]:
             process.join()
 
 
-def measure(made: Rig, goals: int, rounds: int = ROUNDS) -> dict[str, Any]:
+def measure(made: Rig, goals: int, rounds: int = ALTERNATIONS) -> dict[str, Any]:
     """Measure `goals` goals and stops, half of them flooded; return milliseconds at QUANTILES."""
     choice = random.Random(7)
     took: dict[str, list[float]] = {

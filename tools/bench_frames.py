@@ -65,12 +65,12 @@ def measure(cycles: int) -> dict[str, Any]:
         for _ in range(cycles):
             for name, frames in ways.items():
                 times[name].append(_cycle(frames, sync, setpoints, positions, far))
-    found = {name: _spread(np.array(each) * 1e6) for name, each in times.items()}
+    spreads = {name: _spread(np.array(each) * 1e6) for name, each in times.items()}
     return {
         "bus": kind,
         "cycles": cycles,
-        **{f"{name}_us": spread for name, spread in found.items()},
-        "ratio": found["python_can"]["p50"] / found["socket"]["p50"],
+        **{f"{name}_us": spread for name, spread in spreads.items()},
+        "ratio": spreads["python_can"]["p50"] / spreads["socket"]["p50"],
         "aim_us": AIM,
     }
 
@@ -82,7 +82,7 @@ def _cycle(
     while frames.receive() is not None:
         pass
     frames.send(sync)
-    taken = time.perf_counter() - began
+    duration = time.perf_counter() - began
     for position in positions:
         far.send(position)
     listener = Listener()
@@ -92,12 +92,12 @@ def _cycle(
     for frame in setpoints:
         frame.fill(layout.SETPOINT, 123_456, -7890)
         frames.send(frame)
-    taken += time.perf_counter() - began
+    duration += time.perf_counter() - began
     if listener.heard != len(positions):
         raise SystemExit(f"{listener.heard} of {len(positions)} frames came")
     for _ in range(1 + len(setpoints)):
         far.recv(16)
-    return taken
+    return duration
 
 
 def _spread(microseconds: Any) -> dict[str, float]:

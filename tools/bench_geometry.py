@@ -15,9 +15,9 @@ from bench_align import (
     ANGLES,
     ARC,
     FILES,
-    LOOKS,
     NOISE,
     PART,
+    PICTURES_PER_PLACE,
     PLACES,
     SEED,
     TOLERANCE,
@@ -102,23 +102,25 @@ def _kind(file: str, stages: int) -> dict[str, Any]:
         configured: Model = lambda pose, robot=robot: inverse(robot, pose).position  # type: ignore[misc]  # noqa: E731
         stage = ComputedStage(built_otherwise(robot, rng, PLACES, ANGLES), configured, rng, FIELD)
         stage.scales = rng.uniform(-SCALES, SCALES, 3)
-        small = stage.drive(calibrate_by_moves(looks=LOOKS))
-        task = GeometryTask(robot, limits, FIELD, looks=LOOKS)
+        small = stage.drive(calibrate_by_moves(looks=PICTURES_PER_PLACE))
+        task = GeometryTask(robot, limits, FIELD, looks=PICTURES_PER_PLACE)
         calibration = stage.drive(calibrate_geometry(task))
         looks.append(len(calibration.looks))
         noise.append(calibration.noise)
         held_out.append((calibration.residual.before_m, calibration.residual.after_m))
         model, *_ = start_model(task, calibration.looks[:7])
-        wide = calibrated_cameras(model, fit_stage(model, calibration.looks, fixed_legs=True), calibration.looks, LOOKS)
+        wide = calibrated_cameras(
+            model, fit_stage(model, calibration.looks, fixed_legs=True), calibration.looks, PICTURES_PER_PLACE
+        )
         calibrated: Model = lambda pose, calibration=calibration: (  # type: ignore[misc]  # noqa: E731
             inverse(calibration.geometry, pose).position / (1.0 + np.array(calibration.scales))
         )
         ways = [_way(rng, robot, limits, stage) for _ in range(PLACES_OF_STAGE)]
         cases = {
-            "calibrated geometry": (calibrated, calibration.cameras, LOOKS),
+            "calibrated geometry": (calibrated, calibration.cameras, PICTURES_PER_PLACE),
             "calibrated geometry, one picture of a part": (calibrated, calibration.cameras, 1),
-            "configured, cameras over the travel": (configured, wide, LOOKS),
-            "configured, cameras by 1 mm and 1°": (configured, small, LOOKS),
+            "configured, cameras over the travel": (configured, wide, PICTURES_PER_PLACE),
+            "configured, cameras by 1 mm and 1°": (configured, small, PICTURES_PER_PLACE),
         }
         for name, (moved_by, cameras, pictures) in cases.items():
             stage.model = moved_by
@@ -142,7 +144,7 @@ def _way(rng: np.random.Generator, robot: Geometry, limits: Room, stage: Compute
     while len(poses) < 2:
         pose = MARGIN * rng.uniform(low, high)
         stage.pose = (float(pose[0]), float(pose[1]), float(pose[2]))
-        if limits.holds(travels(robot, pose)) and len(stage.seen(NOISE)) == len(PART):
+        if limits.holds(travels(robot, pose)) and len(stage.pixels(NOISE)) == len(PART):
             poses.append(pose)
     return poses[0], poses[1]
 
@@ -152,7 +154,7 @@ def _correct(
 ) -> tuple[float, float, int]:
     """Return distance [m] and angle [rad] after the first correction from a pose to another, and their number."""
     stage.pose = (float(end[0]), float(end[1]), float(end[2]))
-    views = [stage.seen(NOISE) for _ in range(LOOKS)]
+    views = [stage.pixels(NOISE) for _ in range(PICTURES_PER_PLACE)]
     targets = {name: tuple(np.mean([view[name] for view in views], axis=0).tolist()) for name in PART}
     aim = np.array([to_base_frame(q, stage.true) for q in PART.values()])
     stage.pose = (float(begin[0]), float(begin[1]), float(begin[2]))

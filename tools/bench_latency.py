@@ -28,7 +28,7 @@ from trirail_drivers.interface import NAMES
 SETPOINTS = {layout.RPDO2 + node for node in range(1, 1 + len(NAMES))}
 STEADY = 20
 """Maximum change of the feed-forward in a cruise, by rounding at 1e7 counts per metre [counts/s]."""
-WITHIN = 0.1
+CHANGE_TIMEOUT_S = 0.1
 """Time limit for a change; goals without one are left out, and counted [s]."""
 END = 0.08
 """Coordinate x of the goals, at which motions reverse [m]."""
@@ -66,15 +66,15 @@ class Listener:
         """Return the setpoints that have arrived since the last call."""
         return [
             Setpoint(t, identifier, layout.SETPOINT.unpack(data)[1])
-            for t, identifier, data in self._taken()
+            for t, identifier, data in self._new_frames()
             if identifier in SETPOINTS
         ]
 
     def arrivals(self, identifier: int) -> list[float]:
         """Return the arrival times of frames with an identifier since the last call [s]."""
-        return [t for t, one, _ in self._taken() if one == identifier]
+        return [t for t, one, _ in self._new_frames() if one == identifier]
 
-    def _taken(self) -> Iterator[tuple[float, int, bytes]]:
+    def _new_frames(self) -> Iterator[tuple[float, int, bytes]]:
         for chunk in self._capture.drain():
             for t, frame in CAPTURED.iter_unpack(chunk):
                 identifier, _, data = CAN_FRAME.unpack(frame)
@@ -118,7 +118,7 @@ def measure(made: Rig, goals: int) -> dict[str, Any]:
 
 def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, measured: Measured) -> list[float | None]:
     """Measure `goals` goals; one during which a stall of the machine faults the drives counts as without effect."""
-    found: list[float | None] = []
+    latencies: list[float | None] = []
     ready = False
     for _ in range(goals):
         try:
@@ -128,11 +128,11 @@ def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, meas
                     robot.enable()
                 robot.move_to(x=-END, y=0.0, phi=0.0).wait(10.0)
                 ready = True
-            found.append(measured(robot, heard, chance))
+            latencies.append(measured(robot, heard, chance))
         except TrirailError:
-            found.append(None)
+            latencies.append(None)
             ready = False
-    return found
+    return latencies
 
 
 def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
@@ -141,10 +141,10 @@ def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | No
     time.sleep(chance.uniform(0.02, 0.04))  # at any phase of the cycle, and after some earlier setpoints
     put = time.time()
     goal = robot.move_to(x=-END + chance.uniform(0.0, 0.004), y=chance.uniform(-0.004, 0.004), phi=0.0)
-    time.sleep(WITHIN)
-    found = first_change(heard.setpoints(), put)
+    time.sleep(CHANGE_TIMEOUT_S)
+    latency = first_change(heard.setpoints(), put)
     goal.wait(10.0)
-    return found
+    return latency
 
 
 def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
@@ -157,11 +157,11 @@ def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | 
     time.sleep(0.02)
     put = time.time()
     goal = robot.move_to(x=-side * END, y=0.0, phi=0.0)
-    time.sleep(WITHIN)
-    found = first_change(heard.setpoints(), put)
+    time.sleep(CHANGE_TIMEOUT_S)
+    latency = first_change(heard.setpoints(), put)
     with contextlib.suppress(TrirailError):
         goal.wait(10.0)
-    return found
+    return latency
 
 
 def first_change(setpoints: list[Setpoint], put: float) -> float | None:
@@ -171,5 +171,5 @@ def first_change(setpoints: list[Setpoint], put: float) -> float | None:
         if one.t <= put or one.identifier not in steady:
             continue
         if abs(one.velocity - steady[one.identifier]) > STEADY:
-            return one.t - put if one.t - put <= WITHIN else None
+            return one.t - put if one.t - put <= CHANGE_TIMEOUT_S else None
     return None

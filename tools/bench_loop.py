@@ -39,10 +39,10 @@ SETTLE = 2.0
 
 def measure(seconds: float, rates: tuple[int, ...], runs: int) -> dict[str, Any]:
     """Measure each rate [Hz] for `seconds` in total over `runs`; return microseconds at QUANTILES, and counts."""
-    return {"quantiles": QUANTILES, "rates": [_of_a_rate(rate, seconds, runs) for rate in rates]}
+    return {"quantiles": QUANTILES, "rates": [_measure_rate(rate, seconds, runs) for rate in rates]}
 
 
-def _of_a_rate(rate: int, seconds: float, runs: int) -> dict[str, Any]:
+def _measure_rate(rate: int, seconds: float, runs: int) -> dict[str, Any]:
     service: dict[str, Any]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -52,16 +52,16 @@ def _of_a_rate(rate: int, seconds: float, runs: int) -> dict[str, Any]:
         except (TrirailError, _NotKeptError) as error:
             service = {"not_kept": str(error)}
         bare.append(_bare(rate, BARE * seconds, folder / "after.json"))
-    return of_both({"rate_hz": rate, "seconds": seconds, **service}, together(bare))
+    return with_ratios({"rate_hz": rate, "seconds": seconds, **service}, together(bare))
 
 
-def of_both(service: dict[str, Any], bare: dict[str, Any]) -> dict[str, Any]:
+def with_ratios(service: dict[str, Any], bare: dict[str, Any]) -> dict[str, Any]:
     """Return the results of a service's loop and of the bare one, and their ratios if the service kept the rate."""
-    found = {**service, "bare": bare}
+    results = {**service, "bare": bare}
     if "not_kept" not in service:
         pairs = {what: zip(service[what], bare[what], strict=True) for what in ("cycle", "lateness")}
-        found["to_bare"] = {what: [a / b for a, b in each] for what, each in pairs.items()}
-    return found
+        results["to_bare"] = {what: [a / b for a, b in each] for what, each in pairs.items()}
+    return results
 
 
 class _NotKeptError(Exception):
@@ -71,7 +71,7 @@ class _NotKeptError(Exception):
 def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, Any]:
     """Measure the service's loop. Raises TrirailError or _NotKeptError if it cannot keep the rate."""
     priority, period_us = load(SIM).loop.priority, 1_000_000 // rate
-    found: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = []
     batches: list[NDArray[np.void]] = []
     goals = 0
     with rig(rate, own=True) as made:
@@ -83,21 +83,21 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
             late = beside.lateness()
             goals += accepted
             batches.append(rows)
-            found.append(_run(rows, late, beside, period_us))
-    told = faults.told
-    if len(told) > MOST_FAULTS * seconds:
-        raise _NotKeptError(f"{len(told)} faults in {seconds:g} s, the last: {told[-1]}")
+            results.append(_run(rows, late, beside, period_us))
+    messages = faults.told
+    if len(messages) > MOST_FAULTS * seconds:
+        raise _NotKeptError(f"{len(messages)} faults in {seconds:g} s, the last: {messages[-1]}")
     rows = np.concatenate(batches)
     parts = rows["parts_ns"] / 1000.0
     return {
         "goals": goals,
-        "faults": told,
+        "faults": messages,
         "beside": beside.name,
         "moving": float(np.mean(np.any(rows["commanded_velocity"] != 0.0, axis=1))),
         "cycles": len(rows),
-        "missed": sum(run["missed"] for run in found),
-        "lost_by_the_machine": sum(run["lost_by_the_machine"] for run in found),
-        "runs": found,
+        "missed": sum(run["missed"] for run in results),
+        "lost_by_the_machine": sum(run["lost_by_the_machine"] for run in results),
+        "runs": results,
         "parts": {name: quantiles(parts[:, column]) for column, name in enumerate(PART_NAMES)},
         "to_setpoints": quantiles(parts[:, : Part.WRITE + 1].sum(axis=1)),
         "to_record": quantiles(parts[:, : Part.RECORD + 1].sum(axis=1)),
@@ -158,8 +158,8 @@ def _collect(made: Rig, seconds: float, faults: Faults) -> tuple[NDArray[np.void
 
 def _lateness(rows: NDArray[np.void], period_us: int) -> NDArray[np.float64]:
     """Return the lateness of each cycle of a run, including preceding missed ticks, (n,) [µs]."""
-    found: NDArray[np.float64] = rows["lateness_ns"] / 1000.0 + _missed(rows) * period_us
-    return found
+    lateness: NDArray[np.float64] = rows["lateness_ns"] / 1000.0 + _missed(rows) * period_us
+    return lateness
 
 
 def _missed(rows: NDArray[np.void]) -> NDArray[np.int64]:

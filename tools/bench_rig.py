@@ -76,9 +76,9 @@ def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
     if not own:
         changes["interface"] = f'"unix"\nchannel = "{folder}/can"'
     for key, value in changes.items():
-        text, found = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)
-        if found != 1:
-            raise SystemExit(f"{config}: {key} was expected once, it is there {found} times")
+        text, count = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)
+        if count != 1:
+            raise SystemExit(f"{config}: {key} was expected once, it is there {count} times")
     config.write_text(text, encoding="utf-8")
     return config, locator
 

@@ -13,7 +13,7 @@ from trirail.processes.operating_system import processes
 from trirail.telemetry.sinks import free_port
 
 TICK = os.sysconf("SC_CLK_TCK")
-REST = 3.0
+START_DURATION_S = 3.0
 """Time after which the start has finished completely [s]."""
 WATCHED = 5.0
 """Duration of the observation of a service at rest [s]."""
@@ -24,8 +24,8 @@ def measure() -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
         for place in (Path(folder, "first"), Path(folder, "second")):
             place.mkdir()
-            found = _start(place)
-    return found
+            results = _start(place)
+    return results
 
 
 def _start(folder: Path) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def _start(folder: Path) -> dict[str, Any]:
         up = time.monotonic() - began
         pids = processes(service.pid)
         until_up = sum(_processor(pid) for pid in pids.values())
-        time.sleep(REST)
+        time.sleep(START_DURATION_S)
         before = {name: _processor(pid) for name, pid in pids.items()}
         time.sleep(WATCHED)
         each = {

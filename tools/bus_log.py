@@ -55,8 +55,8 @@ ASKED_BY = {
 }
 """Transitions of CiA 402, and the controlwords that command them; None for those that a drive makes by itself."""
 
-FOLLOWS = {0x07: {0x06, 0x0F}, 0x0F: {0x07}}
-"""Controlwords that may precede one that leads towards power."""
+ALLOWED_PREDECESSORS = {0x07: {0x06, 0x0F}, 0x0F: {0x07}}
+"""Controlwords that may precede each controlword on the way to power."""
 
 
 class Frame(NamedTuple):
@@ -88,11 +88,11 @@ def read(path: Path) -> list[Frame]:
 def problems(log: Sequence[Frame], config: Config, missed: int, until: float) -> list[str]:
     """Return the errors in the frames before the time `until`, one line each; the service reported `missed` ticks."""
     log = [frame for frame in log if frame.t < until]
-    found = sync_problems(log, config.period, missed, until)
+    lines = sync_problems(log, config.period, missed, until)
     for name, drive in zip(NAMES, config.drives.each, strict=True):
-        found += (f"drive {name}: {problem}" for problem in _setpoint_problems(log, drive, config))
-        found += (f"drive {name}: {problem}" for problem in _power_problems(log, drive.node))
-    return found
+        lines += (f"drive {name}: {problem}" for problem in _setpoint_problems(log, drive, config))
+        lines += (f"drive {name}: {problem}" for problem in _power_problems(log, drive.node))
+    return lines
 
 
 def sync_problems(log: Sequence[Frame], period: float, missed: int, until: float) -> list[str]:
@@ -106,13 +106,14 @@ def sync_problems(log: Sequence[Frame], period: float, missed: int, until: float
 def differences(own: Sequence[Frame], log: Sequence[Frame], until: float) -> list[str]:
     """Return the identifiers whose frames in the service's log, before `until`, are no contiguous run on the bus."""
     here, there = _by_identifier([frame for frame in own if frame.t < until]), _by_identifier(log)
-    found = []
-    for identifier, said in here.items():
+    lines = []
+    for identifier, frames in here.items():
         heard = there.get(identifier, [])
         # The two logs begin and end at different times.
-        if not any(heard[start : start + len(said)] == said for start in range(len(heard) - len(said) + 1)):
-            found.append(f"identifier {identifier:03X}: {len(said)} frames in the service's log, but others on the bus")
-    return found
+        if not any(heard[start : start + len(frames)] == frames for start in range(len(heard) - len(frames) + 1)):
+            problem = f"{len(frames)} frames in the service's log, but others on the bus"
+            lines.append(f"identifier {identifier:03X}: {problem}")
+    return lines
 
 
 def statistics(log: Sequence[Frame], config: Config, until: float) -> dict[str, float]:
@@ -154,13 +155,13 @@ def _sync_problems(syncs: Sequence[float], period: float, missed: int) -> Iterat
 
 
 def _setpoints(log: Sequence[Frame], drive: Drive) -> list[Setpoint]:
-    found = []
+    setpoints = []
     for frame in log:
         if frame.identifier == layout.RPDO2 + drive.node:
             position, velocity = layout.SETPOINT.unpack(frame.data)
             factor = drive.direction / drive.counts_per_metre
-            found.append(Setpoint(frame.t, position * factor + drive.offset, velocity * factor))
-    return found
+            setpoints.append(Setpoint(frame.t, position * factor + drive.offset, velocity * factor))
+    return setpoints
 
 
 def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> Iterator[str]:
@@ -210,7 +211,7 @@ def _power_problems(log: Sequence[Frame], node: int) -> Iterator[str]:
             setpoint = True
         elif frame.identifier == layout.RPDO1 + node:
             (new,) = layout.CONTROLWORD.unpack(frame.data)
-            if word not in FOLLOWS.get(new, {word}):
+            if word not in ALLOWED_PREDECESSORS.get(new, {word}):
                 yield f"controlword {new:04X} after {word:04X}, at {frame.t:.6f}"
             if new == 0x0F and not setpoint:
                 yield f"operation is enabled before there is a setpoint, at {frame.t:.6f}"

@@ -64,11 +64,11 @@ def _numbers(names: Sequence[str], fields: Sequence[str], line: int, bare: str) 
     """Return the fields of a row in SI units, in the order of COLUMNS; an angle without a unit is in `bare`."""
     if len(fields) != len(names):
         raise CalibrationError(f"line {line}: {len(fields)} fields; wanted are {len(names)}")
-    given = dict(zip(names, fields, strict=True))
+    texts = dict(zip(names, fields, strict=True))
     values = []
     for name in COLUMNS:
         try:
-            values.append(quantity(given[name], ANGLE, bare) if name == "phi" else quantity(given[name], LENGTH))
+            values.append(quantity(texts[name], ANGLE, bare) if name == "phi" else quantity(texts[name], LENGTH))
         except ValueError as error:
             raise CalibrationError(f"line {line}: {name}: {error}") from error
     return values
@@ -85,32 +85,32 @@ def section(geometry: Geometry) -> str:
     return "\n".join(lines) + "\n"
 
 
-def describe(found: Calibration, lines: Sequence[int]) -> str:
+def describe(result: Calibration, lines: Sequence[int]) -> str:
     """Return the report as text."""
-    said = [f"{len(lines)} poses; the residuals are {found.misfit:.2f} times the stated noise", ""]
-    said.append(f"{'residual':<36}{'rms':>10}{'greatest':>12}")
-    for (name, unit, scale), column in zip(COORDINATES, np.abs(found.residuals.T), strict=True):
+    text = [f"{len(lines)} poses; the residuals are {result.misfit:.2f} times the stated noise", ""]
+    text.append(f"{'residual':<36}{'rms':>10}{'greatest':>12}")
+    for (name, unit, scale), column in zip(COORDINATES, np.abs(result.residuals.T), strict=True):
         rms, worst = math.sqrt(np.mean(column**2)), int(np.argmax(column))
-        said.append(f"{f'{name} [{unit}]':<36}{rms * scale:>10.3f}{column[worst] * scale:>12.3f}  line {lines[worst]}")
+        text.append(f"{f'{name} [{unit}]':<36}{rms * scale:>10.3f}{column[worst] * scale:>12.3f}  line {lines[worst]}")
 
-    said += ["", f"{'correction':<36}{'change':>10}{'std. error':>12}"]
-    for leg, changes, errors in zip(found.geometry.labels, found.corrections, found.standard_errors, strict=True):
-        for name, change, error in zip(found.geometry.parameters, changes, errors, strict=True):
+    text += ["", f"{'correction':<36}{'change':>10}{'std. error':>12}"]
+    for leg, changes, errors in zip(result.geometry.labels, result.corrections, result.standard_errors, strict=True):
+        for name, change, error in zip(result.geometry.parameters, changes, errors, strict=True):
             unit = "mrad" if name.endswith("angle") else "mm"
             known = f"{error * 1e3:.4f}" if math.isfinite(error) else "open"
-            said.append(f"{f'{leg} {name} [{unit}]':<36}{change * 1e3:>10.4f}{known:>12}")
+            text.append(f"{f'{leg} {name} [{unit}]':<36}{change * 1e3:>10.4f}{known:>12}")
 
-    said += ["", HELD]
-    for leg, names, combinations in found.open:
+    text += ["", HELD]
+    for leg, names, combinations in result.open:
         what = "one combination of them stays" if combinations == 1 else f"{combinations} combinations of them stay"
-        said.append(f"Leg {leg}: these poses cannot separate {', '.join(names)}: {what} as in the starting geometry.")
-    if found.open:
-        said.append("Poses that differ more, in phi above all, would.")
+        text.append(f"Leg {leg}: these poses cannot separate {', '.join(names)}: {what} as in the starting geometry.")
+    if result.open:
+        text.append("Poses that differ more, in phi above all, would.")
 
-    angles = singular_angles(found.geometry)
+    angles = singular_angles(result.geometry)
     low, high = max(phi for phi in angles if phi < 0.0), min(phi for phi in angles if phi > 0.0)
-    said += ["", f"With G at (0, 0) singular at phi = {low:.4f} and {high:.4f} rad: see limits.platform.phi."]
-    return "\n".join(said)
+    text += ["", f"With G at (0, 0) singular at phi = {low:.4f} and {high:.4f} rad: see limits.platform.phi."]
+    return "\n".join(text)
 
 
 def calibrate(options: argparse.Namespace) -> None:
@@ -124,39 +124,39 @@ def calibrate(options: argparse.Namespace) -> None:
         write(map_text(options, start, poses, sliders), options.output)
         return
     try:
-        found = identify(start, poses, sliders, position_noise=options.position_noise, angle_noise=options.angle_noise)
+        result = identify(start, poses, sliders, position_noise=options.position_noise, angle_noise=options.angle_noise)
     except CalibrationError as error:
         if error.row is None:
             raise
         raise CalibrationError(f"{options.poses}: line {lines[error.row]}: {error}") from error
-    print(describe(found, lines), file=sys.stderr)
-    write(section(found.geometry), options.output)
+    print(describe(result, lines), file=sys.stderr)
+    write(section(result.geometry), options.output)
 
 
 def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders: Array) -> str:
     """Fit the map, report, and return its file. Raises CalibrationError, also if the service would refuse it."""
     limits = config.load(options.config).limits
     try:
-        found = correction_fit.fit(robot, poses, sliders, config.room(limits), options.cells)
-        made = as_built.measured_today(found.correction, robot)
+        fit = correction_fit.fit(robot, poses, sliders, config.room(limits), options.cells)
+        made = as_built.measured_today(fit.correction, robot)
         text = as_built.format_map(made)
         config.check_as_built(as_built.parse(text), robot, limits)
     except (CalibrationError, ConfigError) as error:
         raise CalibrationError(f"{options.poses}: {error}") from error
-    print(describe_map(found), file=sys.stderr)
+    print(describe_map(fit), file=sys.stderr)
     return text
 
 
-def describe_map(found: correction_fit.Fit) -> str:
+def describe_map(fit: correction_fit.Fit) -> str:
     """Return the report on a map as text."""
-    cells = math.prod(found.correction.cells)
-    said = [f"{len(found.before)} poses; {found.empty} of {cells} cells have none, and what is there comes from beside"]
-    said += ["", f"{'pose error: rms, greatest':<28}{'measured':>18}{'left':>18}{'left if not measured':>24}"]
+    cells = math.prod(fit.correction.cells)
+    text = [f"{len(fit.before)} poses; {fit.empty} of {cells} cells have none, and get their values from neighbours"]
+    text += ["", f"{'pose error: rms, greatest':<28}{'measured':>18}{'left':>18}{'left if not measured':>24}"]
     for k, (name, unit, scale) in enumerate(COORDINATES):
-        columns = [np.abs(each[:, k]) * scale for each in (found.before, found.residuals, found.predicted)]
-        told = [f"{math.sqrt(np.mean(each**2)):.2f}, {each.max():.2f}" for each in columns]
-        said.append(f"{f'{name} [{unit}]':<28}{told[0]:>18}{told[1]:>18}{told[2]:>24}")
-    return "\n".join(said)
+        columns = [np.abs(each[:, k]) * scale for each in (fit.before, fit.residuals, fit.predicted)]
+        errors = [f"{math.sqrt(np.mean(each**2)):.2f}, {each.max():.2f}" for each in columns]
+        text.append(f"{f'{name} [{unit}]':<28}{errors[0]:>18}{errors[1]:>18}{errors[2]:>24}")
+    return "\n".join(text)
 
 
 def write(text: str, output: Path | None) -> None:
@@ -185,9 +185,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Identifies the geometry of a robot as built from measured poses.")
     columns = f"CSV file with the columns {', '.join(COLUMNS)} [m, rad], or with units: 12.5um, 3arcsec"
     parser.add_argument("poses", type=Path, help=columns)
-    parser.add_argument("--config", type=Path, default=config.SIM, help="its geometry is where to start (%(default)s)")
-    parser.add_argument("--output", type=Path, metavar="FILE", help="where to write the section; else standard output")
-    parser.add_argument("--map", action="store_true", help="write the map of what the robot does beside its geometry")
+    parser.add_argument(
+        "--config", type=Path, default=config.SIM, help="configuration with the starting geometry (%(default)s)"
+    )
+    parser.add_argument("--output", type=Path, metavar="FILE", help="file for the section; standard output if absent")
+    parser.add_argument(
+        "--map", action="store_true", help="write a map of the errors that the geometry does not explain"
+    )
     parser.add_argument(
         "--cells",
         type=int,

@@ -4,8 +4,9 @@ python tools/chaos.py                   all of it, forty minutes
 python tools/chaos.py --sample 10       ten cases, drawn by --seed
 python tools/chaos.py --only moving/loop/KILL
 
-Afterwards drives stand and have no power, no setpoint has jumped, the goal has ended exactly once, no process is left,
-the ports are free, the recording can be read, and the next start works. Exit 1 if any of it does not hold in any case.
+Each case checks that the drives are at rest and unpowered, that no setpoint has jumped, that the goal has ended exactly
+once, that no process is left, that the ports are free, that the recording can be read, and that the next start works.
+The exit code is 1 if any check fails.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from chaos_rig import PATIENCE, PROCESSES, Failed, Rig, states, wait_for
+from chaos_rig import EVENT_TIMEOUT_S, PROCESSES, Failed, Rig, states, wait_for
 from trirail.client.client import Robot
 from trirail.errors import TrirailError
 from trirail.wire.zenoh_session import key, open_client
@@ -80,7 +81,7 @@ class Case(NamedTuple):
 CASES = [Case(*case) for case in itertools.product(MODES, PROCESSES, HARM)]
 
 
-def bring_to(mode: str, rig: Rig, robot: Robot, ask: Callable[[str], object]) -> None:
+def enter_mode(mode: str, rig: Rig, robot: Robot, ask: Callable[[str], object]) -> None:
     """Bring a disabled robot to a mode, by the goal GOAL if it needs one.
 
     `ask` sends a command and does not wait for its execution.
@@ -112,7 +113,7 @@ def run(rig: Rig, case: Case) -> None:
     faults = rig.major_faults()
     number, seconds = HARM[case.harm]
     with rig.robot() as robot, open_client(rig.locator) as session:
-        bring_to(case.mode, rig, robot, lambda name: session.get(key("demo", "cmd", "chaos", name)))
+        enter_mode(case.mode, rig, robot, lambda name: session.get(key("demo", "cmd", "chaos", name)))
         os.kill(victim, number)
         stands_by = time.monotonic() + STANDS_AFTER
     if seconds is not None:
@@ -123,7 +124,7 @@ def run(rig: Rig, case: Case) -> None:
     if case.ends_the_service:
         _wait_end(rig)
     else:
-        heard = _go_on(rig, case)
+        heard = _check_continues(rig, case)
         if waited := rig.major_faults() - faults:
             raise Failed(f"the loop has waited for {waited} pages from the disk: they should have been in memory")
         if case.victim == "supervisor" and case.harm == "STOP":
@@ -143,7 +144,7 @@ def run(rig: Rig, case: Case) -> None:
     _check_goal(rig, case, heard)
 
 
-def _go_on(rig: Rig, case: Case) -> list[str]:
+def _check_continues(rig: Rig, case: Case) -> list[str]:
     """Check that the service continues and obeys a stop; return the reported end of the goal."""
     if case.stops_the_robot:
         time.sleep(STANDS_AFTER)
@@ -153,13 +154,13 @@ def _go_on(rig: Rig, case: Case) -> list[str]:
         if case.mode == "fault":
             robot.reset()
         robot.disable()
-        told = robot.events(history=True, timeout=1.0)
-        return [str(event.outcome) for event in told if event.id == GOAL and event.outcome]
+        events = robot.events(history=True, timeout=1.0)
+        return [str(event.outcome) for event in events if event.id == GOAL and event.outcome]
 
 
 def _wait_end(rig: Rig) -> None:
     with contextlib.suppress(Exception):
-        rig.service.wait(PATIENCE)
+        rig.service.wait(EVENT_TIMEOUT_S)
     if rig.service.poll() is None:
         rig.service.kill()
         rig.service.wait()
@@ -186,12 +187,12 @@ def _check_goal(rig: Rig, case: Case, heard: list[str]) -> None:
 
 def attempt(rig: Rig, case: Case) -> str:
     """Return "ok" or the failure; leave a service that is up and disabled."""
-    found = "ok"
+    outcome = "ok"
     try:
         run(rig, case)
     except (Failed, TrirailError) as failure:
         rig.service.terminate()
-        found = " ".join(f"{failure}; warnings: {rig.warnings()}".split())
+        outcome = " ".join(f"{failure}; warnings: {rig.warnings()}".split())
     finally:
         rig.fault("clear")
     try:
@@ -203,15 +204,15 @@ def attempt(rig: Rig, case: Case) -> str:
             robot.enable()
             robot.disable()
     except (Failed, TrirailError) as failure:
-        return f"{found}; the next start: {' '.join(str(failure).split())}"
-    return found
+        return f"{outcome}; the next start: {' '.join(str(failure).split())}"
+    return outcome
 
 
 def main() -> int:
     """Run the selected cases; print a table, or with --json one object."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--sample", type=int, help="so many cases, by chance")
-    arguments.add_argument("--seed", type=int, default=0, help="of the chance")
+    arguments.add_argument("--sample", type=int, help="number of random cases")
+    arguments.add_argument("--seed", type=int, default=0, help="seed of the random choice")
     arguments.add_argument("--only", default="", help="cases whose mode/victim/signal contains this")
     arguments.add_argument("--json", action="store_true", help="print one JSON object")
     options = arguments.parse_args()

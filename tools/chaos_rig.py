@@ -30,7 +30,7 @@ from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.errors import BusError
 
 ROOT = Path(__file__).parents[1]
-PATIENCE = 20.0
+EVENT_TIMEOUT_S = 20.0
 """Time limit for any expected event [s]."""
 PROCESSES = ("supervisor", "fork-server", "gateway", "loop", "planner", "recorder")
 NODES = (1, 2, 3)
@@ -48,7 +48,7 @@ class Failed(Exception):
     """A requirement is violated."""
 
 
-def wait_for(condition: Callable[[], bool], what: str, within: float = PATIENCE) -> None:
+def wait_for(condition: Callable[[], bool], what: str, within: float = EVENT_TIMEOUT_S) -> None:
     """Wait until a condition holds. Raises Failed."""
     deadline = time.monotonic() + within
     while not condition():
@@ -103,8 +103,8 @@ class Rig:
             "directory": f'"{self.folder}/recordings"',
         }
         for key, value in changes.items():
-            text, found = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)
-            if not found:
+            text, count = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value} ", text, flags=re.MULTILINE)
+            if not count:
                 raise Failed(f"{SIM} has no key {key}")
         return text
 
@@ -112,8 +112,8 @@ class Rig:
         """Stop the drives."""
         self._closing = True
         self._drives.terminate()
-        self._drives.wait(PATIENCE)
-        self._listener.join(PATIENCE)
+        self._drives.wait(EVENT_TIMEOUT_S)
+        self._listener.join(EVENT_TIMEOUT_S)
         self._bus.shutdown()
 
     # ------------------------------------------------------------------ the service
@@ -137,7 +137,7 @@ class Rig:
 
     def served(self) -> Robot:
         """Return a client once the service answers."""
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + EVENT_TIMEOUT_S
         while True:
             robot: Robot | None = None
             try:
@@ -167,14 +167,14 @@ class Rig:
 
     def remains(self) -> list[int]:
         """Return the ids of the service's remaining processes."""
-        found = []
+        pids = []
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 # Forked processes have no arguments, and not necessarily an environment, of their own.
                 speaks_to = (entry / "fd" / "1").readlink()
                 if speaks_to.is_relative_to(self.folder) and b"virtual_drives" not in (entry / "cmdline").read_bytes():
-                    found.append(int(entry.name))
-        return found
+                    pids.append(int(entry.name))
+        return pids
 
     def clean_up(self) -> None:
         """Remove everything that a service could leave to the next one."""
@@ -189,17 +189,17 @@ class Rig:
 
     def recordings(self) -> list[Recording]:
         """Return all recordings of the service. Raises Failed if a file cannot be read."""
-        found = []
+        recordings = []
         for file in sorted((self.folder / "recordings").glob("*.rrd")):
             if file.name.startswith("fault-"):
                 continue
             try:
-                found.append(read(file))
+                recordings.append(read(file))
             except EmptyRecordingError:  # a recorder that replaced a dead one just before the service ended
                 continue
             except ServiceError as error:
                 raise Failed(str(error)) from error
-        return found
+        return recordings
 
     def warnings(self) -> str:
         """Return the service's warnings, to find the cause of a failure."""
@@ -280,18 +280,18 @@ class Rig:
     def _followed(self, node: int) -> list[np.ndarray[tuple[int], np.dtype[np.float64]]]:
         """Return the setpoints of a drive while commanded to follow them [m]; otherwise they are measured positions."""
         runs: list[list[float]] = []
-        told = 0
+        state = 0
         with self._lock:
             heard = list(self._heard)
         for message in heard:
             if message.arbitration_id == canopen_frames.RPDO1 + node:
-                before, told = (
-                    told,
+                before, state = (
+                    state,
                     canopen_frames.CONTROLWORD.unpack(message.data[:2])[0] & canopen_frames.ENABLE_OPERATION,
                 )
-                if told == canopen_frames.ENABLE_OPERATION != before:
+                if state == canopen_frames.ENABLE_OPERATION != before:
                     runs.append([])
-            elif message.arbitration_id == canopen_frames.RPDO2 + node and told == canopen_frames.ENABLE_OPERATION:
+            elif message.arbitration_id == canopen_frames.RPDO2 + node and state == canopen_frames.ENABLE_OPERATION:
                 runs[-1].append(canopen_frames.SETPOINT.unpack(message.data)[0] / self.counts)
         return [np.array(run) for run in runs]
 
@@ -305,8 +305,8 @@ def _python(*arguments: str) -> list[str]:
 
 def states(robot: Robot, condition: Callable[[State], bool]) -> State:
     """Return the first state that satisfies a condition. Raises Failed."""
-    deadline = time.monotonic() + PATIENCE
-    for state in robot.states(timeout=PATIENCE):
+    deadline = time.monotonic() + EVENT_TIMEOUT_S
+    for state in robot.states(timeout=EVENT_TIMEOUT_S):
         if condition(state):
             return state
         if time.monotonic() > deadline:

@@ -27,7 +27,7 @@ _SECTION = re.compile(r"^Section \[[^]]*\](\.|: )")
 
 FILE = Path(__file__).parents[1] / "configs/README.md"
 
-HEAD = """\
+PREAMBLE = """\
 # Configurations
 
 One TOML file is one robot. It is strict: an unknown key, a wrong type or an impossible value is
@@ -64,14 +64,14 @@ class Section(NamedTuple):
 
 def sections(kind: type = Config, path: str = "") -> Iterator[Section]:
     """Yield the tables below a type in order; adjacent ones of one type form one section."""
-    found: dict[type, list[tuple[str, bool, bool]]] = {}
+    tables: dict[type, list[tuple[str, bool, bool]]] = {}
     for field in _fields(kind):
         inner, many = _table(field.type)
         if inner is not None:
             name = f"{path}.{field.encode_name}" if path else field.encode_name
             name += ".NAME" * isinstance(field.type, mi.DictType)
-            found.setdefault(inner, []).append((name, many, field.required))
-    for inner, places in found.items():
+            tables.setdefault(inner, []).append((name, many, field.required))
+    for inner, places in tables.items():
         headings = tuple(f"[[{name}]]" if many else f"[{name}]" for name, many, _ in places)
         yield Section(headings, inner, any(needed for _, _, needed in places))
         yield from sections(inner, places[0][0])
@@ -79,11 +79,11 @@ def sections(kind: type = Config, path: str = "") -> Iterator[Section]:
 
 def keys(kind: type) -> Iterator[tuple[str, str, str, str]]:
     """Yield name, allowed values, default and meaning of each key of a table that is not a table itself."""
-    said = docstrings.fields(kind)
+    texts = docstrings.fields(kind)
     for field in _fields(kind):
         if _table(field.type)[0] is None:
             default = "" if field.required else "none" if field.default is None else f"`{json.dumps(_default(field))}`"
-            yield field.encode_name, allowed(field.type), default, said.get(field.encode_name, "")
+            yield field.encode_name, allowed(field.type), default, texts.get(field.encode_name, "")
 
 
 def names() -> set[str]:
@@ -136,7 +136,7 @@ def _number(kind: mi.Type) -> str:
 def reference() -> str:
     """Return the text of the file."""
     files = "\n".join(f"- [{name}]({name}): {purpose}" for name, purpose in shipped_files().items())
-    parts = [HEAD.format(files=files), config_limits.table(names())]
+    parts = [PREAMBLE.format(files=files), config_limits.table(names())]
     for headings, kind, needed in sections():
         title = ", ".join(f"`{heading}`" for heading in headings) + ("" if needed else ", may be absent")
         doc = _SECTION.sub("", " ".join((kind.__doc__ or "").split()))
@@ -156,10 +156,10 @@ def reference() -> str:
 
 
 def _fields(kind: type) -> tuple[mi.Field, ...]:
-    found = mi.type_info(kind)
-    if not isinstance(found, mi.StructType):
+    info = mi.type_info(kind)
+    if not isinstance(info, mi.StructType):
         raise TypeError(f"{kind} is no table")
-    return found.fields
+    return info.fields
 
 
 def _default(field: mi.Field) -> object:
@@ -170,7 +170,7 @@ def _table(kind: mi.Type) -> tuple[type | None, bool]:
     """Return the type of the table that a key holds, None if it holds none, and whether it holds several."""
     match kind:
         case mi.UnionType(types=types):
-            return next((found for part in types if (found := _table(part))[0] is not None), (None, False))
+            return next((table for part in types if (table := _table(part))[0] is not None), (None, False))
         case mi.StructType(cls=cls):
             return cls, False
         case mi.TupleType(item_types=(mi.StructType(cls=cls), *_)) | mi.VarTupleType(item_type=mi.StructType(cls=cls)):

@@ -17,20 +17,20 @@ def fields(kind: type) -> dict[str, str]:
     return {
         field: text
         for each in reversed(kind.__mro__[: kind.__mro__.index(end)])
-        for field, text in _of_module(each.__module__).get(each.__name__, {}).items()
+        for field, text in _module_fields(each.__module__).get(each.__name__, {}).items()
     }
 
 
 @functools.cache
-def _of_module(name: str) -> dict[str, dict[str, str]]:
+def _module_fields(name: str) -> dict[str, dict[str, str]]:
     tree = ast.parse(inspect.getsource(sys.modules[name]))
-    return {node.name: _of_class(node) for node in tree.body if isinstance(node, ast.ClassDef)}
+    return {node.name: _class_fields(node) for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
-def _of_class(node: ast.ClassDef) -> dict[str, str]:
-    found = {}
+def _class_fields(node: ast.ClassDef) -> dict[str, str]:
+    texts = {}
     for field, below in itertools.pairwise(node.body):
         match field, below:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                found[name] = " ".join(text.split())
-    return found
+                texts[name] = " ".join(text.split())
+    return texts

@@ -1,11 +1,12 @@
-"""Generated tests with ever new examples, on every core, until the time is over: what it finds stays as an example.
+"""Run the generated tests with new examples on every core until the time is over, and print the findings.
 
 python tools/explore.py 30                      half an hour
 python tools/explore.py 30 --only motion        tests whose name or file contains this
-python tools/explore.py 5 --seed 7              the same examples as before, as far as it gets
+python tools/explore.py 5 --seed 7              the same examples as an earlier run, until the time is over
 
-Each core goes through all of them in an order of its own, over and over, each time with twice the examples and another
-seed. What is found is shown at the end with the lines that keep it, and is tried first by the next run. Exit 1 then.
+Each core repeats all tests in an order of its own, each time with twice the examples and another seed. Findings are
+printed at the end, with the lines that preserve them as examples; the next run tries them first. The exit code is 1 if
+there are findings.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ NICE = 10
 """Nice value, which gives other work of the machine precedence."""
 TIMEOUT = 600
 """Time limit of a test that tries its usual number of examples and shrinks its findings [s]."""
-SAID_EVERY = 30.0
+REPORT_PERIOD_S = 30.0
 """Interval of progress messages [s]."""
 GRACE = 20.0
 """Time limit for a test to clean up [s]."""
@@ -49,7 +50,7 @@ class Summary(NamedTuple):
     """First error, and the line that preserves it, by test."""
 
     @classmethod
-    def of(cls, lines: Sequence[dict[str, Any]]) -> Summary:
+    def from_lines(cls, lines: Sequence[dict[str, Any]]) -> Summary:
         """Summarise the output of rounds."""
         examples: Counter[str] = Counter()
         findings: dict[str, dict[str, str]] = {}
@@ -69,8 +70,8 @@ class Summary(NamedTuple):
         """Yield the summary as text, line by line."""
         for test, count in sorted(self.examples.items()):
             yield f"{count:10,}  {test}"
-        for test, found in self.findings.items():
-            yield f"\nfound in {test}:\n{found['error']}\nto keep it, write above the test:\n{found['keep']}"
+        for test, finding in self.findings.items():
+            yield f"\nfound in {test}:\n{finding['error']}\nto keep it, write above the test:\n{finding['keep']}"
         yield f"\n{self}"
 
 
@@ -94,7 +95,7 @@ class Core:
                 ["nice", "-n", str(NICE), *command], cwd=ROOT, stdout=log, stderr=log, start_new_session=True
             )
 
-    def go_on(self) -> str | None:
+    def continue_rounds(self) -> str | None:
         """Start the next round if the last one is over; return the reason if none can start."""
         code = self._process.poll()
         if code is None:
@@ -128,15 +129,15 @@ class Core:
 
 def explore(cores: Sequence[Core], seconds: float) -> str | None:
     """Run for the given time and report progress; return the reason for an early end, "" for an interrupt."""
-    begun = said = time.monotonic()
+    begun = reported_at = time.monotonic()
     trouble = None
     try:
         while trouble is None and time.monotonic() - begun < seconds:
             time.sleep(0.2)
-            trouble = next(filter(None, (core.go_on() for core in cores)), None)
-            if time.monotonic() - said >= SAID_EVERY:
-                said = time.monotonic()
-                gone = said - begun
+            trouble = next(filter(None, (core.continue_rounds() for core in cores)), None)
+            if time.monotonic() - reported_at >= REPORT_PERIOD_S:
+                reported_at = time.monotonic()
+                gone = reported_at - begun
                 print(f"{gone / 60:.1f} of {seconds / 60:g} min: {summary(cores)}", file=sys.stderr, flush=True)
     except KeyboardInterrupt:
         trouble = ""
@@ -149,7 +150,7 @@ def explore(cores: Sequence[Core], seconds: float) -> str | None:
 
 def summary(cores: Sequence[Core]) -> Summary:
     """Return the combined output of all explorers."""
-    return Summary.of([line for core in cores for line in core.lines()])
+    return Summary.from_lines([line for core in cores for line in core.lines()])
 
 
 def main() -> int:
@@ -157,7 +158,7 @@ def main() -> int:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("minutes", type=float)
     arguments.add_argument("--only", default="", help="tests whose name or file contains this, as pytest -k has it")
-    arguments.add_argument("--seed", type=int, help="of the examples; another one each time if absent")
+    arguments.add_argument("--seed", type=int, help="seed of the examples; random if absent")
     arguments.add_argument("--json", action="store_true", help="print one JSON object")
     options = arguments.parse_args()
     signal.signal(
@@ -167,16 +168,16 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="trirail-explore-") as folder:
         cores = [Core(Path(folder), number, seed, options.only) for number in range(os.cpu_count() or 1)]
         trouble = explore(cores, 60.0 * options.minutes)
-        found = summary(cores)
+        result = summary(cores)
     if trouble:
         print(f"explore: {trouble}", file=sys.stderr)
         return 2
     if options.json:
-        told = {"seed": seed, "tests": found.tests, "examples": found.examples, "findings": found.findings}
-        print(json.dumps(told | {"interrupted": trouble is not None}))
+        content = {"seed": seed, "tests": result.tests, "examples": result.examples, "findings": result.findings}
+        print(json.dumps(content | {"interrupted": trouble is not None}))
     else:
-        print("\n".join(found.lines()) + f"; --seed {seed}" + ("; interrupted" if trouble is not None else ""))
-    return 130 if trouble is not None else int(bool(found.findings))
+        print("\n".join(result.lines()) + f"; --seed {seed}" + ("; interrupted" if trouble is not None else ""))
+    return 130 if trouble is not None else int(bool(result.findings))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""A service among strangers: junk of every kind, for so many seconds, on every port it has; does it hold?
+"""Flood every port of a service with junk for a number of seconds, and check that the service keeps working.
 
-Two hundred client sessions send what cannot be read, twenty subscribe and never read, and TCP connections stay
-half open on the Zenoh port, on Rerun's and on that of the operator's page. Meanwhile a user moves the robot and stops
-it. Afterwards the same processes must live, the robot must move to a goal, the page must be served, and what the log
-has grown by must be bounded. Then users of every role flood a service one after the other, and its memory is bounded.
+Two hundred client sessions send invalid messages, twenty subscribe and never read, and TCP connections stay half open
+on the Zenoh port, on Rerun's and on that of the operator's page. Meanwhile a user moves the robot and stops it.
+Afterwards the same processes must be alive, the robot must move to a goal, the page must be served, and the growth of
+the log must be bounded. Then users of every role flood a service one after the other, and its memory must be bounded.
 """
 
 from __future__ import annotations
@@ -173,18 +173,18 @@ class Flood:
             connection.close()
 
 
-def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, deaf: bool, said: Connection) -> None:
+def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, deaf: bool, results: Connection) -> None:
     """Flood from a separate process: readers that never read block Zenoh's threads in the whole process."""
     if deaf:
         kept = [zenoh_session.open_client(locator) for _ in range(DEAF)]
         subscribed = [one.declare_subscriber("trirail/**", zenoh.handlers.FifoChannel(1)) for one in kept]
         time.sleep(seconds)
-        said.send((Counter({"deaf": len(subscribed)}), 0))
+        results.send((Counter({"deaf": len(subscribed)}), 0))
         os._exit(0)  # closing a blocked session would block too
     flood = Flood(locator, ports, rate)
     with flood:
         time.sleep(seconds)
-    said.send((flood.sent, flood.answered))
+    results.send((flood.sent, flood.answered))
     os._exit(0)
 
 
@@ -225,15 +225,15 @@ def operators_page(locator: str) -> Iterator[str]:
     command = python("-m", "trirail", "panel", "--port", "0", "--robot", "demo", "--connect", locator, "--json")
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
-            told = process.stdout.readline() if process.stdout else ""
-            yield json.loads(told)["url"]
+            line = process.stdout.readline() if process.stdout else ""
+            yield json.loads(line)["url"]
         finally:
             process.terminate()
 
 
 def use(locator: str, seconds: float) -> tuple[int, list[float]]:
     """Connect, move the robot and stop it like a user; return accepted goals and the duration of each stop."""
-    ends, taken = time.monotonic() + seconds, 0
+    ends, accepted = time.monotonic() + seconds, 0
     stops: list[float] = []
     for number in itertools.count():
         if time.monotonic() >= ends:
@@ -242,14 +242,14 @@ def use(locator: str, seconds: float) -> tuple[int, list[float]]:
         with contextlib.suppress(ServiceError), Robot("demo", locator, user="ann") as robot:
             with contextlib.suppress(RefusedError):
                 robot.move_to(x=0.02 * (number % 2), y=0.0, phi=0.0)
-                taken += 1
+                accepted += 1
             asked = time.monotonic()
             with contextlib.suppress(RefusedError):
                 robot.stop()
             asked -= time.monotonic()
         stops.append(abs(asked))
         time.sleep(0.1)
-    return taken, stops
+    return accepted, stops
 
 
 def run(seconds: float, rate: float) -> list[str]:
@@ -265,21 +265,21 @@ def run(seconds: float, rate: float) -> list[str]:
             robot.enable()
             before = memory(pids)
             context = multiprocessing.get_context("spawn")
-            heard, said = context.Pipe(duplex=False)
+            heard, sender = context.Pipe(duplex=False)
             floods = [
-                context.Process(target=_flood, args=(locator, flooded, rate, seconds, deaf, said), daemon=True)
+                context.Process(target=_flood, args=(locator, flooded, rate, seconds, deaf, sender), daemon=True)
                 for deaf in (False, True)
             ]
             for one in floods:
                 one.start()
             with sampled(pids, seconds / SAMPLES) as samples:
-                taken, stops = use(locator, seconds)
-            sent, answered = max((heard.recv() for _ in floods), key=lambda told: sum(told[0].values()))
+                accepted, stops = use(locator, seconds)
+            sent, answered = max((heard.recv() for _ in floods), key=lambda counts: sum(counts[0].values()))
             for one in floods:
                 one.join()
             after = memory(pids)
             print(f"{sum(sent.values())} messages of {len(sent)} kinds in {seconds:g} s, {answered} answers")
-            print(f"{taken} goals taken, {len(stops)} stops, the slowest answered in {max(stops):.2f} s")
+            print(f"{accepted} goals taken, {len(stops)} stops, the slowest answered in {max(stops):.2f} s")
             for process in pids:
                 meanwhile = " ".join(f"{sample[process]:.0f}" for sample in samples)
                 print(f"{process:12}{before[process]:5.0f} MB before, {meanwhile}, {after[process]:.0f} after")

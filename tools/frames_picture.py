@@ -25,8 +25,8 @@ INK, GREY, RAIL, PLATFORM, BASE, SLIDER = "#1f2933", "#7b8794", "#d3d9e0", "#f07
 DASHES = (0, (4, 3))
 MOVED = 60.0, 30.0, 20.0
 """The pose of the second panel [mm, °]."""
-TURN = 112.0, 200.0
-"""Where the arc of +φ begins and ends [°]."""
+ARC_ANGLES_DEG = 112.0, 200.0
+"""Begin and end of the arc of +φ [°]."""
 
 
 def draw(file: Path) -> None:
@@ -75,7 +75,7 @@ def _directions(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
         start = 1e3 * (np.array(leg.anchor) + leg.home * along) + 28.0 * along + 16.0 * outward
         _arrow(panel, start, start + 90.0 * along, SLIDER)
         _text(panel, start + 102.0 * along, "+", SLIDER)
-    begin, end = TURN
+    begin, end = ARC_ANGLES_DEG
     panel.add_patch(Arc((0.0, 0.0), 110.0, 110.0, theta1=begin, theta2=end, color=PLATFORM, linewidth=2.0, zorder=5))
     tip = 55.0 * _unit(end)
     _arrow(panel, tip - _unit(end + 86.0), tip + 7.0 * _unit(end + 94.0), PLATFORM)
@@ -98,7 +98,7 @@ def _pose(panel: Axes) -> None:
 
 
 def _axes(panel: Axes, origin: ArrayLike, turned: float, length: float, colour: str, names: tuple[str, str]) -> None:
-    """Draw a frame turned by so many degrees."""
+    """Draw a frame, turned by an angle [°]."""
     start = np.asarray(origin, dtype=np.float64)
     for name, angle in zip(names, (turned, turned + 90.0), strict=True):
         _arrow(panel, start, start + length * _unit(angle), colour)

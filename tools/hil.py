@@ -26,7 +26,7 @@ import bus_log
 import hil_dissector
 import hil_second
 from hil_dissector import Dissected
-from hil_machine import ROOT, compiling, heard, machine, pack
+from hil_machine import ROOT, compiling, machine, output_lines, pack
 from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
 
@@ -130,7 +130,7 @@ def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict
         packed = pack(folder)
         say(f"booting {kernel.name} in QEMU; logs are in {folder}")
         with machine(folder, kernel, packed) as lines:
-            for line in heard(lines, deadline):
+            for line in output_lines(lines, deadline):
                 say(line)
     result = _result(folder)
     report["checks"] |= result["checks"]
@@ -255,9 +255,9 @@ def _check_outputs(
 
 def _logs(folder: Path, *names: str) -> str:
     """Return the ends of some logs as text."""
-    found = ((name, folder / f"{name}.log") for name in names)
+    logs = ((name, folder / f"{name}.log") for name in names)
     return "".join(
-        f"\n--- {name}.log\n{last(path.read_text(errors='replace'))}" for name, path in found if path.exists()
+        f"\n--- {name}.log\n{last(path.read_text(errors='replace'))}" for name, path in logs if path.exists()
     )
 
 

@@ -73,12 +73,12 @@ def serve(bus: can.BusABC, node: int, say: Callable[[str], None], going: Callabl
     """
     rpm = 60.0 * REVOLUTIONS
     drive = ForeignDrive(MAKE, node, bus, time.monotonic, Truth(COUNTS, rpm, rpm))
-    said = None
+    reported = None
     while going():
         drive.pump(STEP)
-        if drive.state != said:
-            said = drive.state
-            say(f"C {NAMES[said]}, {drive.servo.position * 1e3:.3f} mm")
+        if drive.state != reported:
+            reported = drive.state
+            say(f"C {NAMES[reported]}, {drive.servo.position * 1e3:.3f} mm")
         for sync, bits in drive.switched:
             say(f"outputs {bits:08X} at SYNC {sync}, {time.time():.3f}")
         drive.switched.clear()

@@ -119,8 +119,8 @@ export PYTHONDONTWRITEBYTECODE=1 TMPDIR=/dev/shm NUMBA_CACHE_DIR=/dev/shm/numba
 export {" ".join(f"{name}='{value}'" for name, value in PORTABLE.items())}
 {can_interface("can0")}
 {can_interface("can1")}
-# Both cards interrupt one processor: where each has its own and that of can1 stands still, as the host lets it, frames
-# go on from can0 until the 64 bytes that can1 has room for are full (of 3,600 frames beside a busy host 300 times).
+# Both cards interrupt one processor. With one processor each, the host may suspend that of can1 while can0 continues to
+# send, until the 64 bytes of can1's buffer are full; on a busy host this happened 300 times in 3,600 frames.
 for interrupt in $(awk '/can[01]$/ {{print $1 + 0}}' /proc/interrupts); do
     echo 1 > /proc/irq/$interrupt/smp_affinity
 done
@@ -188,14 +188,14 @@ def _read(process: subprocess.Popen[bytes], lines: queue.Queue[str | None]) -> N
     lines.put(None)
 
 
-def heard(lines: queue.Queue[str | None], deadline: float) -> Iterator[str]:
+def output_lines(lines: queue.Queue[str | None], deadline: float) -> Iterator[str]:
     """Yield the machine's lines until it ends. Raises Failed at the deadline."""
     newest = "nothing"
     while True:
         try:
             line = lines.get(timeout=max(0.0, deadline - time.monotonic()))
         except queue.Empty:
-            raise Failed(f"the time limit is over (--timeout); the last that was heard: {newest}") from None
+            raise Failed(f"time limit exceeded (--timeout); last output: {newest}") from None
         if line is None:
             return
         if line:

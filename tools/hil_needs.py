@@ -52,8 +52,8 @@ def lacking() -> tuple[str, ...]:
 
 def busybox() -> str | None:
     """Return the busybox that needs no library; None if there is none: that of initramfs-tools needs some."""
-    found = (shutil.which(name, path=folder) for name in BUSYBOXES for folder in SEARCH.split(":"))
-    return next((path for path in found if path is not None and is_static(Path(path))), None)
+    paths = (shutil.which(name, path=folder) for name in BUSYBOXES for folder in SEARCH.split(":"))
+    return next((path for path in paths if path is not None and is_static(Path(path))), None)
 
 
 def is_static(file: Path) -> bool:
@@ -86,12 +86,12 @@ def has_drivers(modules: Path) -> bool:
 
 def kernels(boot: Path = Path("/boot"), modules: Path = Path("/lib/modules")) -> list[Path]:
     """Return the installed, readable kernels with the drivers, newest last."""
-    found = (
+    images = (
         image
         for image in boot.glob("vmlinuz-*")
         if os.access(image, os.R_OK) and has_drivers(modules / image.name.removeprefix("vmlinuz-"))
     )
-    return sorted(found, key=lambda image: [int(number) for number in re.findall(r"\d+", image.name)])
+    return sorted(images, key=lambda image: [int(number) for number in re.findall(r"\d+", image.name)])
 
 
 def requirements() -> Path:

@@ -13,15 +13,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-WITHIN = 300.0
+STEP_TIMEOUT_S = 300.0
 """Time limit of any step in this slow machine [s]; the whole run has a limit of its own, outside."""
 BUFFER = 8_000_000
 """Receive buffer of candump's socket [bytes], large enough for every frame on a busy machine."""
-SILENT = 10.0
+HEARTBEAT_TIMEOUT_S = 10.0
 """Heartbeat time-out of a process in this slow machine [s]: while others start, it is scheduled late."""
 PATIENT = (
     "from trirail.cli import app; from trirail.processes import supervisor; "
-    f"supervisor.START_WITHIN = supervisor.END_WITHIN = {WITHIN}; supervisor.SILENT = {SILENT}; app.main()"
+    f"supervisor.START_WITHIN = supervisor.END_WITHIN = {STEP_TIMEOUT_S}; "
+    f"supervisor.MAX_SILENCE_S = {HEARTBEAT_TIMEOUT_S}; app.main()"
 )
 """`trirail` with longer time-outs: the interpreters alone take a minute to start here, and each fault's
 black box takes some seconds to write."""
@@ -50,7 +51,7 @@ class Machine:
                 process.terminate()
         for process in self._processes:
             try:
-                process.wait(WITHIN)
+                process.wait(STEP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -75,7 +76,7 @@ class Machine:
 
     def await_end(self, process: subprocess.Popen[bytes], name: str) -> None:
         """Wait for the end of a program that received SIGTERM. Raises Failed unless it ends regularly."""
-        until(lambda: process.poll() is not None, f"{name} ends")
+        wait_until(lambda: process.poll() is not None, f"{name} ends")
         if process.returncode != 0:
             raise Failed(f"{name} ended with exit code {process.returncode}, not 0, after SIGTERM")
 
@@ -93,8 +94,8 @@ class Machine:
         self._processes.append(process)
 
         def verdict() -> str:
-            said, _ = process.communicate(timeout=WITHIN)
-            can0 = [check for check in json.loads(said)["checks"] if check["name"].startswith("can0")]
+            output, _ = process.communicate(timeout=STEP_TIMEOUT_S)
+            can0 = [check for check in json.loads(output)["checks"] if check["name"].startswith("can0")]
             if len(can0) != 4 or any(check["verdict"] != "ok" for check in can0):
                 raise Failed(f"the doctor says of can0: {can0}")
             return ", ".join(f"{check['name']} {check['found']}" for check in can0)
@@ -135,7 +136,7 @@ class Machine:
 
     def await_drives(self, process: subprocess.Popen[bytes], name: str = "drives") -> None:
         """Wait until the last of a program's drives reports its state."""
-        until(lambda: "C " in self.log(name), f"{name} are there", process)
+        wait_until(lambda: "C " in self.log(name), f"{name} are there", process)
 
     def begin_service(self, config: str, name: str = "service") -> subprocess.Popen[bytes]:
         """Start the service, which notifies systemd, replaced by this program, when it is up."""
@@ -149,7 +150,7 @@ class Machine:
     def await_service(self, process: subprocess.Popen[bytes], name: str = "service") -> None:
         """Wait until a started service is up."""
         with self._systemd.pop(name) as systemd:
-            until(lambda: _received(systemd) == "READY=1", f"{name} is up", process)
+            wait_until(lambda: _received(systemd) == "READY=1", f"{name} is up", process)
 
 
 def run(*command: str) -> None:
@@ -157,14 +158,14 @@ def run(*command: str) -> None:
     subprocess.run(command, check=True)
 
 
-def until(condition: Callable[[], bool], what: str, process: subprocess.Popen[bytes] | None = None) -> None:
+def wait_until(condition: Callable[[], bool], what: str, process: subprocess.Popen[bytes] | None = None) -> None:
     """Wait for a condition. Raises Failed if it does not hold in time, or if the process ends first."""
-    deadline = time.monotonic() + WITHIN
+    deadline = time.monotonic() + STEP_TIMEOUT_S
     while not condition():
         if process is not None and process.poll() is not None:
             raise Failed(f"{what}: no, the process has ended with exit code {process.returncode}")
         if time.monotonic() > deadline:
-            raise Failed(f"{what}: not within {WITHIN:g} s")
+            raise Failed(f"{what}: not within {STEP_TIMEOUT_S:g} s")
         time.sleep(0.1)
 
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from hil_programs import WITHIN, Failed, Machine, run, until
+from hil_programs import STEP_TIMEOUT_S, Failed, Machine, run, wait_until
 from trirail.client.client import Result, Robot
 from trirail.config import Config
 from trirail.errors import RefusedError
@@ -31,7 +31,7 @@ def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, An
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
         recover(robot)  # a stall of the machine at the start correctly faults, and is no error of the service
         held("enable", "confirmed, the robot holds")
-        moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(WITHIN)
+        moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(STEP_TIMEOUT_S)
         expect(moved, "done", robot)
         held("goal", moved.message)
         _refused(robot, held)
@@ -59,9 +59,9 @@ def _refused(robot: Robot, held: Held) -> None:
 
 def _stopped(robot: Robot, held: Held) -> None:
     goal = robot.move_to(x=-0.08, y=0.0, phi=0.0)
-    until_moving(robot, goal.id)
+    wait_until_moving(robot, goal.id)
     robot.stop()
-    result = goal.wait(WITHIN)
+    result = goal.wait(STEP_TIMEOUT_S)
     expect(result, "stopped", robot)
     held("stop", result.message)
 
@@ -69,11 +69,11 @@ def _stopped(robot: Robot, held: Held) -> None:
 def quick_stopped(robot: Robot, held: Held, name: str = "quick stop and reset") -> float:
     """Stop by a quick stop in motion, reset and enable; return the time of the stop command [s since 1970]."""
     goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
-    until_moving(robot, goal.id)
+    wait_until_moving(robot, goal.id)
     at = time.time()
     robot.quick_stop()
-    expect(goal.wait(WITHIN), "faulted", robot)
-    state = until_state(robot, lambda state: state.mode == "fault", "fault after a quick stop")
+    expect(goal.wait(STEP_TIMEOUT_S), "faulted", robot)
+    state = wait_for_state(robot, lambda state: state.mode == "fault", "fault after a quick stop")
     recover(robot)
     held(name, f"{'; '.join(state.faults)}; then enabled again")
     return at
@@ -82,7 +82,7 @@ def quick_stopped(robot: Robot, held: Held, name: str = "quick stop and reset") 
 def _flooded(robot: Robot, held: Held) -> None:
     with subprocess.Popen(("cangen", "can1", "-I", "001", "-L", "8", "-g", FLOOD_GAP)) as flood:
         try:
-            result = robot.move_to(x=0.0, y=0.01, phi=0.0).wait(WITHIN)
+            result = robot.move_to(x=0.0, y=0.01, phi=0.0).wait(STEP_TIMEOUT_S)
         finally:
             flood.terminate()
     expect(result, "done", robot)
@@ -92,19 +92,19 @@ def _flooded(robot: Robot, held: Held) -> None:
 def _thrown_out(robot: Robot, held: Held) -> None:
     """Take drive B out of operational in motion like a foreign master: the robot must stop and name the drive."""
     goal = robot.move_to(x=-0.08, y=0.0, phi=0.0)
-    until_moving(robot, goal.id)
+    wait_until_moving(robot, goal.id)
     run("cansend", "can1", PRE_OPERATIONAL_B)
-    held("a foreign master's NMT", _faulted(robot, goal.wait(WITHIN), "drive B"))
+    held("a foreign master's NMT", _faulted(robot, goal.wait(STEP_TIMEOUT_S), "drive B"))
     recover(robot)
 
 
 def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
     """Take the drives' card down in motion: they must stop by themselves, and recover."""
     goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
-    until_moving(robot, goal.id)
+    wait_until_moving(robot, goal.id)
     run("ip", "link", "set", "can1", "down")
-    words = _faulted(robot, goal.wait(WITHIN), "drive")
-    until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
+    words = _faulted(robot, goal.wait(STEP_TIMEOUT_S), "drive")
+    wait_until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
     run("ip", "link", "set", "can1", "up")
     recover(robot)
     held("drives' interface down in motion", f"{words}; up again, reset and enabled")
@@ -112,17 +112,17 @@ def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
 
 def _link_down(robot: Robot, machine: Machine, held: Held) -> None:
     goal = robot.move_to(x=0.0, y=0.0, phi=0.0)
-    until_moving(robot, goal.id)
+    wait_until_moving(robot, goal.id)
     run("ip", "link", "set", "can0", "down")
-    held("interface down in motion", _faulted(robot, goal.wait(WITHIN), "CAN bus"))
-    until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
+    held("interface down in motion", _faulted(robot, goal.wait(STEP_TIMEOUT_S), "CAN bus"))
+    wait_until(lambda: _in_fault(machine.log("drives")), "the drives stop by their own watchdogs")
     held("drives without a master", "all three stopped by their own watchdogs")
 
 
 def _faulted(robot: Robot, result: Result, whose: str) -> str:
     """Return the text of the fault. Raises Failed unless the goal ended by a fault that names its origin."""
     expect(result, "faulted", robot)
-    state = until_state(robot, lambda state: state.mode == "fault", "fault")
+    state = wait_for_state(robot, lambda state: state.mode == "fault", "fault")
     if not any(whose in fault for fault in state.faults):
         raise Failed(f"the fault does not name {whose!r}: {state.faults}")
     return "; ".join(state.faults)
@@ -140,26 +140,26 @@ def recover(robot: Robot) -> None:
             return False
         return True
 
-    until(enabled, "reset and enabled")
+    wait_until(enabled, "reset and enabled")
 
 
-def until_moving(robot: Robot, goal: str) -> None:
+def wait_until_moving(robot: Robot, goal: str) -> None:
     """Wait until a goal is well under way."""
-    until_state(
+    wait_for_state(
         robot,
         lambda state: state.goal is not None and state.goal.id == goal and state.goal.progress > 0.2,
         "the robot moves",
     )
 
 
-def until_state(robot: Robot, condition: Callable[[State], bool], what: str) -> State:
+def wait_for_state(robot: Robot, condition: Callable[[State], bool], what: str) -> State:
     """Return the first state that satisfies a condition."""
-    deadline = time.monotonic() + WITHIN
-    for state in robot.states(timeout=WITHIN):
+    deadline = time.monotonic() + STEP_TIMEOUT_S
+    for state in robot.states(timeout=STEP_TIMEOUT_S):
         if condition(state):
             return state
         if time.monotonic() > deadline:
-            raise Failed(f"{what}: not within {WITHIN:g} s; {_about(state)}")
+            raise Failed(f"{what}: not within {STEP_TIMEOUT_S:g} s; {_about(state)}")
     raise Failed(f"{what}: the service has gone silent")
 
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from subprocess import Popen
 from typing import Any, NamedTuple
 
-from hil_programs import WITHIN, Failed, Machine, until
+from hil_programs import STEP_TIMEOUT_S, Failed, Machine, wait_until
 from hil_programs import run as run_command
-from hil_scenario import Held, expect, loop_of, quick_stopped, recover, until_moving, until_state
+from hil_scenario import Held, expect, loop_of, quick_stopped, recover, wait_for_state, wait_until_moving
 from trirail.client.client import Robot
 from trirail.config import Config
 
@@ -93,7 +93,7 @@ def run(
     """
     machine.await_service(service, "second-service")
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
-        state = until_state(robot, lambda state: state.mode == "fault", "fault without a bus")
+        state = wait_for_state(robot, lambda state: state.mode == "fault", "fault without a bus")
         if not state.faults[0].startswith(DOWN):
             raise Failed(f"the fault of a start without a bus does not begin with {DOWN!r}: {state.faults}")
         held("start on a bus that is down", state.faults[0])
@@ -104,19 +104,19 @@ def run(
         held("second service", f"{where}; drive C is python-canopen's, of {MAKE}, and lacks {lacking}")
         robot.home()
         held("homing", f"drive A has found its switch, {robot.state().sliders.position[0] * 1e3:.3f} mm")
-        moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(WITHIN)
+        moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(STEP_TIMEOUT_S)
         expect(moved, "done", robot)
         result["switches"] = _switched(robot, machine, held)
         result["second_cut"] = quick_stopped(robot, held, "quick stop of a foreign drive")
-        moved = robot.move_to(x=-0.01, y=0.005, phi=-0.05).wait(WITHIN)
+        moved = robot.move_to(x=-0.01, y=0.005, phi=-0.05).wait(STEP_TIMEOUT_S)
         expect(moved, "done", robot)
         robot.disable()
         state = robot.state()
         result["loops"] |= {f"{config.loop.rate_hz} Hz": loop_of(state)}
-    until(lambda: _at(machine) is not None, "the foreign drive loses its power")
-    there, told = _at(machine) or 0.0, state.sliders.position[2]
-    if abs(there - told) > CLOSE:
-        raise Failed(f"the foreign drive is at {there * 1e3:.3f} mm, the service says {told * 1e3:.3f} mm")
+    wait_until(lambda: _at(machine) is not None, "the foreign drive loses its power")
+    there, reported = _at(machine) or 0.0, state.sliders.position[2]
+    if abs(there - reported) > CLOSE:
+        raise Failed(f"the foreign drive is at {there * 1e3:.3f} mm, the service says {reported * 1e3:.3f} mm")
     held("foreign drive", f"followed to {there * 1e3:.3f} mm, as the service says; no power")
     _disturb(machine, virtual, config, held)
     machine.end(service, "the second service")
@@ -156,10 +156,12 @@ def _switched(robot: Robot, machine: Machine, held: Held) -> list[dict[str, Any]
     """
     before = len(changes(machine.log("foreign")))
     goal = robot.move_to(x=0.01, y=0.015, phi=0.05, speed=0.3, marks=[PULSES])
-    ended = goal.wait(WITHIN)
+    ended = goal.wait(STEP_TIMEOUT_S)
     expect(ended, "done", robot)
     table = ended.marks
-    until(lambda: len(changes(machine.log("foreign"))) >= before + len(table), "the foreign drive switches its output")
+    wait_until(
+        lambda: len(changes(machine.log("foreign"))) >= before + len(table), "the foreign drive switches its output"
+    )
     switched = changes(machine.log("foreign"))[before:]
     if problem := cycles_problem(
         [(row.cycle, row.value) for row in table], [(each.sync, each.on) for each in switched]
@@ -178,9 +180,9 @@ def _disturb(machine: Machine, virtual: Popen[bytes], config: Config, held: Held
         robot.enable()
         held("bus lost at rest", _recovered(robot, lambda: _set_link("down"), lambda: _set_link("up"), DOWN))
         goal = robot.move_to(x=0.03, y=0.0, phi=0.0)
-        until_moving(robot, goal.id)
+        wait_until_moving(robot, goal.id)
         lost = _recovered(robot, lambda: _set_link("down"), lambda: _set_link("up"), DOWN)
-        expect(goal.wait(WITHIN), "faulted", robot)
+        expect(goal.wait(STEP_TIMEOUT_S), "faulted", robot)
         held("bus lost in motion", lost)
 
         def restart() -> None:
@@ -192,13 +194,13 @@ def _disturb(machine: Machine, virtual: Popen[bytes], config: Config, held: Held
 def _recovered(robot: Robot, lose: Callable[[], object], restore: Callable[[], object], fault: str) -> str:
     """Cause a loss and restore it; return the passed check. Raises Failed unless the `fault` begins as expected."""
     lose()
-    state = until_state(robot, lambda state: state.mode == "fault", "fault")
+    state = wait_for_state(robot, lambda state: state.mode == "fault", "fault")
     if not state.faults[0].startswith(fault):
         raise Failed(f"the fault does not begin with {fault!r}: {state.faults}")
     restore()
     recover(robot)
     robot.home()
-    moved = robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN)
+    moved = robot.move_to(x=0.0, y=0.0, phi=0.0).wait(STEP_TIMEOUT_S)
     expect(moved, "done", robot)
     return f"{state.faults[0]}; then reset, enabled, homed, goal done"
 
@@ -210,5 +212,5 @@ def _set_link(state: str) -> None:
 def _at(machine: Machine) -> float | None:
     """Return the position of the foreign drive [m], if its newest output reports no power."""
     lines = [line for line in machine.log("foreign").splitlines() if line.startswith("C ")]
-    found = re.fullmatch(r"C switch on disabled, (-?[\d.]+) mm", lines[-1]) if lines else None
-    return float(found[1]) * 1e-3 if found else None
+    logs = re.fullmatch(r"C switch on disabled, (-?[\d.]+) mm", lines[-1]) if lines else None
+    return float(logs[1]) * 1e-3 if logs else None

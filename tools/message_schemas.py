@@ -74,13 +74,14 @@ def schemas() -> dict[str, str]:
                 del definition["enum"]
                 definition["oneOf"] = [{"const": code, "description": _described(code)} for code in EventCode]
                 continue
-            told = next(getattr(module, struct) for module in MODULES if hasattr(module, struct))
+            struct_type = next(getattr(module, struct) for module in MODULES if hasattr(module, struct))
             if struct == state.Pose.__name__:  # an array: its items carry the descriptions of the fields
-                for item, (field, text) in zip(definition["prefixItems"], docstrings.fields(told).items(), strict=True):
+                texts = docstrings.fields(struct_type).items()
+                for item, (field, text) in zip(definition["prefixItems"], texts, strict=True):
                     item["description"] = f"{field}: {text}"
                 continue
-            on_the_wire = {field.name: field.encode_name for field in msgspec.structs.fields(told)}
-            for field, text in docstrings.fields(told).items():
+            on_the_wire = {field.name: field.encode_name for field in msgspec.structs.fields(struct_type)}
+            for field, text in docstrings.fields(struct_type).items():
                 if field in on_the_wire:
                     definition["properties"][on_the_wire[field]]["description"] = text
         whole = {"$schema": DIALECT, "title": f"trirail: {name}", "description": where, **schema, "$defs": definitions}

@@ -52,31 +52,31 @@ class Comparison(NamedTuple):
 
 def compare(pictures: Mapping[str, Path], service: Mapping[str, Driven]) -> list[Comparison]:
     """Compare computed values with the tables, and with the service if it ran. Raises TrirailError."""
-    found = []
+    comparisons = []
     for number, example, quantity in figures():
         exact = tabulated(example)
         here = computed(example, exact.t)
         setpoints = measured = None
         if example.name in service:
             commanded, positions = service[example.name]
-            meant = computed(example, commanded.t)
-            setpoints = greatest_difference(commanded, meant, quantity)
+            expected = computed(example, commanded.t)
+            setpoints = greatest_difference(commanded, expected, quantity)
             if quantity is QUANTITIES[0]:
-                measured = float(np.max(np.abs(positions - meant.position)))
-        found.append(
+                measured = float(np.max(np.abs(positions - expected.position)))
+        comparisons.append(
             Comparison(
                 figure=number,
                 example=example.name,
                 quantity=quantity.name,
                 unit=quantity.unit,
-                greatest=float(np.max(np.abs(exact.of(quantity)))),
+                greatest=float(np.max(np.abs(exact.values_of(quantity)))),
                 difference=greatest_difference(here, exact, quantity),
                 service=setpoints,
                 measured=measured,
                 picture=str(pictures[f"figure_{number:02}"]),
             )
         )
-    return found
+    return comparisons
 
 
 def over_all(comparisons: Sequence[Comparison], of: str) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The paper's figures 3 to 11 as pictures: what is computed as lines, what the running service did as circles."""
+"""Pictures of the paper's figures 3 to 11: computed values as lines, values of the running service as circles."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def plot(axes: Axes, quantity: Quantity, curves: Curves, service: Curves | None 
 
     Where the curves of several sliders are one, they share it: in dashes, and circles in turn.
     """
-    sliders = curves.of(quantity).T
+    sliders = curves.values_of(quantity).T
     visible = 1e-3 * float(np.ptp(sliders))
     for i, (slider, colour) in enumerate(zip(LEGS, SLIDERS, strict=True)):
         one = [j for j in range(3) if np.max(np.abs(sliders[j] - sliders[i])) <= visible]
@@ -84,11 +84,11 @@ def plot(axes: Axes, quantity: Quantity, curves: Curves, service: Curves | None 
         if service is not None:
             dots = np.searchsorted(service.t, np.arange(1, round(DURATION / DOT) + 1) * DOT - 1e-6)
             mine = dots[one.index(i) :: len(one)]
-            axes.plot(service.t[mine], service.of(quantity)[mine, i], color=rgb, **CIRCLES)
+            axes.plot(service.t[mine], service.values_of(quantity)[mine, i], color=rgb, **CIRCLES)
 
 
 def draw(axes: Axes, title: str, quantity: Quantity, curves: Curves, service: Curves | None, difference: float) -> None:
-    """Draw one whole figure, and say how far the service is from what is computed."""
+    """Draw one figure, with the difference between the service and the computed values."""
     axes.axhline(0.0, color="#9ca3af", linewidth=1.0)
     plot(axes, quantity, curves, service)
     axes.set_title(title, loc="left", pad=12.0)

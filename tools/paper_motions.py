@@ -31,7 +31,7 @@ class Example(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """What a figure shows of the sliders."""
+    """Quantity of the sliders in a figure."""
 
     name: str
     column: str  # in the tables, and with a slider's name
@@ -40,15 +40,15 @@ class Quantity(NamedTuple):
 
 
 class Curves(NamedTuple):
-    """The three sliders over time, wherever they come from: t (N,) [s], the others (N, 3) in m, m/s, m/s²."""
+    """Motion of the three sliders over time, from any source: t (N,) [s], the others (N, 3) in m, m/s, m/s²."""
 
     t: Array
     position: Array  # lambda_10
     velocity: Array  # v_10
     acceleration: Array  # gamma_10
 
-    def of(self, quantity: Quantity) -> Array:
-        """Return what the figures of a quantity show, (N, 3)."""
+    def values_of(self, quantity: Quantity) -> Array:
+        """Return the values of a quantity, (N, 3)."""
         return self[1 + QUANTITIES.index(quantity)]
 
 
@@ -104,4 +104,4 @@ def figures() -> Iterator[tuple[int, Example, Quantity]]:
 
 def greatest_difference(curves: Curves, reference: Curves, quantity: Quantity) -> float:
     """Return the greatest difference of a quantity in its unit, over the sliders and the same times."""
-    return float(np.max(np.abs(curves.of(quantity) - reference.of(quantity))))
+    return float(np.max(np.abs(curves.values_of(quantity) - reference.values_of(quantity))))

@@ -30,10 +30,10 @@ SPACING = 0.02
 f⁽⁶⁾ τ³ (h − τ)³ / 720 at a time τ of an interval h: in position, velocity and acceleration at most h⁶/46080,
 √5 h⁵/30000 and h⁴/1920 of the sixth derivative, here 5e-17 m, 9e-15 m/s and 3e-12 m/s². Rounding errors are not
 smaller, and grow with closer points."""
-WITHIN = 60.0
+MOTION_TIMEOUT_S = 60.0
 """Time limit of a motion, which takes longer on a busy machine [s]."""
 USER = "paper"
-REACHED = 2
+REACHED_AFTER_CYCLES = 2
 """Cycles from the one that writes a setpoint to the SYNC at which a drive should have reached it: the drive applies
 the setpoint at the SYNC in between (trirail.control.control.Control.observe)."""
 
@@ -87,8 +87,8 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     The progress in each record confirms this timing throughout.
     """
     records = recording.records
-    said = [(line.t, line.event) for line in recording.events if line.event is not None]
-    began = [t for t, event in said if event.goal == goal]
+    events = [(line.t, line.event) for line in recording.events if line.event is not None]
+    began = [t for t, event in events if event.goal == goal]
     if len(began) != 1:
         raise ServiceError(f"the recording's log says {len(began)} times, not once, that goal {goal} began")
     first = int(np.searchsorted(recording.t, began[0] - period / 2.0))
@@ -96,16 +96,16 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     n = int(np.argmin(np.append(moving, False)))
     wanted = round(DURATION / period)
     n -= n > wanted and records["progress"][first + n - 1] >= 1.0  # the cycle after its end, which detects the end
-    span = records[first : first + n + REACHED]
+    span = records[first : first + n + REACHED_AFTER_CYCLES]
     t = np.arange(1.0, n + 1.0) * period
-    if n != wanted or not np.array_equal(np.diff(span["cycle"]), np.ones(n + REACHED - 1)):
+    if n != wanted or not np.array_equal(np.diff(span["cycle"]), np.ones(n + REACHED_AFTER_CYCLES - 1)):
         raise ServiceError(f"goal {goal}: {n} cycles of motion are recorded; wanted are {wanted} without a gap")
     if np.max(np.abs(span["progress"][:n] * DURATION - t)) > 1e-3 * period:
         raise ServiceError(f"goal {goal}: its time did not run evenly, by the progress in its records")
     position, velocity, acceleration = (
         span[:n][f"commanded_{each}"] for each in ("position", "velocity", "acceleration")
     )
-    return Driven(Curves(t, position, velocity, acceleration), span["position"][REACHED:])
+    return Driven(Curves(t, position, velocity, acceleration), span["position"][REACHED_AFTER_CYCLES:])
 
 
 def _name(example: Example) -> str:
@@ -121,7 +121,7 @@ def _send(robot: Robot, example: Example) -> GoalHandle:
 
 def _finish(goal: GoalHandle, name: str) -> None:
     try:
-        result = goal.wait(WITHIN)
+        result = goal.wait(MOTION_TIMEOUT_S)
     except TimeoutError as error:
         raise ServiceError(f"{name}: {error}") from error
     if result.outcome != "done":

@@ -30,18 +30,18 @@ SOURCES: dict[str, tuple[str, ...]] = {
 
 def digest(name: str) -> str:
     """Return the digest of a picture's source files. Raises FileNotFoundError for a pattern without files."""
-    found = hashlib.sha256()
+    result = hashlib.sha256()
     for file in _files(name):
-        found.update(file.relative_to(ROOT).as_posix().encode() + b"\0")
-        found.update(hashlib.sha256(file.read_bytes()).digest())
-    return found.hexdigest()
+        result.update(file.relative_to(ROOT).as_posix().encode() + b"\0")
+        result.update(hashlib.sha256(file.read_bytes()).digest())
+    return result.hexdigest()
 
 
 def stamp(name: str) -> str | None:
     """Return the digest stamped into a picture; None if there is none."""
     with Image.open(PICTURES / f"{name}.png") as picture:
-        said: str | None = picture.info.get(KEYWORD)
-        return said
+        keyword: str | None = picture.info.get(KEYWORD)
+        return keyword
 
 
 def main() -> int:
@@ -56,10 +56,10 @@ def main() -> int:
 
 def _files(name: str) -> Iterator[Path]:
     for pattern in SOURCES[name]:
-        found = sorted(ROOT.glob(pattern))
-        if not found:
+        files = sorted(ROOT.glob(pattern))
+        if not files:
             raise FileNotFoundError(f"{pattern}, of which {name}.png is drawn")
-        yield from found
+        yield from files
 
 
 if __name__ == "__main__":

@@ -142,10 +142,10 @@ def room(file: str) -> str:
 
 def counts() -> Counter[str]:
     """Return the number of places in each room and guide."""
-    found: Counter[str] = Counter()
+    result: Counter[str] = Counter()
     for file in files():
-        found[room(file)] += len(places(file))
-    return found
+        result[room(file)] += len(places(file))
+    return result
 
 
 def ceilings() -> dict[str, int]:

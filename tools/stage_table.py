@@ -75,7 +75,7 @@ def rows(robot: Geometry, poses: Sequence[Sequence[float]], velocity: Sequence[f
     j1, j2 = jacobians(robot, zero)
     per_pose = np.linalg.solve(j1, j2)
     at_zero = inverse(robot, zero).position
-    found = []
+    table = []
     for pose in poses:
         motion = inverse(robot, pose, velocity)
         true, rates = _true(robot, pose, velocity)
@@ -87,7 +87,7 @@ def rows(robot: Geometry, poses: Sequence[Sequence[float]], velocity: Sequence[f
             motion.passive_velocity - rates[1],
             back - np.array(pose),
         )
-        found.append(
+        table.append(
             StageRow(
                 list(pose),
                 motion.position.tolist(),
@@ -97,7 +97,7 @@ def rows(robot: Geometry, poses: Sequence[Sequence[float]], velocity: Sequence[f
                 float(np.abs(at_zero + per_pose @ pose - true[0]).max()),
             )
         )
-    return found
+    return table
 
 
 def _true(robot: Geometry, pose: Sequence[float], velocity: Sequence[float]) -> tuple[Array, Array]:

@@ -44,7 +44,7 @@ class Report:
         """Print a text, the first time only."""
         if text not in self._said:
             self._said[text] = text
-            say(text)
+            print_now(text)
 
     def update(self) -> None:
         """Print the changes of state."""
@@ -53,7 +53,7 @@ class Report:
             if self._said.get(name) != state:
                 self._said[name] = state
                 position = axis.direction * drive.servo.position / axis.counts_per_metre + axis.offset
-                say(f"{name} {state}, {position * 1e3:.3f} mm")
+                print_now(f"{name} {state}, {position * 1e3:.3f} mm")
 
 
 class Console:
@@ -79,17 +79,17 @@ class Console:
             case "":
                 return
             case "help":
-                say(HELP)
+                print_now(HELP)
             case "list":
-                say("\n".join(self._faults.lines()) or "no faults")
+                print_now("\n".join(self._faults.lines()) or "no faults")
             case "clear":
                 self._faults.clear()
-                say("no faults")
+                print_now("no faults")
             case _:
                 try:
                     self._faults.add(line)
                 except FaultSyntaxError as error:
-                    say(f"{error} (help lists all)")
+                    print_now(f"{error} (help lists all)")
 
 
 def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Console, poll: float) -> None:
@@ -137,7 +137,7 @@ def main() -> int:
             bus_to_be_on(options.interface, options.channel, config) as wire,
             simulated_bus(config.can, config.drives) as bus,
         ):
-            bus.faults.announce = say
+            bus.faults.announce = print_now
             bus.faults.seed(options.seed)
             if options.faults:
                 bus.faults.load(options.faults)
@@ -158,8 +158,8 @@ def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
     return open_bus(section, config.drives)
 
 
-def say(text: str) -> None:
-    """Print immediately, even into a pipe."""
+def print_now(text: str) -> None:
+    """Print a line without buffering, also into a pipe."""
     print(text, flush=True)
 
 

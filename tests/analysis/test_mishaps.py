@@ -48,7 +48,7 @@ def lose_the_gateway(shell: Shell) -> None:
 
 
 def freeze_the_gateway(shell: Shell) -> None:
-    shell.heartbeats.of("gateway").beat()
+    shell.heartbeats.heart("gateway").beat()
     shell.cycles(400)
 
 

@@ -25,7 +25,7 @@ from trirail.telemetry.reading import join, read
 from trirail.telemetry.recording import Recording
 from trirail.wire.goals import MoveGoal, PoseGoal, VelocityGoal
 from trirail.wire.packets import CheckRequest, CommandRequest, Disturbance, DrivesFault, GoalRequest
-from trirail.wire.plan_packets import Extended, NotPlanned, Planned
+from trirail.wire.plan_packets import NotPlanned, PathExtension, PreemptingMotion
 from warm import trirail
 
 pytestmark = pytest.mark.slow
@@ -149,7 +149,9 @@ def test_a_corrected_session_comes_out_the_same_without_the_maps_file(tmp_path: 
 
 def test_what_was_planned_is_planned_the_same_again(recording: Recording, config: Config) -> None:
     compared = replay_session(recording, config, simulated=False)
-    answers = [what for what in recording.requests if isinstance(what.given, Planned | Extended | NotPlanned)]
+    answers = [
+        what for what in recording.requests if isinstance(what.given, PreemptingMotion | PathExtension | NotPlanned)
+    ]
     assert compared.plans == len(answers) > 5
     assert compared.plans_differing == 0
     assert compared.requests + len(answers) <= len(recording.requests)
@@ -160,9 +162,9 @@ def test_an_answer_that_would_be_another_now_is_noticed_and_used_all_the_same(
 ) -> None:
     """What moved the robot is what was answered then; that it is planned otherwise now is said beside."""
     number, what = next(
-        (number, what) for number, what in enumerate(recording.requests) if isinstance(what.given, Planned)
+        (number, what) for number, what in enumerate(recording.requests) if isinstance(what.given, PreemptingMotion)
     )
-    assert isinstance(what.given, Planned)
+    assert isinstance(what.given, PreemptingMotion)
     requests = list(recording.requests)
     answer = msgspec.structs.replace(what.given, reply=what.given.reply.with_duration(1000.0))
     requests[number] = msgspec.structs.replace(what, given=answer)
@@ -172,7 +174,7 @@ def test_an_answer_that_would_be_another_now_is_noticed_and_used_all_the_same(
 
 def test_a_recording_without_answers_is_planned_anew(recording: Recording, config: Config) -> None:
     """As one that was made before there was a planner to answer."""
-    kinds = Planned | Extended | NotPlanned | DrivesFault
+    kinds = PreemptingMotion | PathExtension | NotPlanned | DrivesFault
     kept = [what for what in recording.requests if not isinstance(what.given, kinds)]
     numbered = tuple(msgspec.structs.replace(what, seq=seq) for seq, what in enumerate(kept, start=1))
     compared = replay_session(recording._replace(requests=numbered), config, simulated=True)
@@ -185,7 +187,7 @@ def test_on_simulated_drives_it_comes_out_the_same_too(recording: Recording, con
 
 def test_a_motion_one_cycle_later_is_noticed(recording: Recording, config: Config) -> None:
     number, what = next(
-        (number, what) for number, what in enumerate(recording.requests) if isinstance(what.given, Planned)
+        (number, what) for number, what in enumerate(recording.requests) if isinstance(what.given, PreemptingMotion)
     )
     requests = list(recording.requests)
     requests[number] = msgspec.structs.replace(what, cycle=what.cycle + 1)

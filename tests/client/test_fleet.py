@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from trirail.cli import fleet_command, terminal
 from trirail.cli.app import app
-from trirail.client.fleet import SILENT, Attention, Fleet, Member
+from trirail.client.fleet import MAX_SILENCE_S, Attention, Fleet, Member
 from trirail.wire import zenoh_session
 from trirail.wire.state import RobotSummary
 from waiting import wait_until
@@ -30,9 +30,9 @@ FAULT = msgspec.structs.replace(OK, mode="fault", fault="drive B: EMCY 8700")
 def test_a_robot_lives_by_the_age_of_what_its_loop_said(waited: float, age: float, summary: RobotSummary) -> None:
     member = Member("demo", msgspec.structs.replace(summary, age=age), 100.0)
     assert member.age(100.0 + waited) == pytest.approx(waited + age)
-    if waited + age > SILENT + 1e-6:
+    if waited + age > MAX_SILENCE_S + 1e-6:
         assert member.need(100.0 + waited) is Attention.SILENT
-    elif waited + age < SILENT - 1e-6:
+    elif waited + age < MAX_SILENCE_S - 1e-6:
         assert member.need(100.0 + waited) is (Attention.FAULT if summary is FAULT else Attention.NOTHING)
 
 
@@ -68,7 +68,7 @@ def test_who_needs_somebody_stands_first(hub: tuple[str, zenoh.Session]) -> None
         assert [member.robot for member in fleet.members()] == ["c", "a", "b", "d"]
         last = {"z": msgspec.json.encode(OK)}  # behind all that was said before
         until(lambda: len(fleet.members()) == 5, lambda: publish(last))
-        now[0] += SILENT - 0.5
+        now[0] += MAX_SILENCE_S - 0.5
         again = {name: said[name] for name in "acd"} | last
         until(lambda: sum(member.heard == now[0] for member in fleet.members()) == 4, lambda: publish(again))
         now[0] += 1.0

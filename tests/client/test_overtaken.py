@@ -63,7 +63,7 @@ class Service:
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "OVERTAKEN_WITHIN", WITHIN)
+    monkeypatch.setattr(connection, "MAX_OVERTAKEN_S", WITHIN)
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ def test_after_an_event(service: Service, locator: str) -> None:
 def test_a_service_that_was_started_again_and_counts_from_one_is_heard(
     service: Service, locator: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connection, "OVERTAKEN_WITHIN", 0.05)
+    monkeypatch.setattr(connection, "MAX_OVERTAKEN_S", 0.05)
     with Robot("demo", locator) as robot:
         robot.pause()
         service.seq = 1

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from trirail.config import Config
-from trirail.control.backlash import TURNS, add_offset, backlash, taking_up
+from trirail.control.backlash import MIN_REVERSAL_M, add_offset, backlash, taking_up
 from trirail.motion.backlash_reserve import NO_BACKLASH, SHARE, planned_limits, reserve_for_backlash
 from trirail.wire.goals import SlidersGoal
 from trirail.wire.vocabulary import Mode
@@ -66,7 +66,7 @@ def test_a_slider_with_play_is_where_it_was_told_to_be(widths: tuple[float, floa
         offsets[n], rates[n], changes[n] = rows[0] - place, rows[1], rows[2]
         if not taking_up(kept):
             known = kept[0]["heading"] != 0.0
-            assert (np.abs(play.place - place)[known] <= TURNS + 1e-12).all()
+            assert (np.abs(play.place - place)[known] <= MIN_REVERSAL_M + 1e-12).all()
             settled += 1
     assert settled > 0
     assert not taking_up(kept)

@@ -15,11 +15,11 @@ from trirail.client.async_client import AsyncRobot
 from trirail.client.client import Robot
 from trirail.config import geometry
 from trirail.control.commands import EFFECTS, CommandProgress, Effect
-from trirail.control.feedback import Measured
+from trirail.control.feedback import MeasuredState
 from trirail.control.modes import ModeEvent
 from trirail.wire import packets
 from trirail.wire.messages import CommandReply
-from trirail.wire.packets import Confirmed, Refused
+from trirail.wire.packets import CommandDone, Refused
 from trirail.wire.vocabulary import Command, CommandContent, Mode, NoContent, Override
 from trirail_drivers.interface import Feedback, PowerState
 
@@ -44,7 +44,7 @@ def test_every_command_has_an_effect_and_each_that_changes_the_mode_an_event() -
 @pytest.mark.parametrize("mode", Mode)
 def test_in_every_mode_there_is_a_rule_when_a_command_is_carried_out(name: Command, mode: Mode) -> None:
     off = PowerState.SWITCH_ON_DISABLED
-    measured = Measured(geometry(CONFIG.geometry).packed(), CONFIG.period, 1e-3)
+    measured = MeasuredState(geometry(CONFIG.geometry).packed(), CONFIG.period, 1e-3)
     measured.start(Feedback((0.0, 0.0, 0.0), (off, off, off), None))
     assert isinstance(EFFECTS[name].rule(CommandProgress(mode, "why", measured, settled=True)), str | None)
 
@@ -62,7 +62,7 @@ def test_a_request_that_is_no_commands_or_carries_what_it_does_not_take_is_not_d
 def test_the_control_answers_every_command(rig: ControlRig, name: Command, enabled: bool) -> None:
     if enabled:
         rig.enable()
-    assert isinstance(rig.command(name), Confirmed | Refused)
+    assert isinstance(rig.command(name), CommandDone | Refused)
     assert rig.control.fault is None or name is Command.QUICK_STOP
 
 

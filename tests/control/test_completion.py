@@ -7,8 +7,8 @@ from itertools import product
 
 from control_rig import CONFIG
 from trirail.config import geometry
-from trirail.control.commands import EFFECTS, CommandProgress, still_powered
-from trirail.control.feedback import Measured
+from trirail.control.commands import EFFECTS, CommandProgress, powered_message
+from trirail.control.feedback import MeasuredState
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.interface import DriveFault, Feedback, PowerState
 
@@ -21,14 +21,14 @@ WHY = "drive B: silent"
 
 def saying(
     *states: PowerState, homed: tuple[bool, bool, bool] = (True, True, True), fault: DriveFault | None = None
-) -> Measured:
-    measured = Measured(geometry(CONFIG.geometry).packed(), CONFIG.period, 1e-3)
+) -> MeasuredState:
+    measured = MeasuredState(geometry(CONFIG.geometry).packed(), CONFIG.period, 1e-3)
     a, b, c = states or (OFF, OFF, OFF)
     measured.start(Feedback((0.0, 0.0, 0.0), (a, b, c), fault, homed=homed))
     return measured
 
 
-def one_of_three() -> Iterator[tuple[str, PowerState, Measured]]:
+def one_of_three() -> Iterator[tuple[str, PowerState, MeasuredState]]:
     """Two drives without power, and one, which is named, in any state."""
     for index, state in product(range(3), P):
         states = [OFF, OFF, OFF]
@@ -36,7 +36,9 @@ def one_of_three() -> Iterator[tuple[str, PowerState, Measured]]:
         yield "ABC"[index], state, saying(*states)
 
 
-def said(name: Command, mode: Mode, measured: Measured, why: str | None = None, settled: bool = True) -> str | None:
+def said(
+    name: Command, mode: Mode, measured: MeasuredState, why: str | None = None, settled: bool = True
+) -> str | None:
     return EFFECTS[name].rule(CommandProgress(mode, why, measured, settled))
 
 
@@ -92,6 +94,6 @@ def test_reset_is_done_when_the_drives_had_time_and_none_is_in_fault() -> None:
 
 def test_still_powered_names_the_drives_that_can_move() -> None:
     for drive, state, measured in one_of_three():
-        states, _, advice = still_powered(measured, WHY).partition(" by what it said last: ")
+        states, _, advice = powered_message(measured, WHY).partition(" by its last statusword: ")
         assert states == (f"drive {drive} is {state}" if state in CAN_MOVE else "")
-        assert advice == f"send reset again when the drives stand (fault: {WHY})"
+        assert advice == f"send reset again when the drives are at rest (fault: {WHY})"

@@ -23,7 +23,7 @@ from trirail.motion.runs import MotionState, rest
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import FaultDetail
-from trirail.wire.packets import Accepted, Confirmed, GoalRequest
+from trirail.wire.packets import Accepted, CommandDone, GoalRequest
 from trirail.wire.vocabulary import FaultCause, Mode
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
@@ -231,7 +231,7 @@ def test_stop_ends_in_a_standstill(rig: Rig) -> None:
     rig.cycles(200)
     moved = rig.control.commanded.pose[0]
     answer = rig.command("stop")
-    assert isinstance(answer, Confirmed)
+    assert isinstance(answer, CommandDone)
     assert answer.mode == "holding"
     assert rig.outcomes() == [("g1", "stopped")]
     assert moved < rig.control.commanded.pose[0] < 0.1
@@ -246,7 +246,7 @@ def test_disable_in_motion_stops_first(rig: Rig) -> None:
     rig.goal("g1", 0.1, 0.0, 0.0)
     rig.cycles(200)
     answer = rig.command("disable")
-    assert isinstance(answer, Confirmed)
+    assert isinstance(answer, CommandDone)
     assert rig.mode is Mode.DISABLED
     assert rig.outcomes() == [("g1", "stopped")]
     assert all(drive.state is PowerState.SWITCH_ON_DISABLED for drive in rig.drives)
@@ -276,7 +276,7 @@ def test_goals_in_the_wrong_mode(rig: Rig) -> None:
     rig.enable()
     rig.goal("g2", 0.1, 0.0, 0.0)
     rig.cycles(100)
-    rig.control.modes.happen(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
+    rig.control.modes.handle_disturbance(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
     assert refusal(rig.goal("g3", 0.0, 0.0, 0.1)).code == "stopping"
     assert rig.outcomes() == [("g1", "rejected"), ("g2", "stopped"), ("g3", "rejected")]
 
@@ -375,7 +375,7 @@ def test_a_drive_fault(rig: Rig) -> None:
     assert [notice.message for notice in rig.notices if notice.kind == "fault"] == [said]
     assert refusal(rig.goal("g2", 0.0, 0.0, 0.0)).code == "fault"
     answer = rig.command("reset")
-    assert isinstance(answer, Confirmed)
+    assert isinstance(answer, CommandDone)
     assert rig.mode is Mode.DISABLED
     rig.cycles(200)
     assert all(drive.state is PowerState.SWITCH_ON_DISABLED for drive in rig.drives)  # never re-enabled
@@ -428,7 +428,7 @@ def test_the_last_gate_knows_the_platforms_limits(rig: Rig) -> None:
 def test_quick_stop_is_latched_like_a_fault(rig: Rig) -> None:
     moving(rig)
     answer = rig.command("quick_stop")
-    assert isinstance(answer, Confirmed)
+    assert isinstance(answer, CommandDone)
     assert rig.mode is Mode.FAULT
     assert rig.outcomes() == [("g1", "faulted")]
     assert rig.control.fault == "quick_stop by ann"
@@ -542,7 +542,7 @@ def test_pause_and_resume_stay_on_the_path(rig: Rig) -> None:
     rig.enable()
     rig.goal("g1", 0.08, -0.04, 0.3)
     rig.cycles(180)
-    assert isinstance(rig.command("pause"), Confirmed)
+    assert isinstance(rig.command("pause"), CommandDone)
     assert rig.mode is Mode.HOLDING
     assert rig.control.commanded.at_rest
     assert rig.control.ledger.goal is not None
@@ -654,7 +654,7 @@ def assert_smooth(rig: ControlRig, steps: list[tuple[object, int]]) -> None:
     ids = []
     for number, (what, wait) in enumerate(steps):
         if what == "lost":
-            rig.control.modes.happen(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
+            rig.control.modes.handle_disturbance(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
         elif isinstance(what, str):
             rig.command(what)
         elif isinstance(what, float):

@@ -13,8 +13,8 @@ from control_rig import CONFIG
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from trirail.config import geometry
-from trirail.control.cycle import PASSED, STANDS
-from trirail.control.feedback import Measured
+from trirail.control.cycle import AT_REST, PASSED
+from trirail.control.feedback import MeasuredState
 from trirail.control.setpoints import Setpoints
 from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward, inverse
@@ -81,7 +81,7 @@ def test_what_is_commanded_is_what_everybody_elses_mathematics_says(
     run.time = time
     schedule = Schedule(rest(start), PERIOD)
     schedule.replace_runs(deque([run]))
-    measured = Measured(LEGS, PERIOD, STEP)
+    measured = MeasuredState(LEGS, PERIOD, STEP)
     measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
     setpoints = Setpoints(LEGS, boundless(), ANYWHERE, measured, STEP)
 
@@ -117,11 +117,11 @@ def test_a_motion_stands_on_its_way_where_its_law_does(rate: float, change: floa
     run = Run(LEGS, path, law, target)
     schedule = Schedule(rest((0.0, 0.0, 0.0)), PERIOD)
     schedule.replace_runs(deque([run]))
-    setpoints = Setpoints(LEGS, boundless(), ANYWHERE, Measured(LEGS, PERIOD, STEP), STEP)
+    setpoints = Setpoints(LEGS, boundless(), ANYWHERE, MeasuredState(LEGS, PERIOD, STEP), STEP)
     found = setpoints.solve(schedule, schedule.begin_cycle())
     assert setpoints.refusal(found) is None
     assert run.at_rest is stands
-    assert bool(found & STANDS) is stands
+    assert bool(found & AT_REST) is stands
     assert not found & PASSED
 
 
@@ -131,7 +131,7 @@ def test_what_the_gate_refuses_leaves_the_setpoints_as_they_are(
 ) -> None:
     """A motion that begins with a velocity: a jerk that no limit allows."""
     assume(max(map(abs, terms)) > 0.01)
-    bounds, measured = Bounds(CONFIG.limits, PERIOD), Measured(LEGS, PERIOD, STEP)
+    bounds, measured = Bounds(CONFIG.limits, PERIOD), MeasuredState(LEGS, PERIOD, STEP)
     setpoints, schedule = Setpoints(LEGS, bounds, ANYWHERE, measured, STEP), Schedule(rest(start), PERIOD)
     a, b, c = inverse(ROBOT, start).position.tolist()
     measured.start(Feedback((a, b, c), ON, None))
@@ -154,7 +154,7 @@ def test_the_measured_pose_is_forwards_to_the_last_bit(
     place: tuple[float, float, float], shares: tuple[float, float, float]
 ) -> None:
     a, b, c = inverse(ROBOT, place).position.tolist()
-    measured = Measured(LEGS, PERIOD, STEP)
+    measured = MeasuredState(LEGS, PERIOD, STEP)
     measured.start(Feedback((a, b, c), ON, None))
     measured.update(Feedback((a, b, c), ON, None))
     assert bits(measured.pose) == bits(forward(ROBOT, (a, b, c)))

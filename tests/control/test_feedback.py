@@ -7,7 +7,7 @@ from control_rig import CONFIG
 from hypothesis import example, given
 from hypothesis import strategies as st
 from trirail.config import geometry
-from trirail.control.feedback import Measured
+from trirail.control.feedback import MeasuredState
 from trirail.kinematics.robot import forward, inverse
 from trirail_drivers.interface import Feedback, PowerState
 
@@ -18,8 +18,8 @@ ON = (PowerState.OPERATION_ENABLED,) * 3
 Triple = tuple[float, float, float]
 
 
-def standing(position: Triple) -> Measured:
-    measured = Measured(ROBOT.packed(), PERIOD, STEP)
+def standing(position: Triple) -> MeasuredState:
+    measured = MeasuredState(ROBOT.packed(), PERIOD, STEP)
     measured.start(Feedback(position, ON, None))
     measured.update(Feedback(position, ON, None))
     return measured
@@ -50,7 +50,7 @@ def test_only_a_slider_that_goes_twice_as_far_as_one_can_has_jumped(place: Tripl
 @given(place=PLACES)
 def test_the_first_cycle_is_no_jump_wherever_the_robot_stands(place: Triple) -> None:
     a, b, c = inverse(ROBOT, place).position.tolist()
-    measured = Measured(ROBOT.packed(), PERIOD, STEP)
+    measured = MeasuredState(ROBOT.packed(), PERIOD, STEP)
     measured.start(Feedback((a, b, c), ON, None))
     measured.update(Feedback((a, b, c), ON, None))
     assert measured.jumps == (False, False, False)
@@ -59,7 +59,7 @@ def test_the_first_cycle_is_no_jump_wherever_the_robot_stands(place: Triple) -> 
 
 
 def test_before_the_first_answer_nothing_has_jumped() -> None:
-    assert Measured(ROBOT.packed(), PERIOD, STEP).jumps == (False, False, False)
+    assert MeasuredState(ROBOT.packed(), PERIOD, STEP).jumps == (False, False, False)
 
 
 POSITION = st.floats(-0.01, 0.01)
@@ -91,7 +91,7 @@ def test_following_error_is_to_the_setpoint_that_was_due_at_the_sync_of_the_posi
 def test_a_position_that_is_older_than_the_setpoints_that_are_kept_is_compared_with_none_of_them() -> None:
     """As of drives that a busy machine has kept waiting, where missed_positions lets them: it is no fault of theirs."""
     limit = CONFIG.limits.slider.following_error
-    measured, step = Measured(ROBOT.packed(), PERIOD, STEP, limit), 0.9 * limit
+    measured, step = MeasuredState(ROBOT.packed(), PERIOD, STEP, limit), 0.9 * limit
     measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
     for age in range(30):
         measured.record["commanded_position"] = ((age + 1) * step, 0.0, 0.0)
@@ -104,7 +104,7 @@ def test_a_position_that_is_older_than_the_setpoints_that_are_kept_is_compared_w
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_following_error_is_beyond_its_limit_when_it_is_more(index: int, sign: float) -> None:
     limit = 2.0**-8  # [m], a number that is exact
-    measured = Measured(ROBOT.packed(), PERIOD, STEP, limit)
+    measured = MeasuredState(ROBOT.packed(), PERIOD, STEP, limit)
     measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
     for error, beyond in ((limit, 0), (limit * (1.0 + 1e-9), 1 + index)):
         position = [0.0, 0.0, 0.0]
@@ -115,7 +115,7 @@ def test_a_following_error_is_beyond_its_limit_when_it_is_more(index: int, sign:
 
 
 def test_sliders_that_belong_to_no_pose_leave_the_pose_as_it_was() -> None:
-    measured = Measured(ROBOT.packed(), PERIOD, 10.0)  # none jumps
+    measured = MeasuredState(ROBOT.packed(), PERIOD, 10.0)  # none jumps
     measured.start(Feedback((0.0, 0.0, 0.0), ON, None))
     measured.update(Feedback((0.01, 0.0, 0.0), ON, None))
     before = measured.pose

@@ -19,7 +19,7 @@ from trirail.kinematics.robot import inverse
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal, SlidersGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.messages import Notice
-from trirail.wire.packets import Accepted, Confirmed
+from trirail.wire.packets import Accepted, CommandDone
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.interface import PowerState
@@ -205,11 +205,11 @@ def test_unsettled_says_where_the_robot_is_and_holds(robots: Callable[..., Rig])
 )
 def test_what_ends_it(late: Rig, what: str | ModeEvent, outcome: str, mode: Mode) -> None:
     if isinstance(what, ModeEvent):
-        late.control.modes.happen(what, coded("it happened", EventCode.OTHER))
+        late.control.modes.handle_disturbance(what, coded("it happened", EventCode.OTHER))
     elif what == "fault":
         late.drives[0].fail(0x2310)
     else:
-        assert isinstance(late.command(what), Confirmed)
+        assert isinstance(late.command(what), CommandDone)
         assert late.mode is mode
     late.until(lambda: late.mode is mode)
     late.cycles(1000)
@@ -342,7 +342,7 @@ def test_in_position_is_all_inside_in_every_cycle_of_the_dwell(cycles: list[Cycl
         inside.append(known and all(abs(share) <= 1.0 for share in off))
         expected = number >= dwell and all(inside[-dwell:])
         assert bool(record["settled"][0]) is expected
-        found = settling.over(number)
+        found = settling.result(number)
         assert (found is not None and found.settle is not None) is expected
         if found is not None and found.settle is not None:
             streak = next((n for n, was in enumerate(reversed(inside)) if not was), number)

@@ -14,7 +14,7 @@ from trirail.config import ControlTable
 from trirail.control.lease import REMEMBERED_IDS, LeaseArbiter
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.goals import Goal, PoseGoal, VelocityGoal
-from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused, Request
+from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, GoalRequest, Refused, Request
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, LeasePolicy, Mode, ReleaseLease
 
 REQUIRED = msgspec.structs.replace(CONFIG, control=ControlTable(lease="required"))
@@ -83,7 +83,7 @@ def begun(rig: ControlRig) -> list[str | None]:
 
 
 def test_only_its_holders_goals_move_the_robot(users: Users) -> None:
-    assert isinstance(users.tell("ann", "acquire", "l"), Confirmed)
+    assert isinstance(users.tell("ann", "acquire", "l"), CommandDone)
     refused = users.send("bob", "g1")
     assert code(refused) is RefusalCode.LEASED
     assert isinstance(users.send("ann", "g2"), Accepted)
@@ -101,7 +101,7 @@ def test_every_command_is_its_holders_but_what_stops_the_robot(users: Users, nam
     if name in ("acquire", "release"):
         assert rig.control.lease.user == "ann"
     elif name in EVERYBODYS:
-        assert isinstance(answer, Confirmed)
+        assert isinstance(answer, CommandDone)
         assert rig.mode is not Mode.MOVING
     else:
         assert code(answer) is RefusalCode.LEASED
@@ -124,7 +124,7 @@ def test_without_signs_of_life_the_robot_stops_and_the_lease_is_free(users: User
     users.send("ann", "g", JOG)
     for _ in range(5):
         rig.cycles(HELD // 2)
-        assert isinstance(users.tell("ann", "acquire", "l"), Confirmed)
+        assert isinstance(users.tell("ann", "acquire", "l"), CommandDone)
     assert rig.mode is Mode.MOVING
     assert leases(rig) == [("lease acquired by ann", "ann")]
     waited = rig.until(lambda: rig.control.lease.user is None)
@@ -144,11 +144,11 @@ def test_whatever_ends_it_stops_what_its_holder_has_under_way_and_what_waits(use
     users.send("ann", "g1", PoseGoal(x=0.0, y=0.02, phi=0.0))
     assert len(rig.control.ledger.goals) == 2
     if ending == "released":
-        assert isinstance(users.tell("ann", "release", "l"), Confirmed)
+        assert isinstance(users.tell("ann", "release", "l"), CommandDone)
         assert rig.mode is Mode.HOLDING
     elif ending == "taken over":
         assert code(users.tell("bob", "acquire", "m")) is RefusalCode.LEASED
-        assert isinstance(users.tell("bob", "acquire", "m", force=True), Confirmed)
+        assert isinstance(users.tell("bob", "acquire", "m", force=True), CommandDone)
         assert leases(rig)[-1] == ("lease taken over by bob from ann", "bob")
         assert code(users.send("ann", "g2")) in (RefusalCode.LEASED, RefusalCode.STOPPED)
         late = users.tell("ann", "acquire", "l")
@@ -176,7 +176,7 @@ def test_who_acquires_it_stops_what_others_have_under_way(under_way: str, users:
 
 def test_what_one_has_under_way_oneself_goes_on_when_one_acquires_it(users: Users) -> None:
     users.send("ann", "g")
-    assert isinstance(users.tell("ann", "acquire", "l"), Confirmed)
+    assert isinstance(users.tell("ann", "acquire", "l"), CommandDone)
     assert users.rig.mode is Mode.MOVING
     users.rig.until(users.rig.holds)
     assert ("g", "done") in users.rig.outcomes()
@@ -214,7 +214,7 @@ def test_who_does_not_hold_the_lease_releases_nothing_and_is_told_so(users: User
     assert said(users.tell("bob", "release")) == other
     assert said(users.tell("bob", "release", "l")) == other
     assert users.rig.control.lease.user == "ann"
-    assert isinstance(users.tell("ann", "release", "l"), Confirmed)
+    assert isinstance(users.tell("ann", "release", "l"), CommandDone)
     over = RefusalCode.LEASE_OVER, "lease released by ann: there is nothing to release"
     assert said(users.tell("ann", "release", "l")) == over
     assert said(users.tell("ann", "release")) == nobody

@@ -15,7 +15,7 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal, VelocityGoal
 from trirail.wire.messages import REMEMBERED_IDS, GoalReply
-from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused
+from trirail.wire.packets import Accepted, CommandDone, CommandRequest, GoalRequest, Refused
 from trirail.wire.vocabulary import Command
 
 NAMES = list(Command)
@@ -171,7 +171,7 @@ def test_each_command_is_answered_once_when_its_verdict_is_there(verdicts: list[
     for _ in range(rounds):
         ledger.settle(verdict, "holding", 1)
     assert ledger.answers == [
-        Refused(n, RefusalCode.FAILED, f"{NAMES[n]} failed: {said}") if said else Confirmed(n, NAMES[n], "holding", 1)
+        Refused(n, RefusalCode.FAILED, f"{NAMES[n]} failed: {said}") if said else CommandDone(n, NAMES[n], "holding", 1)
         for n, said in enumerate(verdicts)
         if said is not None
     ]

@@ -18,7 +18,7 @@ from trirail.wire.event_codes import EventCode
 from trirail.wire.goals import PoseGoal
 from trirail.wire.marks import Mark, StopAt, Switch
 from trirail.wire.messages import GoalReply
-from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, Refused, Request
+from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, Refused, Request
 from trirail.wire.vocabulary import Command, Mode, SetOutput
 
 OUTPUTS = {
@@ -86,7 +86,7 @@ def rig() -> Rig:
 
 
 def test_an_output_is_set_with_the_next_setpoints(rig: Rig) -> None:
-    assert isinstance(rig.set("valve", True), Confirmed)
+    assert isinstance(rig.set("valve", True), CommandDone)
     assert rig.value("valve")
     assert [notice.message for notice in rig.notices if notice.kind == "output"] == ["output valve on by ann"]
     rig.set("valve", False)
@@ -113,7 +113,7 @@ def test_outputs_are_safe_without_power(rig: Rig, how: str) -> None:
     assert isinstance(refused, Refused)
     assert refused.code in (RefusalCode.NOT_ENABLED, RefusalCode.FAULT)
     assert "output 'valve' keeps its safe value, off" in refused.message
-    assert isinstance(rig.set("light", False), Confirmed)  # always = true
+    assert isinstance(rig.set("light", False), CommandDone)  # always = true
     assert not rig.value("light")
 
 

@@ -154,7 +154,7 @@ def test_a_stop_of_the_goal_before_it_frees_the_planner_for_a_check(rig: Control
     meddler.delays = [2000, 1]
     rig.post("g1", PoseGoal(0.02, 0.0, 0.0))
     ticket = post(rig, NEAR)
-    assert rig.control.calm() is not None
+    assert rig.control.steady_state() is not None
     rig.order("stop")
     rig.until(lambda: answered(rig, ticket), 10)
     assert isinstance(answer_to(rig, ticket), Checked)

@@ -24,11 +24,11 @@ from trirail.motion.time_scaling import TimeScaling
 from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal, TrajectoryPoint, VelocityGoal
 from trirail.wire.packets import Accepted, CommandRequest, GoalRequest, PlannerLost, Refused
 from trirail.wire.plan_packets import (
-    Extended,
     PackedPath,
+    PathExtension,
     PlanAnswer,
-    Planned,
     PlanRequest,
+    PreemptingMotion,
     decode_plan_answer,
     decode_plan_request,
     encode,
@@ -289,7 +289,7 @@ def test_a_motion_that_begins_elsewhere_is_never_begun(rig: ControlRig, meddler:
     moving(rig)
 
     def elsewhere(answer: PlanAnswer) -> list[PlanAnswer]:
-        assert isinstance(answer, Planned)
+        assert isinstance(answer, PreemptingMotion)
         pieces = np.frombuffer(answer.run.path.pieces).copy()
         pieces[0] += 1e-5
         path = msgspec.structs.replace(answer.run.path, pieces=pieces.tobytes())
@@ -310,7 +310,7 @@ def test_a_continuation_that_begins_elsewhere_is_never_appended(
     """A goal that is to follow the one under way: beside its end in position, velocity or acceleration."""
 
     def elsewhere(answer: PlanAnswer) -> list[PlanAnswer]:
-        assert isinstance(answer, Extended)
+        assert isinstance(answer, PathExtension)
         pieces = np.frombuffer(answer.path.pieces).copy()
         pieces[6 * coordinate + power] += (1e-6, 1e-4, 1e-2)[power]
         return [msgspec.structs.replace(answer, path=msgspec.structs.replace(answer.path, pieces=pieces.tobytes()))]
@@ -342,7 +342,7 @@ def test_garbage_is_refused_and_the_motion_goes_on(
     moving(rig)
 
     def spoilt(answer: PlanAnswer) -> list[PlanAnswer]:
-        assert isinstance(answer, Planned)
+        assert isinstance(answer, PreemptingMotion)
         return [msgspec.structs.replace(answer, run=msgspec.structs.replace(answer.run, **{place: garbage}))]
 
     meddler.change = spoilt
@@ -543,7 +543,7 @@ def test_warming_up_plans_each_motion_from_the_one_before(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(MotionPlanner, "plan", noted)
     MotionPlanner(CONFIG).warm_up()
-    begins = [answer.first for answer in answers if isinstance(answer, Planned)]
+    begins = [answer.first for answer in answers if isinstance(answer, PreemptingMotion)]
     assert begins == [None, 2, 2, 2]
 
 
@@ -617,6 +617,6 @@ def test_every_answer_is_the_same_when_it_is_read_from_a_recording(steps: list[t
     rig.cycles(5)
     play(rig, steps)
     answers = [planner.planner.plan(request) for request in planner.asked]
-    assert any(isinstance(answer, Planned) and answer.reply.duration is None for answer in answers)
+    assert any(isinstance(answer, PreemptingMotion) and answer.reply.duration is None for answer in answers)
     for answer in answers:
         assert msgspec.json.decode(msgspec.json.encode(answer), type=PlanAnswer) == answer

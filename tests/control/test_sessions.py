@@ -136,7 +136,7 @@ def test_a_queue_that_is_paused_and_then_stopped_has_no_goal_to_pass_on_to(then:
         session.order(Command.PAUSE)
         session.cycles(later)
         if then == "lost":
-            session.control.modes.happen(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
+            session.control.modes.handle_disturbance(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
         else:
             session.order(Command(then))
         session.until(lambda: session.mode in STANDS, 3000)  # noqa: B023 - called at once

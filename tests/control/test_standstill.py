@@ -14,7 +14,7 @@ from control.test_backlash import with_backlash
 from control.test_stop import PROMPT, braking
 from trirail.motion.paths import constant_law
 from trirail.wire.goals import PoseGoal
-from trirail.wire.packets import CommandRequest, Confirmed, GoalRequest, PlannerLost, Request
+from trirail.wire.packets import CommandDone, CommandRequest, GoalRequest, PlannerLost, Request
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Mode, Override, Stop
 
 QUEUE = (
@@ -70,7 +70,9 @@ class QueueSession(Session):
         if len(self.kept) > 1 and self.kept[-1]["mode"][0] == self.kept[-2]["mode"][0] and self.mode is Mode.HOLDING:
             assert not changed
             assert not motion[0, 1:].any()
-        answered = any(isinstance(answer, Confirmed) and answer.ticket == self.pause_ticket for answer in self.answers)
+        answered = any(
+            isinstance(answer, CommandDone) and answer.ticket == self.pause_ticket for answer in self.answers
+        )
         if answered and self.paused_at is None:
             self.paused_at = motion[0, 0].tolist()
         if self.paused_at is not None:

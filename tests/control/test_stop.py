@@ -11,7 +11,7 @@ from trirail.config import Config
 from trirail.control.modes import ModeEvent
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import Goal, PoseGoal, SlidersGoal, TrackGoal, VelocityGoal
-from trirail.wire.packets import Accepted, Answer, CommandRequest, Confirmed, GoalRequest, Refused
+from trirail.wire.packets import Accepted, Answer, CommandDone, CommandRequest, GoalRequest, Refused
 from trirail.wire.vocabulary import Command, FaultCause, Mode, Override, Stop
 
 PERIOD = CONFIG.period
@@ -30,7 +30,7 @@ def confirmed_after(rig: ControlRig, name: str, within: int) -> int:
     for number in range(within):
         answer = answer_to(rig, ticket)
         if answer is not None:
-            assert isinstance(answer, Confirmed), answer
+            assert isinstance(answer, CommandDone), answer
             return number
         rig.cycle()
     raise AssertionError(f"{name} is not confirmed within {within} cycles; the mode is {rig.mode}")
@@ -102,7 +102,7 @@ def planned(rig: ControlRig, goal: PoseGoal, name: str) -> None:
 @pytest.mark.parametrize("event", [ModeEvent.GATEWAY_LOST, ModeEvent.LATE, ModeEvent.SHUTDOWN])
 def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: ControlRig, event: ModeEvent) -> None:
     planned(slow, FAR, "g1")
-    slow.control.modes.happen(event, coded("gone", EventCode.OTHER))
+    slow.control.modes.handle_disturbance(event, coded("gone", EventCode.OTHER))
     slow.until(lambda: slow.mode in (Mode.HOLDING, Mode.DISABLED))
     pose = slow.control.commanded.pose
     slow.cycles(200)
@@ -112,7 +112,7 @@ def test_a_goal_that_is_planned_while_the_robot_is_to_stand_never_begins(slow: C
 
 def test_a_goal_that_is_planned_from_rest_does_not_begin_without_a_gateway(slow: ControlRig) -> None:
     slow.post("g1", FAR)
-    slow.control.modes.happen(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
+    slow.control.modes.handle_disturbance(ModeEvent.GATEWAY_LOST, coded("gone", EventCode.GATEWAY_LOST))
     slow.cycles(100)
     assert slow.mode is Mode.HOLDING
     assert slow.outcomes() == [("g1", "stopped")]
@@ -131,7 +131,8 @@ def test_stop_of_a_goal_that_has_not_begun_leaves_the_others(slow: ControlRig, w
     slow.post("g2", PoseGoal(0.0, 0.03, 0.0))
     slow.cycle(CommandRequest(99, "ann", Command.STOP, Stop("g1" if waiting == "planned" else "g2")))
     assert (
-        isinstance(answer_to(slow, 99), Confirmed) or slow.until(lambda: isinstance(answer_to(slow, 99), Confirmed)) < 3
+        isinstance(answer_to(slow, 99), CommandDone)
+        or slow.until(lambda: isinstance(answer_to(slow, 99), CommandDone)) < 3
     )
     slow.until(lambda: slow.holds() and slow.control.goal_queue.idle)
     assert sorted(slow.outcomes()) == [
@@ -152,7 +153,7 @@ def test_stop_of_one_of_several_goals_that_wait_for_a_plan_is_of_that_one_alone(
         slow.post(goal, PoseGoal(x, 0.0, 0.0))
     slow.cycle(CommandRequest(99, "ann", Command.STOP, Stop(name)))
     slow.until(lambda: answer_to(slow, 99) is not None)
-    assert isinstance(answer_to(slow, 99), Refused if name == "never" else Confirmed)
+    assert isinstance(answer_to(slow, 99), Refused if name == "never" else CommandDone)
     slow.until(lambda: slow.holds() and slow.control.goal_queue.idle)
     assert [goal for goal, outcome in slow.outcomes() if outcome == "stopped"] == [name] * (name in places)
     last = [x for goal, x in places.items() if goal != name][-1]

@@ -16,8 +16,8 @@ from conftest import Rig, changed
 from control_rig import CONFIG
 from drivers.test_homing import incremental
 from trirail.config import Config
-from trirail.control.cycle import FAR
-from trirail.wire.packets import CommandRequest, Confirmed, Refused
+from trirail.control.cycle import MAX_DISTANCE_STEPS
+from trirail.wire.packets import CommandDone, CommandRequest, Refused
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.interface import PowerState
@@ -101,7 +101,9 @@ class Cia402Rig(FaultRig):
             position = np.array([target for target, _ in targets]) / counts
             enabled = np.array([enabled for _, enabled in targets])
             velocity = np.diff(position) / PERIOD
-            back = ~(enabled[1:] | enabled[:-1]) & (np.abs(np.diff(position)) > FAR * limits.velocities[0] * PERIOD)
+            back = ~(enabled[1:] | enabled[:-1]) & (
+                np.abs(np.diff(position)) > MAX_DISTANCE_STEPS * limits.velocities[0] * PERIOD
+            )
             assert np.nanmax(np.abs(velocity[~back])) <= limits.velocities[0] * 1.001 + rounding
             always = enabled[2:] & enabled[1:-1] & enabled[:-2]
             acceleration = np.diff(velocity)[always] / PERIOD
@@ -280,17 +282,17 @@ def assert_stops_until_reset(rig: FaultRig, case: Case, begun: Begin) -> None:
     if case.lasts:
         answer = rig.command("reset")
         assert isinstance(answer, Refused)
-        assert "the cause is still there" in answer.message or "by what it said last" in answer.message
+        assert "the cause is still there" in answer.message or "by its last statusword" in answer.message
         assert rig.faulty()
     rig.mend()
     rig.cycles(LONG)
     rig.until(lambda: not rig.control.measured.unready)
-    assert isinstance(rig.command("reset"), Confirmed) is case.curable
+    assert isinstance(rig.command("reset"), CommandDone) is case.curable
     assert rig.stands()
     if case.curable:
         rig.enable()
         if not rig.control.measured.homed:
-            assert isinstance(rig.command("home"), Confirmed)
+            assert isinstance(rig.command("home"), CommandDone)
         rig.goal("g3", 0.01, 0.0, 0.0)
         rig.until(lambda: rig.mode is Mode.HOLDING)
     expected = [*begun.faulted, ("g2", "rejected"), *([("g3", "done")] if case.curable else [])]

@@ -20,7 +20,7 @@ from trirail.config import Config, geometry
 from trirail.control.modes import ModeEvent
 from trirail.kinematics.robot import inverse
 from trirail.wire.event_codes import EventCode, coded
-from trirail.wire.packets import Accepted, CommandRequest, Confirmed
+from trirail.wire.packets import Accepted, CommandDone, CommandRequest
 from trirail.wire.vocabulary import Command, Mode
 from trirail_drivers import config
 from trirail_drivers.bus.frames import Frame
@@ -77,7 +77,7 @@ def modes(rig: Rig) -> list[int]:
 
 def is_homed(rig: Rig) -> None:
     """Home it; then it is where it says."""
-    assert isinstance(rig.command("home"), Confirmed)
+    assert isinstance(rig.command("home"), CommandDone)
     assert rig.control.measured.feedback.homed == (True, True, True)
     assert rig.control.measured.feedback.position == pytest.approx(true_positions(rig), abs=2e-7)
 
@@ -276,10 +276,10 @@ def test_a_stop_halts_it_and_it_can_begin_again(robots: Robots, event: str | Mod
     rig.enable()
     begin(rig, when)
     if isinstance(event, ModeEvent):
-        rig.control.modes.happen(event, coded("it happened", EventCode.OTHER))
+        rig.control.modes.handle_disturbance(event, coded("it happened", EventCode.OTHER))
         rig.until(lambda: rig.mode is end, 400)
     else:
-        assert isinstance(rig.command(event), Confirmed)
+        assert isinstance(rig.command(event), CommandDone)
     assert rig.mode is end
     assert rig.control.fault is None
     assert not all(rig.control.measured.feedback.homed)
@@ -380,7 +380,7 @@ def test_a_stop_when_the_last_drive_is_home_comes_too_late(rig: Rig) -> None:
     rig.enable()
     begin(rig)
     rig.until(lambda: rig.drives[2].homing.attained)
-    assert isinstance(rig.command("stop"), Confirmed)
+    assert isinstance(rig.command("stop"), CommandDone)
     assert rig.mode is Mode.HOLDING
     assert rig.control.measured.homed
     settled(rig)
@@ -408,7 +408,7 @@ def test_a_fault_stops_it_at_once_and_it_can_begin_again(rig: Rig, cause: str, w
     rig.until(lambda: not rig.control.measured.unready)  # and is configured again, where it was silent
     assert not any(drive.state is PowerState.OPERATION_ENABLED for drive in rig.drives)
     assert not any(drive.servo.velocity for drive in rig.drives)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     rig.enable()
     settled(rig)
     is_homed(rig)
@@ -462,7 +462,7 @@ def test_homes_outside_the_limits_are_warned_of(robots: Robots) -> None:
     rig.enable()
     begin(rig)
     rig.until(lambda: rig.mode is Mode.HOLDING)
-    assert any("the robot stands outside its limits, only motion back" in said.message for said in rig.notices)
+    assert any("the robot is outside its limits, only motion back" in said.message for said in rig.notices)
 
 
 # ---------------------------------------------------------------------- what is refused

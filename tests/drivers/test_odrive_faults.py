@@ -25,7 +25,7 @@ from drivers.test_faults import (
 )
 from drivers.test_odrive import odrives
 from trirail.config import Config
-from trirail.wire.packets import Confirmed, Refused, Request
+from trirail.wire.packets import CommandDone, Refused, Request
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.bus.wire import UNSENT_CYCLES
 from trirail_drivers.driver.ramp import brake
@@ -376,7 +376,7 @@ def test_a_drive_that_keeps_its_power_stays_at_the_end_of_the_ramp_and_is_named(
     rig.mend()
     rig.until(rig.stands, 2 * BEAT)
     rig.cycles(BEAT)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     rig.enable()
     rig.assert_no_jump()
 

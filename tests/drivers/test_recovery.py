@@ -15,7 +15,7 @@ from drivers.test_homing import incremental
 from drivers.test_odrive import odrives
 from trirail.config import Config
 from trirail.errors import RefusalCode
-from trirail.wire.packets import Confirmed, Refused, Request
+from trirail.wire.packets import CommandDone, Refused, Request
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.cia402 import canopen_frames
 from trirail_drivers.cia402.axis import ANSWER_TIME
@@ -87,7 +87,7 @@ class RecoveryRig(Rig):
         """Every drive is configured; reset, enable and a goal follow, and nothing has power before."""
         self.until(self.ready, ENDS)
         self.assert_unpowered()
-        assert isinstance(self.command("reset"), Confirmed)
+        assert isinstance(self.command("reset"), CommandDone)
         self.assert_unpowered()
         self.enable()
         self.goal("after", 0.005, 0.0, 0.0)
@@ -294,13 +294,13 @@ def test_an_odrive_whose_position_is_relative_is_not_homed() -> None:
     drive.settings[POSITION_STATUS] = RELATIVE_MODE
     rig.supply(0)
     rig.until(rig.ready, ENDS)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     rig.enable()
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
     assert rig.said("drive A: axis0.pos_vel_mapper.status is 9, relative")
-    assert rig.said("slider A: its position is not known since its drive was off")
+    assert rig.said("slider A: position unknown since its drive was off")
     rig.bus.shutdown()
 
 
@@ -334,18 +334,18 @@ def test_a_slider_that_was_moved_while_its_drive_was_off_is_told(rig: RecoveryRi
 def test_an_incremental_encoder_makes_the_robot_not_homed() -> None:
     rig = RecoveryRig(incremental())
     rig.enable()
-    assert isinstance(rig.command("home"), Confirmed)
+    assert isinstance(rig.command("home"), CommandDone)
     rig.cut(0)
     rig.cycles(300)
     rig.supply(0)
     rig.until(rig.ready, ENDS)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     rig.enable()
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
-    assert rig.said("slider A: its position is not known since its drive was off: send home")
-    assert isinstance(rig.command("home"), Confirmed)
+    assert rig.said("slider A: position unknown since its drive was off: send home")
+    assert isinstance(rig.command("home"), CommandDone)
     rig.goal("g2", 0.01, 0.0, 0.0)
     rig.until(lambda: ("g2", "done") in rig.outcomes())
     rig.bus.shutdown()
@@ -358,7 +358,7 @@ def test_another_home_offset_makes_the_robot_not_homed(rig: RecoveryRig) -> None
     rig.supply(0)
     rig.drives[0].objects[0x607C, 0].value = 500
     rig.until(rig.ready, ENDS)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     rig.enable()
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)

@@ -19,7 +19,7 @@ from drivers.test_odrive import odrives
 from drivers.test_recovery import ENDS, RecoveryRig, disabled, holding
 from numpy.typing import NDArray
 from trirail.config import Config
-from trirail.wire.packets import Confirmed, Refused
+from trirail.wire.packets import CommandDone, Refused
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.interface import PowerState
 from trirail_drivers.odrive.cansimple import Error
@@ -203,7 +203,7 @@ def play(row: Row, seed: int) -> None:
     if said:
         refused_by_name(rig, row, said)
     rig.until(rig.ready, ENDS)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     rig.assert_unpowered()
     begun = len(rig.rows)
     rig.enable()
@@ -301,7 +301,7 @@ def test_safe_torque_off_needs_a_reset_and_an_enable(seed: int) -> None:
     for index in struck:
         give_torque(rig, index)
     rig.cycles(20)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     assert rig.asked == []
     rig.assert_unpowered()
     rig.enable()

@@ -18,7 +18,7 @@ from drivers.test_recovery_matrix import stopping
 from processes.test_quiet import odrives
 from trirail.config import Config
 from trirail.errors import RefusalCode
-from trirail.wire.packets import Confirmed, Refused
+from trirail.wire.packets import CommandDone, Refused
 from trirail.wire.vocabulary import Mode
 from trirail_drivers.bus import wire as wires
 from trirail_drivers.bus.can_frame import CAN_FRAME
@@ -243,7 +243,7 @@ def test_a_bus_that_is_lost_comes_back(rig: BusRig, seed: int) -> None:
                 rig.finish()
             rig.cycles(1)
             answer = rig.command("reset") if draw.random() < 0.2 and rig.down else None
-            assert not isinstance(answer, Confirmed)
+            assert not isinstance(answer, CommandDone)
         if draw.random() < 0.5:
             rig.cycles(draw.randrange(400))  # of the configuration
     rig.recover()
@@ -378,7 +378,7 @@ def test_odrives_go_on_when_their_bus_is_back(seed: int) -> None:
         rig.cycles(1)
     rig.until(rig.ready, ENDS)
     rig.cycles(300)
-    assert isinstance(rig.command("reset"), Confirmed)
+    assert isinstance(rig.command("reset"), CommandDone)
     rig.cycles(300)
     rig.enable()
     rig.goal("after", 0.005, 0.0, 0.0)

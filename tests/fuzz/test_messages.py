@@ -29,7 +29,7 @@ from trirail.wire.goals import Goal, PoseGoal, TrajectoryGoal
 from trirail.wire.goals import TrajectoryPoint as Point
 from trirail.wire.links import Port, TooLarge
 from trirail.wire.messages import CommandReply, Event, Notice
-from trirail.wire.packets import Accepted, Announcement, GoalRequest, Happened
+from trirail.wire.packets import Accepted, Announcement, EventReport, GoalRequest
 from trirail.wire.records import DTYPE, SIZE
 from trirail.wire.sizes import (
     MAX_BESIDE,
@@ -205,7 +205,7 @@ def test_the_gateway_takes_any_message(
     gateway: tuple[Gateway, FakeLink], kind: str, key: str, payload: bytes, encoding: str
 ) -> None:
     served, link = gateway
-    served._refusals._told_since = -math.inf
+    served._refusals._announced_since = -math.inf
     link.sent.clear()
     served._handle(Incoming(kind, key, len(payload), payload, encoding, None, time.monotonic_ns()))
     for packet in link.sent:
@@ -220,7 +220,7 @@ def test_the_gateway_takes_any_message(
 @given(packet=st.binary(min_size=1, max_size=300) | st.builds(bytes.__add__, st.sampled_from((b"\1", b"\2")), payloads))
 def test_the_gateway_outlives_any_packet(gateway: tuple[Gateway, FakeLink], packet: bytes) -> None:
     served, _ = gateway
-    served._hear(packet, lambda: None)
+    served._handle_packet(packet, lambda: None)
 
 
 # ---------------------------------------------------------------------- what goes between the processes
@@ -269,7 +269,7 @@ def test_an_event_always_fits_into_a_packet(length: int) -> None:
     packet = packets.event_packet(event)
     assert len(packet) <= MAX_PACKET
     told = packets.decode_answer(packet[1:])
-    assert isinstance(told, Happened)
+    assert isinstance(told, EventReport)
     assert told.event.message.startswith(event.message[:1000])
 
 

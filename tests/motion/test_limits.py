@@ -538,4 +538,4 @@ def test_a_slider_beyond_its_travel_by_more_than_can_be_measured_is_enabled_with
     rig = ControlRig(changed(CONFIG, start=sliders_at(0.0, 0.0, high)))
     rig.enable()
     (warning,) = (said.message for said in rig.notices if said.level == "warning")
-    assert "the robot stands outside its limits, only motion back is accepted: slider A: position" in warning
+    assert "the robot is outside its limits, only motion back is accepted: slider A: position" in warning

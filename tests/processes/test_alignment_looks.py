@@ -11,7 +11,7 @@ from refusals import refused_as
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.gateway import ROUTES
 from trirail.processes.incoming import Incoming
-from trirail.processes.requests import LOOKS, LOOKS_PER_SECOND, Looks
+from trirail.processes.requests import LOOK_BURST, LOOKS_PER_SECOND, Looks
 from trirail.wire import boundary
 from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, in_words
 from trirail.wire.messages import Notice
@@ -62,14 +62,14 @@ LOOK = AlignmentLook("a", "check", 1)
 
 def test_who_sends_too_many_is_refused_until_he_has_waited_and_others_are_not() -> None:
     asked = Asked()
-    for _ in range(LOOKS):
+    for _ in range(LOOK_BURST):
         asked.take(LOOK)
     with refused_as(RefusalCode.BUSY):
         asked.take(LOOK)
     asked.take(LOOK, "trirail/demo/alignment/bob")
     asked.now += 1.5 / LOOKS_PER_SECOND
     asked.take(LOOK)
-    assert [sent.user for sent in asked.sent] == ["ann"] * LOOKS + ["bob", "ann"]
+    assert [sent.user for sent in asked.sent] == ["ann"] * LOOK_BURST + ["bob", "ann"]
 
 
 def test_what_the_loop_does_not_take_is_refused() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refusals import uncoded
 from trirail.processes import sockets
-from trirail.processes.zenoh_links import EACH, LOOK_EVERY, Crowding, surplus
+from trirail.processes.zenoh_links import CHECK_PERIOD_S, PROTECTED_SESSIONS, LinkMonitor, surplus
 from trirail.wire.messages import Notice
 
 USERS = frozenset({"ann", "eva", "max"})
@@ -23,10 +23,10 @@ def test_the_newest_of_whom_has_most_end_and_no_more_than_are_too_many(names: li
     before, left = Counter(names), Counter(name for at, name in links.items() if at not in ending)
     assert len(ending) <= max(0, len(links) - 90)
     if len(ending) < len(links) - 90:
-        assert all(left[name] <= EACH for name in USERS)
+        assert all(left[name] <= PROTECTED_SESSIONS for name in USERS)
         assert set(left) <= USERS
     for name in USERS:
-        assert left[name] >= min(before[name], EACH)
+        assert left[name] >= min(before[name], PROTECTED_SESSIONS)
         if left[name] < before[name]:  # nobody's without a role are left, and nobody has more
             assert set(left) <= USERS
             assert max(left.values()) <= left[name] + 1
@@ -47,7 +47,7 @@ class Crowd:
         monkeypatch.setattr(sockets, "descriptors_used", lambda: self.descriptors)
         monkeypatch.setattr(sockets, "descriptor_limit", lambda: 1000)
         self.unopened: Counter[str] = Counter()
-        self.crowding = Crowding(
+        self.crowding = LinkMonitor(
             lambda: self.links,
             self.ended.extend,
             USERS,
@@ -60,7 +60,7 @@ class Crowd:
     def look(self, links: int, descriptors: int = 10, name: str | None = "eva") -> tuple[str, ...]:
         self.links = {f"at {number}": name for number in range(links)}
         self.descriptors = descriptors
-        self.now += LOOK_EVERY
+        self.now += CHECK_PERIOD_S
         self.crowding.poll()
         return self.crowding.warnings()
 

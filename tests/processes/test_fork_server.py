@@ -14,7 +14,7 @@ import pytest
 import servers
 from trirail.config import SIM, load
 from trirail.processes import forked_processes
-from trirail.processes.forked_processes import UNTOLD, ChildProcess, ForkServerLink
+from trirail.processes.forked_processes import EXIT_CODE_UNKNOWN, ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.order import Order
 from trirail.wire import links
@@ -46,7 +46,7 @@ def target(entry):
         return "/proc/"  # that of the listing itself
 
 def work(child):
-    child.ready({{
+    child.report_ready({{
         "named": Path("/proc/self/cmdline").read_bytes().strip(b"\\0").decode(),
         "record": child.order.record,
         "descriptors": {{entry: target(entry) for entry in os.listdir("/proc/self/fd")}},
@@ -82,25 +82,25 @@ class Parent:
         """Wait until a child is up, and return what it said."""
         watched: list[Any] = [child.pipe, self.warm]
         deadline = time.monotonic() + WITHIN
-        while child.ready_with is None or child.pid is None:
+        while child.ready_message is None or child.pid is None:
             heard, _, _ = select.select(watched, [], [], deadline - time.monotonic())
             assert heard
-            self.warm.hear()
-            if child.pipe in heard and not child.listen():
+            self.warm.receive()
+            if child.pipe in heard and not child.read_messages():
                 break
-        assert child.ready_with is not None
-        return child.ready_with
+        assert child.ready_message is not None
+        return child.ready_message
 
     def until_over(self, child: ChildProcess) -> str:
         """Wait until a child has ended, and return how."""
         assert child.wait(time.monotonic() + WITHIN)
-        return child.how
+        return child.end_description
 
 
 @pytest.fixture
 def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Parent]:
     (tmp_path / "kept").touch()
-    for times in ("TELLS_WITHIN", "IMPORTS_WITHIN"):  # of a busy machine
+    for times in ("END_REPORT_TIMEOUT_S", "IMPORT_TIMEOUT_S"):  # of a busy machine
         monkeypatch.setattr(forked_processes, times, WITHIN)
     monkeypatch.setattr(forked_processes, "ServerProcess", servers.doing(SERVER.format(folder=str(tmp_path)), tmp_path))
     made = Parent(tmp_path)
@@ -157,7 +157,7 @@ def test_a_signal_that_comes_before_a_child_handles_it_is_not_lost(parent: Paren
     child = parent.child("gateway")
     while child.pid is None:
         select.select([parent.warm], [], [], WITHIN)
-        parent.warm.hear()
+        parent.warm.receive()
     child.send_signal(signal.SIGTERM)
     assert parent.until_over(child) == "killed by SIGTERM"
 
@@ -198,7 +198,7 @@ def test_a_compiler_that_dies_is_the_end_of_who_needs_it(parent: Parent) -> None
     (parent.folder / "compiler").write_text("os.kill(os.getpid(), signal.SIGKILL)")
     loop = parent.child("loop")
     assert parent.until_over(loop) == "killed by SIGKILL"
-    assert loop.ready_with is None
+    assert loop.ready_message is None
 
 
 @pytest.mark.parametrize("name", ["loop", "drives", "planner"])
@@ -217,10 +217,10 @@ def test_a_dead_parent_is_told_and_so_are_its_children(parent: Parent) -> None:
     child = parent.child("planner")
     parent.until_said(child)
     (parent.folder / "planner").write_text("os.kill(os.getppid(), signal.SIGKILL)")
-    assert parent.until_over(child) == "its parent does not say how"
+    assert parent.until_over(child) == "exit code unknown"
     assert parent.warm.gone
-    assert parent.warm.how() == "killed by SIGKILL"
-    assert parent.child("gateway").returncode == UNTOLD
+    assert parent.warm.describe_end() == "killed by SIGKILL"
+    assert parent.child("gateway").returncode == EXIT_CODE_UNKNOWN
 
 
 def test_how_a_child_ended_is_told_also_where_its_parent_is_importing(parent: Parent) -> None:
@@ -233,13 +233,13 @@ def test_how_a_child_ended_is_told_also_where_its_parent_is_importing(parent: Pa
 
 
 def test_a_frozen_parent_is_waited_for_once(parent: Parent, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forked_processes, "TELLS_WITHIN", 1.0)
+    monkeypatch.setattr(forked_processes, "END_REPORT_TIMEOUT_S", 1.0)
     children = [parent.child(name) for name in ("planner", "gateway", "recorder")]
     for child in children:
         parent.until_said(child)
     (parent.folder / "planner").write_text("os.kill(os.getppid(), signal.SIGSTOP); os._exit(1)")
-    assert parent.until_over(children[0]) == "its parent does not say how"
-    assert parent.warm.tells_within == 0.0
+    assert parent.until_over(children[0]) == "exit code unknown"
+    assert parent.warm.report_timeout == 0.0
     for child in children[1:]:
         child.kill()
-        assert parent.until_over(child) == "its parent does not say how"
+        assert parent.until_over(child) == "exit code unknown"

@@ -17,7 +17,7 @@ from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
 from trirail.processes.incoming import GOAL_PATIENCE, GOALS_OF_ONE, Incoming
 from trirail.processes.replies import REFUSALS_PER_SECOND
-from trirail.processes.requests import AHEAD, AHEAD_OF_ALL, UNDER_WAY
+from trirail.processes.requests import MAX_COMMANDS_OF_USER, MAX_GOALS, MAX_GOALS_OF_USER
 from trirail.processes.session_guard import Guard
 from trirail.wire import boundary, packets, zenoh_session
 from trirail.wire.event_codes import EventCode
@@ -27,11 +27,11 @@ from trirail.wire.packets import (
     Accepted,
     Announcement,
     Answer,
+    CommandDone,
     CommandRequest,
-    Confirmed,
+    EventReport,
     Farewell,
     GoalRequest,
-    Happened,
     Request,
     Status,
     Welcome,
@@ -72,7 +72,7 @@ class Rig:
 
     def hear(self, answer: Answer) -> None:
         """The loop says something."""
-        self.gateway._hear(packets.message(answer), lambda: None)
+        self.gateway._handle_packet(packets.message(answer), lambda: None)
 
     def accepted(self, ticket: int) -> None:
         self.hear(Accepted(ticket, GoalReply("g", 1.0)))
@@ -154,15 +154,20 @@ def test_a_goal_that_has_waited_too_long_does_not_begin(rig: Rig, monkeypatch: p
 
 
 def test_many_commands_are_refused_but_never_a_stop(rig: Rig) -> None:
-    for _ in range(UNDER_WAY + 3):
+    for _ in range(MAX_COMMANDS_OF_USER + 3):
         rig.command("resume")
     for name in ("stop", "quick_stop", "disable", "pause"):
         rig.command(name)
     passed = [request.name for request in rig.commands()]
-    assert passed == ["resume"] * UNDER_WAY + ["stop", "quick_stop", "disable", "pause"]
-    rig.hear(Confirmed(1, Command.RESUME, "holding", 1))
-    for ticket in (UNDER_WAY + 1, UNDER_WAY + 2, UNDER_WAY + 3, UNDER_WAY + 4):
-        rig.hear(Confirmed(ticket, Command.STOP, "holding", 1))
+    assert passed == ["resume"] * MAX_COMMANDS_OF_USER + ["stop", "quick_stop", "disable", "pause"]
+    rig.hear(CommandDone(1, Command.RESUME, "holding", 1))
+    for ticket in (
+        MAX_COMMANDS_OF_USER + 1,
+        MAX_COMMANDS_OF_USER + 2,
+        MAX_COMMANDS_OF_USER + 3,
+        MAX_COMMANDS_OF_USER + 4,
+    ):
+        rig.hear(CommandDone(ticket, Command.STOP, "holding", 1))
     rig.command("reset")
     assert rig.commands()[-1].name == "reset"
 
@@ -179,14 +184,14 @@ def test_users_take_turns_at_the_loop(rig: Rig) -> None:
 def test_what_the_loop_has_at_once_is_bounded_for_all_users_together(rig: Rig) -> None:
     for number in range(40):
         rig.goal(f"g{number}", f"u{number % 20}")
-    assert len(rig.goals()) == AHEAD_OF_ALL
+    assert len(rig.goals()) == MAX_GOALS
     for ticket in range(1, 41):
         rig.accepted(ticket)
     assert sorted(name for name, _ in rig.goals()) == sorted(f"g{number}" for number in range(40))
 
 
 def test_goals_of_one_who_floods_are_refused_and_nobody_elses(rig: Rig) -> None:
-    for number in range(AHEAD + GOALS_OF_ONE + 3):
+    for number in range(MAX_GOALS_OF_USER + GOALS_OF_ONE + 3):
         rig.goal(f"e{number}", "eve")
     rig.goal("a", "ann")
     words = f"{GOALS_OF_ONE} goals of eve are waiting already: send fewer"
@@ -202,32 +207,35 @@ def test_a_stop_that_overtook_goals_withdraws_them_and_none_that_came_later(rig:
 
 
 def test_what_waits_for_the_loop_does_not_begin_under_anothers_lease(rig: Rig) -> None:
-    for number in range(AHEAD + 1):
+    for number in range(MAX_GOALS_OF_USER + 1):
         rig.goal(f"a{number}", "ann")
         rig.goal(f"b{number}", "bob")
     event = Event("lease", "info", "lease acquired by bob", user="bob", seq=1, t=0.0, cycle=1, time=0.0)
-    rig.hear(Happened(event))
-    for ticket in range(1, 2 * AHEAD + 1):
+    rig.hear(EventReport(event))
+    for ticket in range(1, 2 * MAX_GOALS_OF_USER + 1):
         rig.accepted(ticket)
-    assert rig.goals()[2 * AHEAD :] == [(f"a{AHEAD}", "lease acquired by bob"), (f"b{AHEAD}", None)]
+    assert rig.goals()[2 * MAX_GOALS_OF_USER :] == [
+        (f"a{MAX_GOALS_OF_USER}", "lease acquired by bob"),
+        (f"b{MAX_GOALS_OF_USER}", None),
+    ]
 
 
 @pytest.mark.parametrize(("holder", "withdrawn"), [(None, True), ("ann", True), ("bob", False)])
 def test_goals_that_wait_are_withdrawn_by_a_pause_of_who_may(rig: Rig, holder: str | None, withdrawn: bool) -> None:
     rig.hear(Status(None, 1.0, None, lease=holder))
-    for number in range(AHEAD + 1):
+    for number in range(MAX_GOALS_OF_USER + 1):
         rig.goal(f"b{number}", "bob", number)
-    rig.command("pause", number=AHEAD + 1)
+    rig.command("pause", number=MAX_GOALS_OF_USER + 1)
     rig.accepted(1)
-    assert rig.goals()[-1] == (f"b{AHEAD}", "pause by ann" if withdrawn else None)
+    assert rig.goals()[-1] == (f"b{MAX_GOALS_OF_USER}", "pause by ann" if withdrawn else None)
 
 
 def test_commands_of_one_are_bounded_and_leave_the_others_theirs(rig: Rig) -> None:
-    for _ in range(UNDER_WAY + 1):
+    for _ in range(MAX_COMMANDS_OF_USER + 1):
         rig.command("resume", user="eve")
     rig.command("resume", user="ann")
     users = [request.user for request in rig.commands()]
-    assert users == ["eve"] * UNDER_WAY + ["ann"]
+    assert users == ["eve"] * MAX_COMMANDS_OF_USER + ["ann"]
 
 
 def test_what_is_refused_of_one_who_floods_leaves_room_to_tell_of_the_others(rig: Rig) -> None:
@@ -258,7 +266,7 @@ def test_an_error_of_its_own_is_told_and_does_not_end_it(rig: Rig, monkeypatch: 
         patched.setattr(boundary, "decode", broken)
         rig.goal("a")
         rig.command("stop")
-    rig.gateway._hear(b"\x02not a message", lambda: None)
+    rig.gateway._handle_packet(b"\x02not a message", lambda: None)
     told = [request.message for request in rig.refusals()]
     assert [text[:14] for text in told] == ["internal error", "internal error", "the gateway co"]
     rig.goal("b")

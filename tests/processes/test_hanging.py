@@ -28,7 +28,7 @@ TURNS = st.tuples(st.booleans(), st.sampled_from("RDSTtZ"), st.floats(0.0, TURN)
 def test_only_the_time_counts_in_which_it_could_have_given_a_sign_of_life(
     patience: float, turns: list[tuple[bool, str, float]]
 ) -> None:
-    heart, used = Heartbeats.create().of("planner"), 0.0
+    heart, used = Heartbeats.create().heart("planner"), 0.0
     heart.beat()
     now = Effort("R", 0.0)
     watch = HangWatch(heart, patience, TURN, lambda _: now)
@@ -50,14 +50,14 @@ def test_only_the_time_counts_in_which_it_could_have_given_a_sign_of_life(
 
 @given(turns=st.integers(1, 10_000), state=st.sampled_from("RD"))
 def test_one_that_gets_nothing_of_the_machine_never_hangs(turns: int, state: str) -> None:
-    heart = Heartbeats.create().of("planner")
+    heart = Heartbeats.create().heart("planner")
     heart.beat()
     watch = HangWatch(heart, 0.7, TURN, lambda _: Effort(state, 5.0))
     assert not any(watch.hangs(1) for _ in range(turns))
 
 
 def test_nobody_hangs_who_is_not_expected_to_beat() -> None:
-    watch = HangWatch(Heartbeats.create().of("planner"), 0.7, TURN, lambda _: Effort("S", 0.0))
+    watch = HangWatch(Heartbeats.create().heart("planner"), 0.7, TURN, lambda _: Effort("S", 0.0))
     assert not any(watch.hangs(1) for _ in range(100))
 
 
@@ -67,12 +67,12 @@ def test_who_says_that_it_is_up_is_expected_to_beat_from_then_on(name: str) -> N
     hears, voice = os.pipe()
     try:
         child = Child(name, Order(load(SIM), None), Path(), heartbeats, [], voice)
-        child.compiling("a function")
-        assert heartbeats.of(name).count == 0
-        child.ready({"lacking": ()})
+        child.report_compiling("a function")
+        assert heartbeats.heart(name).count == 0
+        child.report_ready({"lacking": ()})
     finally:
         os.close(voice)
-    watch = HangWatch(heartbeats.of(name), 0.7, TURN, lambda _: Effort("S", 0.0))
+    watch = HangWatch(heartbeats.heart(name), 0.7, TURN, lambda _: Effort("S", 0.0))
     assert any(watch.hangs(1) for _ in range(20))
     with open(hears, "rb") as heard:
         assert [*map(msgspec.json.decode, heard)] == [{"compiling": "a function"}, {"lacking": []}]
@@ -113,7 +113,7 @@ def test_the_kernel_tells_what_works_from_what_is_stopped(name: str) -> None:
 
 
 def test_what_is_silent_and_works_is_killed_by_what_it_has_used() -> None:
-    heart = Heartbeats.create().of("planner")
+    heart = Heartbeats.create().heart("planner")
     heart.beat()
     with running("print(flush=True)\nwhile True: pass") as pid:
         watch = HangWatch(heart, 0.3, TURN)

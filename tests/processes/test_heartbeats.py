@@ -11,16 +11,16 @@ def test_each_process_has_its_own_and_all_share_them() -> None:
     one = Heartbeats.create()
     other = Heartbeats(one.descriptor)
     for name in PROCESSES:
-        assert other.of(name).count == 0
-        one.of(name).beat()
-        assert other.of(name).count == 1
-    one.of("loop").rest()
-    assert {name: other.of(name).count for name in PROCESSES} == {name: int(name != "loop") for name in PROCESSES}
+        assert other.heart(name).count == 0
+        one.heart(name).beat()
+        assert other.heart(name).count == 1
+    one.heart("loop").rest()
+    assert {name: other.heart(name).count for name in PROCESSES} == {name: int(name != "loop") for name in PROCESSES}
 
 
 @given(patience=st.integers(1, 10), turns=st.lists(st.sampled_from(["beat", "rest", ""]), max_size=60))
 def test_it_is_silent_after_more_turns_than_there_is_patience(patience: int, turns: list[str]) -> None:
-    heart = Heartbeats.create().of("gateway")
+    heart = Heartbeats.create().heart("gateway")
     watch = Watch(heart, patience)
     silence: int | None = None
     for turn in turns:
@@ -33,4 +33,4 @@ def test_it_is_silent_after_more_turns_than_there_is_patience(patience: int, tur
         elif silence is not None:
             silence += 1
         assert watch.silent() == (silence is not None and silence > patience)
-        assert watch.heard == (turn == "beat")
+        assert watch.has_beat == (turn == "beat")

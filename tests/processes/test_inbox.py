@@ -15,7 +15,7 @@ import zenoh
 from rigs import Clock
 from trirail.errors import RefusalCode, RefusedError
 from trirail.processes.gateway import ROUTES
-from trirail.processes.inbox import UNREAD, UNREAD_OF_ONE, Inbox, _incoming
+from trirail.processes.inbox import MAX_MESSAGES, MAX_MESSAGES_OF_USER, Inbox, _incoming
 from trirail.processes.incoming import BURST, RATE, FairQueue, Incoming, Pace
 from trirail.processes.memory_budget import OVERHEAD
 from trirail.wire import zenoh_session
@@ -61,7 +61,7 @@ def test_messages_are_taken_in_their_order(inbox: Inbox) -> None:
 
 
 def test_a_flood_of_goals_is_refused_and_keeps_no_command_out(inbox: Inbox, refused: list[Incoming]) -> None:
-    for number in range(UNREAD + 5):
+    for number in range(MAX_MESSAGES + 5):
         keep(inbox, "goal", user=f"u{number % 8}")
     assert len(refused) == 5
     keep(inbox, "cmd", name="enable")
@@ -71,7 +71,7 @@ def test_a_flood_of_goals_is_refused_and_keeps_no_command_out(inbox: Inbox, refu
 
 
 def test_the_flood_of_one_leaves_room_for_the_others(inbox: Inbox, refused: list[Incoming]) -> None:
-    for _ in range(UNREAD_OF_ONE + 5):
+    for _ in range(MAX_MESSAGES_OF_USER + 5):
         keep(inbox, "goal", user="eve")
     assert [incoming.user for incoming in refused] == ["eve"] * 5
     keep(inbox, "goal")
@@ -177,7 +177,7 @@ def test_what_is_too_large_is_refused_when_it_comes_and_its_memory_is_not_held(t
             client.get(f"trirail/demo/{name}", zenoh.handlers.FifoChannel(1), payload=content, attachment=attached)
             incoming, error = refused.get(timeout=WITHIN)
             assert (incoming.payload, error.code) == (b"", RefusalCode.TOO_LARGE)
-            assert ("the robot is told to stop all the same" in error.message) == (name == "cmd/eve/stop")
+            assert ("stop takes effect nevertheless" in error.message) == (name == "cmd/eve/stop")
             assert inbox._budget.held - before == OVERHEAD * (name == "cmd/eve/stop")
         (stop,) = inbox.next_messages(9)
         assert stop.key == "trirail/demo/cmd/eve/stop"

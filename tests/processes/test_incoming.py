@@ -31,9 +31,9 @@ def test_each_users_own_are_in_order_and_nobody_waits_for_more_than_one_of_each_
                 before[user] += other != user
                 assert before[user] <= 1
             waited.pop(user)
-            if queue.of(user):
+            if queue.count(user):
                 waited[user] = Counter()
-        assert set(queue.users) == {user for user in USERS if queue.of(user)}
+        assert set(queue.users) == {user for user in USERS if queue.count(user)}
     left = sorted(queue)
     for user in USERS:
         taken[user] += [number for name, number in left if name == user]

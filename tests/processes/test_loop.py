@@ -14,7 +14,7 @@ from trirail.processes.heartbeats import Heartbeats, Watch
 from trirail.processes.loop import Loop
 from trirail.processes.ports import REQUESTS_A_CYCLE, Ports
 from trirail.processes.reports import BATCHES_PER_SECOND
-from trirail.processes.requests import AHEAD_OF_ALL, UNDER_WAY_OF_ALL
+from trirail.processes.requests import MAX_COMMANDS, MAX_GOALS
 from trirail.wire import links
 from trirail.wire.event_codes import EventCode, coded
 from trirail.wire.goals import PoseGoal
@@ -23,13 +23,13 @@ from trirail.wire.messages import Event, Notice
 from trirail.wire.packets import (
     Announcement,
     Answer,
+    CommandDone,
     CommandRequest,
-    Confirmed,
     ControlInput,
     Disturbance,
     DrivesFault,
+    EventReport,
     GoalRequest,
-    Happened,
     Kind,
     Refused,
     Status,
@@ -38,7 +38,7 @@ from trirail.wire.packets import (
     decode_answer,
     message,
 )
-from trirail.wire.plan_packets import Planned, decode_plan_request, encode
+from trirail.wire.plan_packets import PreemptingMotion, decode_plan_request, encode
 from trirail.wire.records import unpack
 from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.vocabulary import Command, Mode, Override
@@ -95,7 +95,7 @@ class Shell:
         return [decode_answer(packet[1:]) for packet in self.received(by) if packet[0] == Kind.MESSAGE]
 
     def events(self) -> list[Event]:
-        return [answer.event for answer in self.said() if isinstance(answer, Happened)]
+        return [answer.event for answer in self.said() if isinstance(answer, EventReport)]
 
     def send(self, ticket: int, name: str, goal: PoseGoal) -> None:
         """The gateway passes a goal of ann's on."""
@@ -121,10 +121,10 @@ def test_every_cycle_has_its_record_and_every_event_its_number(shell: Shell) -> 
     assert cycles == list(range(cycles[0], cycles[0] + len(cycles)))
     said = [decode_answer(packet[1:]) for packet in packets if packet[0] == Kind.MESSAGE]
     assert isinstance(said[0], Welcome)
-    assert [answer.event.seq for answer in said if isinstance(answer, Happened)] == [1, 2]
+    assert [answer.event.seq for answer in said if isinstance(answer, EventReport)] == [1, 2]
 
 
-@pytest.mark.parametrize("part", ["observe", "solve", "_judge_arrival", "goal_queue"])
+@pytest.mark.parametrize("part", ["observe", "solve", "_check_arrival", "goal_queue"])
 def test_a_program_that_is_wrong_stops_the_robot_in_that_cycle(
     shell: Shell, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
@@ -135,7 +135,7 @@ def test_a_program_that_is_wrong_stops_the_robot_in_that_cycle(
         raise ZeroDivisionError("a bug")
 
     if part == "goal_queue":
-        monkeypatch.setattr(shell.loop.control.goal_queue, "think", wrong)
+        monkeypatch.setattr(shell.loop.control.goal_queue, "step", wrong)
     else:
         monkeypatch.setattr(shell.loop.control, part, wrong)
     shell.cycles(1)
@@ -162,7 +162,7 @@ def test_a_cycle_that_changes_nothing_takes_no_memory(shell: Shell, in_motion: b
         beating(shell, 50)
     drives = Followers(shell.loop.control.measured.feedback)
     shell.loop._drives = shell.loop.control._drives = cast(DriveGroup, drives)
-    heart, tick = shell.heartbeats.of("gateway"), Tick(round(shell.rig.now * 1e9), 0, 0)
+    heart, tick = shell.heartbeats.heart("gateway"), Tick(round(shell.rig.now * 1e9), 0, 0)
 
     def cycle() -> None:
         heart.beat()
@@ -193,7 +193,7 @@ def test_a_gateway_that_comes_anew_is_told_everything(shell: Shell, tmp_path: Pa
     shell.cycles(30)
     said = shell.said()
     assert isinstance(said[0], Welcome)
-    assert [answer.event.mode for answer in said if isinstance(answer, Happened)] == ["enabling", "holding"]
+    assert [answer.event.mode for answer in said if isinstance(answer, EventReport)] == ["enabling", "holding"]
 
 
 def test_a_lost_gateway_is_noticed(shell: Shell) -> None:
@@ -208,7 +208,7 @@ def test_a_lost_gateway_is_noticed(shell: Shell) -> None:
 def beating(shell: Shell, cycles: int) -> None:
     """Cycles of a loop whose gateway gives its signs of life."""
     for _ in range(cycles // 50):
-        shell.heartbeats.of("gateway").beat()
+        shell.heartbeats.heart("gateway").beat()
         shell.cycles(50)
 
 
@@ -251,7 +251,7 @@ def test_what_a_frozen_gateway_has_left_dies_with_it(shell: Shell, tmp_path: Pat
     shell.cycles(300)
     shell.send(2, "g-1", PoseGoal(0.01, 0.0, 0.0))
     shell.gateway.close()
-    shell.heartbeats.of("gateway").rest()
+    shell.heartbeats.heart("gateway").rest()
     shell.cycles(30)
     shell.gateway = links.connect(tmp_path / "gateway")
     shell.cycles(300)  # the next one takes its time to serve
@@ -299,11 +299,11 @@ def test_a_machine_that_stands_still_is_no_frozen_gateway(shell: Shell) -> None:
 
 
 def test_the_loop_gives_signs_of_life_while_it_turns(shell: Shell) -> None:
-    watch = Watch(shell.heartbeats.of("loop"), 2)
+    watch = Watch(shell.heartbeats.heart("loop"), 2)
     for _ in range(20):
         shell.cycles(20)
         assert not watch.silent()
-        assert watch.heard
+        assert watch.has_beat
     assert [watch.silent() for _ in range(3)] == [False, False, True]
 
 
@@ -312,9 +312,9 @@ def test_it_ends_when_the_robot_has_no_power(shell: Shell) -> None:
     shell.loop.ending = True
     shell.cycles(1)
     assert shell.loop.control.state.mode is Mode.DISABLED
-    assert not shell.loop._over()  # the drives have not said so yet
+    assert not shell.loop._has_ended()  # the drives have not said so yet
     shell.cycles(5)
-    assert shell.loop._over()
+    assert shell.loop._has_ended()
 
 
 def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) -> None:
@@ -330,7 +330,7 @@ def test_the_recorder_is_told_what_the_control_was_given_and_when(shell: Shell) 
     assert [type(what.given) for what in given] == [CommandRequest, DrivesFault, Disturbance, Disturbance]
     assert [what.seq for what in given] == [1, 2, 3, 4]
     assert [what.given.event for what in given if isinstance(what.given, Disturbance)] == ["GATEWAY_LOST", "SHUTDOWN"]
-    events = {answer.event.kind: answer.event for answer in said if isinstance(answer, Happened)}
+    events = {answer.event.kind: answer.event for answer in said if isinstance(answer, EventReport)}
     assert isinstance(given[1].given, DrivesFault)
     assert given[1].given.message == events["fault"].message
     assert given[1].cycle == events["fault"].cycle
@@ -343,7 +343,7 @@ def test_what_the_recorder_says_is_told_to_everyone(shell: Shell) -> None:
     shell.cycles(60)
     full, unreadable = shell.events()[2:]
     assert (full.level, full.message) == ("warning", "the disk is full")
-    assert unreadable.message.startswith("the recorder said something unreadable")
+    assert unreadable.message.startswith("the recorder has sent an invalid packet")
     assert shell.loop.control.state.mode is Mode.HOLDING
 
 
@@ -379,7 +379,7 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
     shell.cycles(60)
     for link in (shell.gateway, shell.recorder):
         said = shell.said(link)
-        (told,) = [answer.event for answer in said if isinstance(answer, Happened) and answer.event.kind == "fault"]
+        (told,) = [answer.event for answer in said if isinstance(answer, EventReport) and answer.event.kind == "fault"]
         assert told.message.startswith("xxx")
         faults = [answer.fault for answer in said if isinstance(answer, Status) and answer.fault]
         assert all(fault.startswith("xxx") and fault.isprintable() for fault in faults)
@@ -388,7 +388,7 @@ def test_whatever_the_fault_says_the_gateway_and_the_recorder_can_read_it(shell:
 
 def answered(shell: Shell) -> list[int]:
     """Tickets of the commands that are confirmed, in order."""
-    return [answer.ticket for answer in shell.said() if isinstance(answer, Confirmed)]
+    return [answer.ticket for answer in shell.said() if isinstance(answer, CommandDone)]
 
 
 def test_a_stop_behind_a_flood_of_commands_is_carried_out_while_they_arrive(shell: Shell) -> None:
@@ -412,11 +412,11 @@ def test_an_urgent_stop_takes_effect_in_its_cycle_whatever_was_sent_before_it(sh
     shell.send(2, "g-1", PoseGoal(0.08, 0.02, 0.2))
     shell.cycles(100)
     assert shell.mode() is Mode.MOVING
-    for ticket in range(100, 100 + AHEAD_OF_ALL):
+    for ticket in range(100, 100 + MAX_GOALS):
         shell.send(ticket, f"g{ticket}", PoseGoal(-0.08, 0.02, 0.2))
-    for ticket in range(200, 200 + UNDER_WAY_OF_ALL):
+    for ticket in range(200, 200 + MAX_COMMANDS):
         shell.gateway.send(message(CommandRequest(ticket, "eve", Command.OVERRIDE, Override(100.0))))
-    with shell.heartbeats.hurrying():
+    with shell.heartbeats.urgent_section():
         shell.gateway.send(message(CommandRequest(300, "ann", name)))
     shell.cycles(1)
     assert shell.mode() is not Mode.MOVING
@@ -534,7 +534,7 @@ def test_the_recorder_has_every_answer_with_the_cycle_in_which_it_was_taken(shel
     said = shell.said(shell.recorder)
     goal, planned = [answer for answer in said if isinstance(answer, ControlInput)][-2:]
     assert isinstance(goal.given, GoalRequest)
-    assert isinstance(planned.given, Planned)
+    assert isinstance(planned.given, PreemptingMotion)
     assert planned.cycle == goal.cycle + 1
 
 

@@ -9,15 +9,15 @@ from rigs import Clock
 from trirail.processes.loop_death import LoopDeath
 from trirail.wire.goals import PoseGoal
 from trirail.wire.messages import Event
-from trirail.wire.packets import ControlInput, Farewell, GoalRequest, Happened, Status
+from trirail.wire.packets import ControlInput, EventReport, Farewell, GoalRequest, Status
 
 
 def request(goal_id: str) -> GoalRequest:
     return GoalRequest(1, "ann", goal_id, PoseGoal(0.0, 0.0, 0.0), 0)
 
 
-def ended(seq: int, goal_id: str) -> Happened:
-    return Happened(Event("goal", "info", "", id=goal_id, outcome="done", seq=seq, t=0.0, cycle=1, time=0.0))
+def ended(seq: int, goal_id: str) -> EventReport:
+    return EventReport(Event("goal", "info", "", id=goal_id, outcome="done", seq=seq, t=0.0, cycle=1, time=0.0))
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def ended(seq: int, goal_id: str) -> Happened:
 def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
     clock = Clock()
     words = LoopDeath(0.001, clock)
-    words.heard()
+    words.record_activity()
     words.follow(ended(7, "before"))
     words.follow(ControlInput(1, 3, 0, request("g-1")))
     clock.now += silent
@@ -44,14 +44,14 @@ def test_the_goal_under_way_is_faulted(silent: float, said: str) -> None:
 def test_a_slow_loop_is_not_taken_for_frozen() -> None:
     clock = Clock()
     words = LoopDeath(1.0, clock)
-    words.heard()
+    words.record_activity()
     clock.now += 1.0
     assert "has died" in str(words.reason)
 
 
 def test_nothing_is_added_to_an_end_as_it_should_be() -> None:
     words = LoopDeath(0.001)
-    words.heard()
+    words.record_activity()
     words.follow(request("g-1"))
     words.follow(Farewell())
     assert (words.reason, words.events(1)) == (None, [])
@@ -67,7 +67,7 @@ IDS = st.sampled_from("abcd")
 @given(st.lists(st.tuples(st.sampled_from(["asked", "under way", "ended"]), IDS)))
 def test_every_goal_ends_once(history: list[tuple[str, str]]) -> None:
     words = LoopDeath(0.001)
-    words.heard()
+    words.record_activity()
     begun: set[str] = set()
     over: set[str] = set()
     for what, name in history:

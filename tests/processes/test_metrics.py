@@ -28,19 +28,19 @@ from trirail.processes.child_process import MEASURED
 from trirail.processes.heartbeats import PROCESSES, Heartbeats
 from trirail.processes.metrics import MetricsServer, ServiceMetrics
 from trirail.processes.monitoring import (
-    KINDS_OF_FAULT,
+    MAX_FAULT_KINDS,
+    MAX_SILENCE_S,
     NOT_RUNNING,
     SETTLE_BOUNDS,
-    SILENT,
     Health,
     Histogram,
     Meter,
-    RecorderMeasured,
+    RecorderMeasurements,
     Running,
-    ServiceMeasured,
+    ServiceMeasurements,
 )
 from trirail.processes.publications import StateMaker
-from trirail.processes.zenoh_links import InUse
+from trirail.processes.zenoh_links import ResourceUse
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.records import DTYPE
 
@@ -57,7 +57,7 @@ class Told:
 
     def __init__(self) -> None:
         self.now = 0.0
-        self.measured: list[ServiceMeasured] = []
+        self.measured: list[ServiceMeasurements] = []
         self.meter = Meter(self.measured.append, lambda: self.now)  # type: ignore[arg-type]
         self._states = StateMaker(
             msgspec.structs.replace(CONFIG, outputs={"valve": Output("A", 16)}, inputs={"part": Input("B", 16)})
@@ -71,15 +71,15 @@ class Told:
         self._states.records(rows)
         self.meter.records(rows)
 
-    def newest(self) -> ServiceMeasured:
+    def newest(self) -> ServiceMeasurements:
         self.now += 1.0
-        self.meter.publish(self._states.newest, InUse(3, 512, 40, 1024), ())
+        self.meter.publish(self._states.newest, ResourceUse(3, 512, 40, 1024), ())
         return self.measured[-1]
 
 
 @given(st.lists(st.floats(0.0, 20.0)))
 def test_a_bucket_has_the_values_up_to_its_bound(values: list[float]) -> None:
-    histogram = Histogram.of(SETTLE_BOUNDS)
+    histogram = Histogram.empty(SETTLE_BOUNDS)
     histogram.add(np.array(values))
     for place, bound in enumerate(SETTLE_BOUNDS):
         assert sum(histogram.counts[: place + 1]) == sum(value <= bound for value in values)
@@ -95,7 +95,7 @@ def test_what_passes_the_gateway_is_counted() -> None:
     told.meter.event(event(3, kind="goal", id="c", outcome="done"))
     for seq in (4, 5):
         told.meter.event(event(seq, kind="fault", level="error", fault=FaultDetail("emcy", "B", 0x8700)))
-    text = exposed(told.newest(), RecorderMeasured(3, 20, 5))
+    text = exposed(told.newest(), RecorderMeasurements(3, 20, 5))
     assert 'trirail_mode{mode="moving"} 1.0' in text
     assert 'trirail_mode{mode="holding"} 0.0' in text
     assert "trirail_loop_missed_ticks_total 7.0" in text
@@ -124,10 +124,10 @@ def test_what_is_told_fits_into_a_pipe_at_once_and_loses_no_fault(faults: list[t
         told.meter.event(event(seq, kind="fault", fault=FaultDetail("following_error", drive, code)))
     newest = told.newest()
     assert sum(count.times for count in newest.faults) == len(faults)
-    assert len(newest.faults) <= KINDS_OF_FAULT + 1
+    assert len(newest.faults) <= MAX_FAULT_KINDS + 1
     # Twelve more digits in each of 39 buckets, as after years.
     assert len(msgspec.json.encode({MEASURED: newest})) + 39 * 12 <= select.PIPE_BUF
-    assert msgspec.convert(msgspec.to_builtins(newest), ServiceMeasured) == newest
+    assert msgspec.convert(msgspec.to_builtins(newest), ServiceMeasurements) == newest
 
 
 def health() -> tuple[Health, Heartbeats, list[float]]:
@@ -135,7 +135,7 @@ def health() -> tuple[Health, Heartbeats, list[float]]:
     return Health(hearts, CONFIG.period, TURN, lambda: now[0]), hearts, now
 
 
-def exposed(service: ServiceMeasured | None, recorder: RecorderMeasured | None) -> str:
+def exposed(service: ServiceMeasurements | None, recorder: RecorderMeasurements | None) -> str:
     """What Prometheus reads."""
     looked, _, _ = health()
     if service is not None:
@@ -158,7 +158,7 @@ def test_the_dashboard_shows_every_metric_and_no_other() -> None:
     told.rows()
     told.meter.event(event(1, kind="goal", id="a", outcome="done", settle=0.03))
     told.meter.event(event(2, kind="fault", fault=FaultDetail("bus")))
-    families = list(text_string_to_metric_families(exposed(told.newest(), RecorderMeasured(0, 0, 0))))
+    families = list(text_string_to_metric_families(exposed(told.newest(), RecorderMeasurements(0, 0, 0))))
     samples = {sample.name: family.name for family in families for sample in family.samples}
     dashboard = json.loads((SIM.parent / "grafana.json").read_text())
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
@@ -179,13 +179,13 @@ def test_a_frozen_process_is_told_by_its_name(name: str) -> None:
     for turn in range(100):
         for each in PROCESSES:
             if each != name or turn < 50:
-                hearts.of(each).beat()
+                hearts.heart(each).beat()
         now[0] += TURN
         looked.poll(ALL_UP)
         frozen_for = (turn - 49) * TURN
         if frozen_for <= 0.0:
             assert not any(looked.troubles().values())
-        elif frozen_for > SILENT + 2 * TURN:
+        elif frozen_for > MAX_SILENCE_S + 2 * TURN:
             assert {each for each, trouble in looked.troubles().items() if trouble} == {name}
             assert frozen_for < 5.0 or looked.troubles()[name] == "no sign of life"
 
@@ -204,7 +204,7 @@ def test_a_process_that_is_dead_or_starting_is_told_at_once(name: str) -> None:
 def test_a_supervisor_that_is_held_up_or_ending_is_told() -> None:
     looked, _, now = health()
     looked.poll(ALL_UP)
-    now[0] += SILENT + 0.1
+    now[0] += MAX_SILENCE_S + 0.1
     assert looked.troubles()["supervisor"] == "no sign of life"
     looked.poll(ALL_UP)
     assert not looked.troubles()["supervisor"]

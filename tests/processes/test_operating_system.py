@@ -42,12 +42,12 @@ def turns(watchdog: Watchdog, clock: Clock, seconds: float, *beating: str, of: H
     for _ in range(round(seconds / 0.1)):
         clock.now += 0.1
         for name in beating:
-            of.of(name).beat()
+            of.heart(name).beat()
         watchdog.feed()
 
 
 def watchdog_of(hearts: Heartbeats, clock: Clock, **environment: str) -> Watchdog:
-    return Watchdog([hearts.of(name) for name in WATCHED_BY_SYSTEMD], environment, clock)
+    return Watchdog([hearts.heart(name) for name in WATCHED_BY_SYSTEMD], environment, clock)
 
 
 def test_it_is_fed_several_times_within_its_time(told: socket.socket) -> None:

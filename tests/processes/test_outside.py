@@ -171,7 +171,7 @@ def test_a_stop_that_cannot_be_read_stops_the_robot_all_the_same(
     until(robot, lambda state: state.mode == "moving")
     ((found, message),) = asked(session, f"trirail/demo/cmd/eve/{name}", payload=payload, encoding=encoding)
     assert found == code
-    assert message.endswith(f"; the robot is told to {name} all the same")
+    assert message.endswith(f"; {name} takes effect nevertheless")
     assert goal.wait(WITHIN).outcome in ("stopped", "faulted")
     until(robot, lambda state: state.mode == {"stop": "holding", "quick_stop": "fault", "disable": "disabled"}[name])
     if name == "quick_stop":

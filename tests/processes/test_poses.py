@@ -29,7 +29,7 @@ from trirail.processes import poses
 from trirail.processes.gateway import ROUTES
 from trirail.processes.incoming import Incoming
 from trirail.processes.pose_file import NAME, PoseFile, state_directory
-from trirail.processes.poses import LOOK_EVERY, MOST, UNDER_WAY, Poses
+from trirail.processes.poses import CHECK_PERIOD_S, MAX_CHANGES_UNDER_WAY, MAX_TAUGHT_POSES, Poses
 from trirail.telemetry.provenance import toml
 from trirail.wire.goals import NamedGoal, OwnLimits, PoseGoal
 from trirail.wire.messages import ErrorReply, Notice
@@ -171,7 +171,7 @@ def test_poses_whose_file_goes_are_neither_silently_kept_nor_lost(acts: list[str
                     asked = Asked(CONFIG)
                     known = set() if gone else known
             for _ in range(2):
-                asked.now += LOOK_EVERY
+                asked.now += CHECK_PERIOD_S
                 before = [said for said in asked.told if said.kind == "service"]
                 was_told = bool(asked.poses.warnings())
                 asked.poses.poll()
@@ -283,17 +283,17 @@ def test_what_is_refused_at_once(make: Make, kind: str, name: str, content: byte
 
 def test_what_is_kept_and_what_is_under_way_is_bounded(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = make(CONFIG)
-    for number in range(UNDER_WAY):
+    for number in range(MAX_CHANGES_UNDER_WAY):
         asked.ask("teach", f"p{number}")
     with refused_as(RefusalCode.BUSY):
         asked.ask("teach", "pick")
-    monkeypatch.setattr(poses, "MOST", 2)
+    monkeypatch.setattr(poses, "MAX_TAUGHT_POSES", 2)
     full = make(CONFIG)
     for name in ("a", "b", "a"):
         full.teach(name)
     with refused_as(RefusalCode.BUSY):
         full.ask("teach", "c")
-    assert MOST == 1000
+    assert MAX_TAUGHT_POSES == 1000
 
 
 def test_a_goal_of_a_name_is_that_pose_with_all_that_it_asks_for(make: Make) -> None:
@@ -301,11 +301,13 @@ def test_a_goal_of_a_name_is_that_pose_with_all_that_it_asks_for(make: Make) -> 
     asked.teach("pick")
     limits = OwnLimits(velocity=(0.1, 0.1, 0.5))
     goal = NamedGoal("pick", id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01)
-    assert asked.poses.of_name(goal) == PoseGoal(*POSE, id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01)
-    assert asked.poses.of_name(NamedGoal("park")) == PoseGoal(0.0, 0.05, 0.0)
+    assert asked.poses.resolve_name(goal) == PoseGoal(
+        *POSE, id="g", speed=0.5, valid_for=2.0, limits=limits, blend=0.01
+    )
+    assert asked.poses.resolve_name(NamedGoal("park")) == PoseGoal(0.0, 0.05, 0.0)
     other = PoseGoal(0.0, 0.0, 0.0)
-    assert asked.poses.of_name(other) is other
-    assert asked.poses.of_name(NamedGoal("pikc")) == NamedGoal("pikc")
+    assert asked.poses.resolve_name(other) is other
+    assert asked.poses.resolve_name(NamedGoal("pikc")) == NamedGoal("pikc")
 
 
 def test_a_goal_of_a_name_that_there_is_not_ends_as_rejected_by_its_id(rig: Rig) -> None:
@@ -332,7 +334,7 @@ def test_what_cannot_be_read_ends_the_start(make: Make) -> None:
     folder = state_directory("demo")
     folder.mkdir()
     (folder / "poses.json").write_text('{"pick": [0.0, 0.0')
-    with pytest.raises(ServiceError, match=r"poses\.json: .*mend it, or move it away and teach the poses anew"):
+    with pytest.raises(ServiceError, match=r"poses\.json: .*mend it, or move it away and teach the poses again"):
         make(CONFIG)
 
 

@@ -31,7 +31,7 @@ from trirail.processes.ports import Ports
 from trirail.wire import links
 from trirail.wire.goals import Goal, MoveGoal, PoseGoal, TrackGoal, VelocityGoal
 from trirail.wire.links import Port
-from trirail.wire.packets import CommandRequest, GoalRequest, Happened, Kind, Request, decode_answer, message
+from trirail.wire.packets import CommandRequest, EventReport, GoalRequest, Kind, Request, decode_answer, message
 from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.records import DTYPE, unpack
 from trirail.wire.vocabulary import MODES, Command, Mode
@@ -126,7 +126,7 @@ class Session:
         while (packet := self.planner.receive()) is not None:
             self.planner.send(encode(self.motion.plan(decode_plan_request(packet))))
         if self.beats:
-            self.hearts.of("gateway").beat()
+            self.hearts.heart("gateway").beat()
         self.now_ns = max(self.now_ns, deadline_ns + self.late_ns)
         self.late_ns = 0
         self.pump()
@@ -163,7 +163,7 @@ class Session:
     def ask(self, request: Request) -> None:
         """Send a request; a stop with haste, as the gateway does."""
         hurries = isinstance(request, CommandRequest) and request.name.stops
-        with self.hearts.hurrying() if hurries else nullcontext():
+        with self.hearts.urgent_section() if hurries else nullcontext():
             self.gateway.send(message(request))
 
     def run(self, script: dict[int, list[Happening]], cycles: int = CYCLES) -> None:
@@ -190,7 +190,7 @@ def _comparable(packet: bytes) -> Iterator[object]:
         yield from (record.tobytes() for record in records)
     elif packet[0] == Kind.MESSAGE:
         said = decode_answer(packet[1:])
-        if isinstance(said, Happened):
+        if isinstance(said, EventReport):
             event = said.event
             yield event.seq, event.cycle, event.t, event.kind, CHANNEL.sub("can0", event.message), event.outcome
         else:

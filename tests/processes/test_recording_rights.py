@@ -28,7 +28,7 @@ def test_a_recording_and_its_folder_are_not_for_others(umask: int, tmp_path: Pat
     config = msgspec.structs.replace(CONFIG, telemetry=telemetry)
     ours, loops = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     loops.close()  # the loop has gone, so it ends at once
-    heart = Heartbeats.create().of("recorder")
+    heart = Heartbeats.create().heart("recorder")
     with ours:
         assert recording.main(config, None, PacketLink(ours), heart, lambda _: None, lambda _: None) == 0
     (file,) = (tmp_path / "new").glob("*.rrd")

@@ -9,11 +9,11 @@ from processes.test_gateway import Rig
 from processes.test_gateway import rig as rig  # noqa: PLC0414 - a fixture
 from refusals import uncoded
 from rigs import Clock
-from trirail.processes.zenoh_links import ASK_EVERY, PATIENCE, RouterLinks
+from trirail.processes.zenoh_links import DIAGNOSIS_PERIOD_S, ROUTER_GRACE_S, RouterLinks
 from trirail.wire.messages import Notice
 
 HUB = "tls/192.0.2.9:7447"
-DOWN = f"no link to the router {HUB}: connection refused; it is dialled again, local control goes on"
+DOWN = f"no link to the router {HUB}: connection refused; it is dialled again, local control continues"
 
 
 class Net:
@@ -41,7 +41,7 @@ class Net:
 
 def test_nothing_is_said_of_a_router_that_is_there_soon() -> None:
     net = Net()
-    net.wait(PATIENCE - 1)
+    net.wait(ROUTER_GRACE_S - 1)
     assert (net.told, net.links.warnings(), net.asked) == ([], (), 0)
     net.there = True
     net.wait(100)
@@ -54,7 +54,7 @@ def test_a_router_that_does_not_answer_is_told_once_and_warned_of_until_it_does(
     net.wait(100)
     assert uncoded(net.told) == [Notice("service", "warning", DOWN)]
     assert net.links.warnings() == (DOWN,)
-    assert net.asked <= 100 / ASK_EVERY + 1
+    assert net.asked <= 100 / DIAGNOSIS_PERIOD_S + 1
     net.there = True
     net.wait(2)
     assert uncoded(net.told[1:]) == [Notice("service", "info", f"linked to the router {HUB}")]
@@ -69,7 +69,7 @@ def test_a_link_that_is_lost_is_told_at_once_with_why() -> None:
     net.wait(3)
     assert uncoded(net.told[1:]) == [Notice("service", "warning", DOWN)]
     net.why = "the server's certificate has the name stray, expected hub"
-    net.wait(2 * ASK_EVERY)
+    net.wait(2 * DIAGNOSIS_PERIOD_S)
     assert net.links.warnings() == (DOWN.replace("connection refused", net.why),)
     assert len(net.told) == 2
 

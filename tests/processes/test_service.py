@@ -585,14 +585,14 @@ def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> 
             until(robot, lambda state: state.settled)
             far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
             assert far.returncode == 1
-            assert "unsettled: not in position 0.3 s after the end of its path; left to go: slider A " in far.stdout
+            assert "unsettled: not in position 0.3 s after the end of its path; residuals: slider A " in far.stdout
             said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
             assert (said["outcome"], said["settle"]) == ("unsettled", None)
             assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0
             assert until(robot, lambda state: state.mode == "holding").faults == ()
             until(robot, lambda state: state.settled)
             there = trirail("goto", 0.05, 0.0, 0.0, "--wait", locator=lagging.locator)
-            assert (there.returncode, "done: arrived, settled in 1 ms" in there.stdout) == (0, True)
+            assert (there.returncode, "done: arrived, settled after 1 ms" in there.stdout) == (0, True)
         assert lagging.end() == 0
         (file,) = (tmp_path / "recordings").glob("*.rrd")
         recording = read(file)
@@ -735,7 +735,7 @@ def test_a_planner_that_is_lost_costs_a_goal_and_no_more(service: Service, harm:
     assert service.end() == 0
     assert_stopped_smoothly(service.frames())
     log = service.log.read_text()
-    assert "the motion under way goes on, new goals are refused; starting it again" in log
+    assert "the motion under way continues, new goals are refused; starting it again" in log
     assert "Traceback" not in log
 
 
@@ -838,8 +838,8 @@ def test_killed_drives_are_a_fault_and_the_service_stays(service: Service) -> No
         (fault,) = state.faults
         assert re.fullmatch(r"CAN bus .* is down: cannot (send|receive): .*listening end( of the bus)? is gone", fault)
         service.wait_said(
-            "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
-            "service's next start"
+            "the simulated drives have died (killed by SIGKILL): the robot is in fault; restart the "
+            "service to restart them"
         )
         with pytest.raises(RefusedError) as refused:
             robot.reset()

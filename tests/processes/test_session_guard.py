@@ -35,7 +35,7 @@ from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.credentials import Admission, Credentials
 from trirail.wire.messages import Event, GoalReply
-from trirail.wire.packets import Accepted, Announcement, CommandRequest, Confirmed, GoalRequest, Request
+from trirail.wire.packets import Accepted, Announcement, CommandDone, CommandRequest, GoalRequest, Request
 from trirail.wire.records import DTYPE
 from trirail.wire.vocabulary import Command
 from waiting import WITHIN
@@ -52,7 +52,7 @@ class Loop:
         request = packets.decode_request(packet[1:])
         self.asked.append(request)
         if isinstance(request, CommandRequest):
-            self.answers.append(packets.message(Confirmed(request.ticket, request.name, "holding", 1)))
+            self.answers.append(packets.message(CommandDone(request.ticket, request.name, "holding", 1)))
         elif isinstance(request, GoalRequest):
             self.answers.append(packets.message(Accepted(request.ticket, GoalReply(request.id, 1.0))))
         return True
@@ -81,7 +81,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
                 gateway._poses.measure(STANDING)
                 gateway._poses.settle()
                 while loop.answers:
-                    gateway._hear(loop.answers.pop(0), lambda: None)
+                    gateway._handle_packet(loop.answers.pop(0), lambda: None)
 
         serving = threading.Thread(target=serve)
         serving.start()
@@ -155,7 +155,7 @@ def test_who_has_no_role_does_nothing_and_is_told(served: Served, name: str, doe
     with robot(served, name) as asking, pytest.raises(RefusedError) as caught:
         DOES[does](asking)
     assert caught.value.code is RefusalCode.NOT_ALLOWED
-    said = f"{name} has no role at demo: its [zenoh.users] does not name him, or he is revoked"
+    said = f"{name} has no role at demo: [zenoh.users] does not list this user, or it is revoked"
     assert str(caught.value) == said
 
 
@@ -264,7 +264,7 @@ def test_what_would_not_be_encrypted_takes_no_credentials(served: Served) -> Non
 
 def test_who_is_revoked_while_named_is_told_at_the_start(served: Served) -> None:
     guard = Guard(served[0])
-    assert guard.warnings() == ("gone is revoked and has no role; take him out of [zenoh.users]",)
+    assert guard.warnings() == ("gone is revoked and has no role; remove this user from [zenoh.users]",)
     assert guard.role("gone") is None
 
 
@@ -316,7 +316,10 @@ def test_a_gateway_that_is_started_again_has_the_certificates_and_roles_of_the_s
 def test_an_open_door_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     config = msgspec.structs.replace(CONFIG, zenoh=Zenoh(("tcp/0.0.0.0:7447",), insecure=True))
     (said,) = Guard(config).warnings()
-    assert said == "insecure: whoever reaches tcp/0.0.0.0:7447 can move the robot; trirail keys init makes certificates"
+    assert (
+        said
+        == "insecure: everyone who reaches tcp/0.0.0.0:7447 can move the robot; trirail keys init makes certificates"
+    )
     loop = {"lacking": [], "bus_load": 0.1}
     ready: dict[str, dict[str, Any]] = {
         "loop": loop,
@@ -383,7 +386,7 @@ def test_the_doctor_tells_who_can_reach_it(served: Served, tmp_path: Path) -> No
     assert said(tls, Guard(served[0])) == [
         open_to,
         ("users", "ok", "eva viewer, ann operator, max maintainer"),
-        ("certificates", "warning", "gone is revoked and has no role; take him out of [zenoh.users]"),
+        ("certificates", "warning", "gone is revoked and has no role; remove this user from [zenoh.users]"),
     ]
 
 

@@ -49,7 +49,7 @@ class Asked:
 
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_door, "PLACES", PLACES)
+    monkeypatch.setattr(stop_door, "MAX_CALLERS", PLACES)
 
 
 Opened = tuple[str, Asked]
@@ -81,7 +81,7 @@ def call(
 ) -> Outcome:
     """Ask once as a client does, and wait for what comes of it."""
     came: list[Outcome] = []
-    stop = StopOrder.of(of.get("robot", "demo"), user, name, content, WITHIN)
+    stop = StopOrder.create(of.get("robot", "demo"), user, name, content, WITHIN)
     credentials = None if shown is None else Credentials.read(shown)
     calling = stop.at_door(locator, credentials, came.append)
     assert calling is not None
@@ -197,7 +197,7 @@ def test_who_waits_for_his_answer_is_not_pushed_out_by_others(secured: Opened, t
     locator, asked = secured
     asked.held = []
     came: list[Outcome] = []
-    stop = StopOrder.of("demo", "ann", "stop", None, WITHIN)
+    stop = StopOrder.create("demo", "ann", "stop", None, WITHIN)
     waiting = stop.at_door(locator, Credentials.read(user(tmp_path, "ann")), came.append)
     assert isinstance(waiting, StopCall)
     with contextlib.ExitStack() as held:
@@ -205,7 +205,7 @@ def test_who_waits_for_his_answer_is_not_pushed_out_by_others(secured: Opened, t
             held.enter_context(connected(locator))
         eva = [
             stop.at_door(locator, Credentials.read(user(tmp_path, "eva")), came.append)
-            for stop in (StopOrder.of("demo", "eva", "stop", None, WITHIN) for _ in range(4))
+            for stop in (StopOrder.create("demo", "eva", "stop", None, WITHIN) for _ in range(4))
         ]
         while len({request.id for request in asked.requests}) < 5:
             assert not came
@@ -251,7 +251,7 @@ def test_nobody_asks_in_anothers_name_or_with_a_certificate_that_is_no_good(secu
     ]
     for credentials in unseen:
         came: list[Outcome] = []
-        calling = StopOrder.of("demo", "ann", "stop", None, 1.0).at_door(locator, credentials, came.append)
+        calling = StopOrder.create("demo", "ann", "stop", None, 1.0).at_door(locator, credentials, came.append)
         assert calling is not None
         calling.join()
         assert isinstance(came[0], ServiceError)

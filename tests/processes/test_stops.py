@@ -18,13 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trirail.errors import RefusalCode
 from trirail.processes.gateway import Gateway
-from trirail.processes.inbox import ALIKE
+from trirail.processes.inbox import MAX_MERGED_STOPS
 from trirail.processes.incoming import Incoming
-from trirail.processes.replies import REMEMBERED, Copies
+from trirail.processes.replies import REMEMBERED_S, Copies
 from trirail.processes.session_guard import Guard
 from trirail.wire import packets, zenoh_session
 from trirail.wire.messages import CommandReply, ErrorReply, GoalReply
-from trirail.wire.packets import Accepted, CommandRequest, Confirmed, GoalRequest, Refused
+from trirail.wire.packets import Accepted, CommandDone, CommandRequest, GoalRequest, Refused
 from trirail.wire.records import DTYPE
 from trirail.wire.stop_protocol import STOPS
 
@@ -95,7 +95,7 @@ class Played:
             )
             no = Refused(request.ticket, RefusalCode.NO_GOAL, "not under way")
             self._packets.append(
-                packets.message(Confirmed(request.ticket, request.name, "holding", 1) if under_way else no)
+                packets.message(CommandDone(request.ticket, request.name, "holding", 1) if under_way else no)
             )
         else:
             return True
@@ -121,7 +121,7 @@ class Played:
         for incoming in self._gateway._inbox.next_messages(at_most):
             self._gateway._handle(incoming)
             while self._packets:
-                self._gateway._hear(self._packets.pop(0), lambda: None)
+                self._gateway._handle_packet(self._packets.pop(0), lambda: None)
 
     def acted(self) -> list[int]:
         """The numbers of the stops but for copies of earlier ones."""
@@ -176,7 +176,7 @@ def test_only_what_is_alike_and_came_one_behind_the_other_is_carried_out_as_one(
     played = Played(opened, list(alone))
     for user in USERS:
         runs = [(key, len(list(same))) for key, same in itertools.groupby(step for step in alone if step.user == user)]
-        names = [name for (_, name, _, _), length in runs for _ in range(-(-length // ALIKE))]
+        names = [name for (_, name, _, _), length in runs for _ in range(-(-length // MAX_MERGED_STOPS))]
         assert [each.name for each in played.sent if isinstance(each, CommandRequest) and each.user == user] == names
 
 
@@ -231,6 +231,6 @@ def test_copies_are_forgotten_when_nobody_waits_for_them_any_more() -> None:
     copies = Copies(lambda: now)
     assert copies.first(stop("a"))
     assert not copies.first(stop("a"))
-    now = REMEMBERED
+    now = REMEMBERED_S
     assert copies.first(stop("b"))
     assert copies.first(stop("a"))

@@ -38,22 +38,22 @@ def freeze():
         time.sleep(0.1)
 
 def work(child):
-    name, heartbeats, ready = child.name, child.heartbeats, lambda: child.ready({{}})
+    name, heartbeats, ready = child.name, child.heartbeats, lambda: child.report_ready({{}})
     number = len(list(folder.glob(f"{{name}}-*.begun"))) + 1
     (folder / f"{{name}}-{{number}}.begun").touch()
 
     def beat_until(condition):
-        heartbeats.of(name).beat()
+        heartbeats.heart(name).beat()
         while not (condition() or never()):
             time.sleep(0.01)
-            heartbeats.of(name).beat()
+            heartbeats.heart(name).beat()
 
     def rest():
         if name != "drives":
-            heartbeats.of(name).rest()
+            heartbeats.heart(name).rest()
 
     def loop_gone():
-        return heartbeats.of("loop").count == 0 or never()
+        return heartbeats.heart("loop").count == 0 or never()
 
     exec((folder / f"{{name}}-{{number}}").read_text(), globals() | locals())
     return 0
@@ -63,7 +63,7 @@ TURNING = "ready(); beat_until(never)"
 RECORDING = "ready(); rest(); freeze()"
 HANGING = "ready(); beat_until(lambda: begun('up')); freeze()"
 SERVING = (
-    "ready(); beat_until(lambda: heartbeats.of('loop').count); (folder / 'serving.begun').touch(); "
+    "ready(); beat_until(lambda: heartbeats.heart('loop').count); (folder / 'serving.begun').touch(); "
     "beat_until(loop_gone)"
 )
 
@@ -124,7 +124,7 @@ def patient(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_hung_gateway_is_killed_and_started_again(run: Running) -> None:
     run.ends(
         1,
-        loop_1="ready(); beat_until(lambda: begun('gateway-2')); heartbeats.of('loop').rest()",
+        loop_1="ready(); beat_until(lambda: begun('gateway-2')); heartbeats.heart('loop').rest()",
         gateway_1=HANGING,
         gateway_2="ready()",
     )
@@ -139,7 +139,7 @@ def test_a_gateway_that_hangs_in_its_start_is_killed(run: Running, monkeypatch: 
     run.told = Told("up", 6.0, monkeypatch)
     run.ends(
         1,
-        loop_1="ready(); beat_until(lambda: begun('gateway-3')); heartbeats.of('loop').rest()",
+        loop_1="ready(); beat_until(lambda: begun('gateway-3')); heartbeats.heart('loop').rest()",
         gateway_1="ready(); beat_until(lambda: begun('up'))",
         gateway_2="freeze()",
         gateway_3="ready()",
@@ -161,7 +161,7 @@ def test_a_frozen_loop_ends_the_service(run: Running) -> None:
 @pytest.mark.parametrize(
     ("name", "silent", "consequence"),
     [
-        ("planner", 0.7, "the motion under way goes on, new goals are refused"),
+        ("planner", 0.7, "the motion under way continues, new goals are refused"),
         ("recorder", 5, "the robot is not affected"),
     ],
 )
@@ -169,7 +169,7 @@ def test_what_hangs_beside_the_loop_is_killed_and_started_again(
     name: str, silent: float, consequence: str, run: Running
 ) -> None:
     children = {
-        "loop_1": f"ready(); beat_until(lambda: begun('{name}-2')); heartbeats.of('loop').rest()",
+        "loop_1": f"ready(); beat_until(lambda: begun('{name}-2')); heartbeats.heart('loop').rest()",
         "gateway_1": SERVING,
         "recorder_1": RECORDING,
         f"{name}_1": HANGING,
@@ -188,9 +188,9 @@ def test_those_that_end_because_the_loop_ends_are_not_started_again(run: Running
     run.ends(
         1,
         loop_1="ready(); beat_until(lambda: begun('up') and begun('serving') and begun('recording')); "
-        "heartbeats.of(name).rest(); time.sleep(0.5)",
+        "heartbeats.heart(name).rest(); time.sleep(0.5)",
         gateway_1=SERVING,
-        recorder_1="ready(); beat = heartbeats.of('loop')\nwhile not beat.count: pass\n"
+        recorder_1="ready(); beat = heartbeats.heart('loop')\nwhile not beat.count: pass\n"
         "(folder / 'recording.begun').touch()\nwhile beat.count: pass",
     )
     assert run.told == [
@@ -209,10 +209,10 @@ def test_a_first_start_is_waited_for_as_long_as_it_compiles(run: Running, monkey
     run.told = Told("the first start", 3.0, monkeypatch)
     compiling = f"""
 for number in range({FUNCTIONS}):
-    child.compiling(f"f{{number}}")
+    child.report_compiling(f"f{{number}}")
     time.sleep(4.0 / {FUNCTIONS})
 """
-    end = "ready(); beat_until(lambda: begun('up')); heartbeats.of('loop').rest()"
+    end = "ready(); beat_until(lambda: begun('up')); heartbeats.heart('loop').rest()"
     run.ends(1, loop_1=compiling + end, gateway_1=SERVING)
     assert run.told[0].startswith(f"the first start compiles the mathematics, {FUNCTIONS} functions; once")
     assert run.told[1:4] == [f"compiling: {-(-FUNCTIONS * part // 4)} of {FUNCTIONS} functions" for part in (1, 2, 3)]
@@ -225,7 +225,7 @@ def test_the_terminals_interrupt_and_end_reach_no_child_not_even_one_that_is_sti
 ) -> None:
     """Ctrl-C, and its own end, go to all of the terminal's processes: the supervisor alone acts on it."""
     interrupted = f"os.kill(os.getpid(), signal.{sent}); ready(); "
-    turning = "beat_until(lambda: begun('up')); heartbeats.of('loop').rest()"
+    turning = "beat_until(lambda: begun('up')); heartbeats.heart('loop').rest()"
     run.ends(1, loop_1=interrupted + turning, gateway_1=interrupted + "freeze()")
     assert run.told[0] == "up"
 
@@ -258,7 +258,7 @@ def test_a_frozen_fork_server_ends_the_service_when_a_child_is_wanted(
     )
     assert run.told[:3] == [
         "up",
-        "the gateway has died (its parent does not say how): the loop stops the robot and holds; starting it again",
+        "the gateway has died (exit code unknown): the loop stops the robot and holds; starting it again",
         "the process that forks the others has died (no sign of life for 0.5 s, so it was killed): the loop stops the "
         "robot and disables the drives; ending",
     ]
@@ -268,14 +268,14 @@ def test_simulated_drives_that_die_are_told_and_come_back_with_the_next_service_
     """The loop has them in fault; those that would take their place would stand elsewhere, and not be set up."""
     run.ends(
         1,
-        loop_1="ready(); beat_until(lambda: begun('told-2')); heartbeats.of('loop').rest()",
+        loop_1="ready(); beat_until(lambda: begun('told-2')); heartbeats.heart('loop').rest()",
         gateway_1=SERVING,
         drives_1="ready()\nwhile not (begun('up') or never()): time.sleep(0.01)\nos.kill(os.getpid(), signal.SIGKILL)",
     )
     assert run.told[:2] == [
         "up",
-        "the simulated drives have died (killed by SIGKILL): the robot is in fault, and they come back with the "
-        "service's next start",
+        "the simulated drives have died (killed by SIGKILL): the robot is in fault; restart the "
+        "service to restart them",
     ]
     assert len(run.told) == 3, run.told
     assert not (run.folder / "drives-2.begun").exists()
@@ -295,7 +295,7 @@ def test_drives_that_end_since_the_loop_lets_go_of_them_are_not_told(run: Runnin
 
 def test_an_end_while_a_recorder_is_started_again_is_in_order(run: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor, "END_WITHIN", 5.0)  # it is given so long
-    stopping = "def end(*_): heartbeats.of('loop').rest(); os._exit(0)\nsignal.signal(signal.SIGTERM, end)\n"
+    stopping = "def end(*_): heartbeats.heart('loop').rest(); os._exit(0)\nsignal.signal(signal.SIGTERM, end)\n"
     run.ends(
         0,
         loop_1=f"{stopping}ready(); beat_until(lambda: begun('recorder-2')); os.kill({os.getpid()}, signal.SIGTERM); "
@@ -328,7 +328,7 @@ def test_of_a_start_that_fails_the_loops_reason_alone_is_said(other: str, is_rea
 
 def test_a_real_bus_has_no_process_of_drives(run: Running) -> None:
     on_a_bus = structs.replace(CONFIG, can=structs.replace(CONFIG.can, interface="socketcan", channel="can0"))
-    turning = "ready(); beat_until(lambda: begun('up')); heartbeats.of('loop').rest()"
+    turning = "ready(); beat_until(lambda: begun('up')); heartbeats.heart('loop').rest()"
     run.ends(1, on_a_bus, loop_1=turning, gateway_1=SERVING)
     assert run.told[0] == "up"
     assert not (run.folder / "drives-1.begun").exists()

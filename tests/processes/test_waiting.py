@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from trirail.processes.clock import SPARE_NS, Doors
+from trirail.processes.clock import SPARE_NS, PollSet
 from trirail.wire import links
 from trirail.wire.links import PacketLink, Port
 
@@ -37,7 +37,7 @@ def peers(ports: list[Port], tmp_path: Path) -> Iterator[list[PacketLink]]:
 
 def test_a_tick_is_waited_for_where_nobody_is_connected(ports: list[Port]) -> None:
     deadline = time.monotonic_ns() + SOON
-    assert not Doors(ports).wait(deadline)
+    assert not PollSet(ports).wait(deadline)
     assert time.monotonic_ns() >= deadline
 
 
@@ -46,21 +46,21 @@ def test_a_tick_is_waited_for_where_nobody_is_connected(ports: list[Port]) -> No
 def test_who_calls_or_goes_is_heard_long_before_the_tick(
     ports: list[Port], peers: list[PacketLink], place: int, gone: bool
 ) -> None:
-    doors, deadline = Doors(ports), time.monotonic_ns() + LATER
-    assert not doors.called()
+    poll_set, deadline = PollSet(ports), time.monotonic_ns() + LATER
+    assert not poll_set.called()
     if gone:
         peers[place].close()
     else:
         peers[place].send(b"now")
-    assert doors.called()
-    assert doors.wait(deadline)
+    assert poll_set.called()
+    assert poll_set.wait(deadline)
     assert time.monotonic_ns() < deadline
 
 
 def test_who_calls_too_late_does_not_delay_the_tick(ports: list[Port], peers: list[PacketLink]) -> None:
     peers[0].send(b"late")
     deadline = time.monotonic_ns() + SPARE_NS
-    assert not Doors(ports).wait(deadline)
+    assert not PollSet(ports).wait(deadline)
     assert time.monotonic_ns() >= deadline
 
 
@@ -70,7 +70,7 @@ def test_signals_do_not_make_a_tick_come_early(ports: list[Port]) -> None:
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001)
         deadline = time.monotonic_ns() + 4 * SOON
-        assert not Doors(ports).wait(deadline)
+        assert not PollSet(ports).wait(deadline)
         assert time.monotonic_ns() >= deadline
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)

@@ -19,7 +19,7 @@ from trirail.wire.packets import (
     GivenInput,
     GoalRequest,
 )
-from trirail.wire.plan_packets import Extended, NotPlanned, PackedPath, PackedRun, Planned
+from trirail.wire.plan_packets import NotPlanned, PackedPath, PackedRun, PathExtension, PreemptingMotion
 from trirail.wire.vocabulary import Command, Override
 
 TAUGHT = coded("pose", EventCode.POSE_REMOVED, pose="x", user="ann")
@@ -74,7 +74,7 @@ LINES: list[tuple[GivenInput, str]] = [
         '{"type":"CommandRequest","ticket":2,"user":"ann","name":"override","content":{"percent":50.0}}',
     ),
     (
-        Planned(
+        PreemptingMotion(
             1, 2, None, PackedRun(PATH, PATH, 1.0), GoalReply("", None, stops_first=True, lag=0.25), bound="slider A"
         ),
         '{"type":"Planned","number":1,"version":2,"first":null,'
@@ -82,7 +82,7 @@ LINES: list[tuple[GivenInput, str]] = [
         '"stops_first":true,"stop":null,"bound":"slider A","lag":0.25}',
     ),
     (
-        Extended(1, 2, 0.5, PATH, GoalReply("", None, 1.5, queued=True)),
+        PathExtension(1, 2, 0.5, PATH, GoalReply("", None, 1.5, queued=True)),
         '{"type":"Extended","number":1,"version":2,"s":0.5,"path":["YWJj","ZGVmZw==",false,""],"slowed":1.5}',
     ),
     (

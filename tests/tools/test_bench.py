@@ -95,7 +95,7 @@ def test_what_a_goal_changes_first_is_a_setpoint_after_it_with_another_feed_forw
     turn = Setpoint(1.0025, 0x302, -400)
     assert bench_latency.first_change([*before, rounding, turn], 1.001) == pytest.approx(0.0015)
     assert bench_latency.first_change([*before, rounding], 1.001) is None
-    late = turn._replace(t=1.001 + 2 * bench_latency.WITHIN)
+    late = turn._replace(t=1.001 + 2 * bench_latency.CHANGE_TIMEOUT_S)
     assert bench_latency.first_change([*before, late], 1.001) is None
 
 
@@ -117,7 +117,7 @@ def test_a_rate_that_is_not_kept_is_said_and_not_met() -> None:
     bare = bench_loop.together([(cycles, 1), (cycles, 0)])
     assert (bare["cycles"], bare["answers"], bare["missed"], bare["lost_by_the_machine"]) == (4, 10, 4, 1)
     assert bare["cycle"][-1] == 40.0
-    found = bench_loop.of_both({"rate_hz": 2000, "seconds": 1.0, "not_kept": "9 faults"}, bare)
+    found = bench_loop.with_ratios({"rate_hz": 2000, "seconds": 1.0, "not_kept": "9 faults"}, bare)
     assert "to_bare" not in found
     assert any("9 faults" in line for line in bench.lines({"rates": [found]}))
     rows = bench_aims.table({"loop": {"rates": [found]}})

@@ -85,7 +85,7 @@ def test_the_kinematics_alone() -> None:
 
 @pytest.mark.slow
 def test_move_and_wait(service: Service) -> None:
-    assert "done: arrived, settled in" in run("move_and_wait.py", "demo", service.locator)[-1]
+    assert "done: arrived, settled after" in run("move_and_wait.py", "demo", service.locator)[-1]
     assert pose(service) == pytest.approx((0.02, -0.01, 0.1), abs=1e-9)
 
 
@@ -161,7 +161,7 @@ def test_a_camera_is_followed(service: Service, tmp_path: Path) -> None:
 def test_a_file_is_followed(service: Service) -> None:
     lines = run("follow_a_file.py", EXAMPLES / "circle.csv", "demo", service.locator)
     assert lines[0] == "41 points in 4.0 s"
-    assert "done: arrived, settled in" in lines[1]
+    assert "done: arrived, settled after" in lines[1]
 
 
 @pytest.mark.slow

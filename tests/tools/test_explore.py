@@ -100,7 +100,7 @@ def test_exploring_draws_anew_by_its_seed_and_keeps_what_it_finds(folder: Path) 
 
 def test_what_was_found_is_told_with_the_line_that_keeps_it(folder: Path) -> None:
     assert pytest_in(folder, "--explore", "1", "--found", "found") == 1
-    found = Summary.of(told(folder))
+    found = Summary.from_lines(told(folder))
     assert found.tests == 3
     assert found.examples["test_some.py::test_drawn"] == 30
     assert found.findings["test_some.py::test_wrong"]["keep"] == "@example(\n    a=1000,\n    b=[],\n)"

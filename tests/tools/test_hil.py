@@ -177,7 +177,7 @@ def test_the_time_limit_says_what_was_heard_last() -> None:
 
     lines: queue.Queue[str | None] = queue.Queue()
     lines.put("the machine is up")
-    heard = hil_machine.heard(lines, 0.0)
+    heard = hil_machine.output_lines(lines, 0.0)
     assert next(heard) == "the machine is up"
     with pytest.raises(Failed, match="the machine is up"):
         next(heard)

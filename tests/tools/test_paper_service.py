@@ -13,7 +13,7 @@ import paper
 import paper_service
 import pytest
 from paper_motions import DURATION, EXAMPLES, QUANTITIES, Example, computed, greatest_difference, platform
-from paper_service import REACHED, driven, points
+from paper_service import REACHED_AFTER_CYCLES, driven, points
 from refusals import refused_as
 from trirail.client import own_service
 from trirail.config import SIM, load
@@ -46,7 +46,7 @@ def recording(example: Example, first: int = 40, lost: slice = slice(0, 0)) -> R
     span["mode"] = MODES.index(Mode.MOVING)
     span["progress"] = t / DURATION
     _, span["commanded_position"], span["commanded_velocity"], span["commanded_acceleration"] = computed(example, t)
-    records["position"][first + REACHED : first + n + REACHED] = span["commanded_position"]
+    records["position"][first + REACHED_AFTER_CYCLES : first + n + REACHED_AFTER_CYCLES] = span["commanded_position"]
     records = np.delete(records, lost)
     times = records["cycle"] * PERIOD
     events = [line(100 + first, "g")]
@@ -90,7 +90,7 @@ def test_the_cycle_that_takes_the_goal_is_one_period_into_it(rig: conftest.Rig, 
     assert rig.control.measured.record["progress"][0] == pytest.approx(PERIOD / DURATION)
     moving = 1
     measured, error = [rig.control.measured.feedback.position], [rig.control.measured.following_error]
-    for _ in range(round(DURATION / PERIOD) + REACHED):
+    for _ in range(round(DURATION / PERIOD) + REACHED_AFTER_CYCLES):
         rig.cycle()
         moving += rig.mode is Mode.MOVING
         measured.append(rig.control.measured.feedback.position)
@@ -100,8 +100,8 @@ def test_the_cycle_that_takes_the_goal_is_one_period_into_it(rig: conftest.Rig, 
     _, *exact = computed(example, np.arange(1.0, moving + 1.0) * PERIOD)
     for row, values in enumerate(exact):
         assert np.max(np.abs(setpoints[:, row] - values)) < BOUNDS[row]
-    behind = setpoints[:, 0] - np.array(measured)[REACHED : moving + REACHED]
-    assert np.array_equal(behind, np.array(error)[REACHED : moving + REACHED])
+    behind = setpoints[:, 0] - np.array(measured)[REACHED_AFTER_CYCLES : moving + REACHED_AFTER_CYCLES]
+    assert np.array_equal(behind, np.array(error)[REACHED_AFTER_CYCLES : moving + REACHED_AFTER_CYCLES])
 
 
 # ---------------------------------------------------------------------- in time

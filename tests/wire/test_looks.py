@@ -13,7 +13,7 @@ from trirail.errors import AlignmentFault, RefusalCode
 from trirail.wire import boundary
 from trirail.wire.looks import SUCCESSFUL_ENDS, AlignmentLook, LookEnd, SeenMark, alignment_event_text
 from trirail.wire.messages import Notice
-from trirail.wire.packets import Announcement, Happened, decode_answer, decode_request, event_packet, message
+from trirail.wire.packets import Announcement, EventReport, decode_answer, decode_request, event_packet, message
 from trirail.wire.sizes import MAX_MESSAGE, MAX_PACKET
 from wire.looks import LARGEST, looks
 from wire.looks import told as event
@@ -25,7 +25,7 @@ def test_a_look_is_read_as_it_was_said_and_goes_between_the_processes(look: Alig
         assert boundary.decode(boundary.encode(look, encoding), AlignmentLook, "no look", encoding) == look
     request = Announcement(Notice("alignment", "info", "so it looked", user="ann", alignment=look))
     assert decode_request(message(request)[1:]) == request
-    assert decode_answer(event_packet(event(1, look))[1:]) == Happened(event(1, look))
+    assert decode_answer(event_packet(event(1, look))[1:]) == EventReport(event(1, look))
 
 
 def test_the_largest_fits_into_a_message_and_a_packet() -> None:
@@ -33,7 +33,7 @@ def test_the_largest_fits_into_a_message_and_a_packet() -> None:
     text = alignment_event_text(LARGEST, "w" * 6000)
     notice = Notice("alignment", "warning", text.text, user="u" * 64, alignment=LARGEST, **text.fields)
     assert len(message(Announcement(notice))) <= MAX_PACKET
-    assert decode_answer(event_packet(event(1, LARGEST))[1:]) == Happened(event(1, LARGEST))
+    assert decode_answer(event_packet(event(1, LARGEST))[1:]) == EventReport(event(1, LARGEST))
 
 
 ONE = {"id": "a", "purpose": "check", "number": 1}

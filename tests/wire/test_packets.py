@@ -16,10 +16,10 @@ from trirail.wire.packets import (
     Answer,
     Checked,
     CheckRequest,
+    CommandDone,
     CommandRequest,
-    Confirmed,
+    EventReport,
     GoalRequest,
-    Happened,
     Kind,
     Refused,
     Request,
@@ -54,9 +54,9 @@ def test_requests(request_: Request) -> None:
     [
         Accepted(1, GoalReply("g", 0.5, queued=True)),
         Checked(1, GoalReply("", 0.5)),
-        Confirmed(2, Command.STOP, "holding", 1),
+        CommandDone(2, Command.STOP, "holding", 1),
         Refused(3, RefusalCode.OUT_OF_WORKSPACE, "no", "A", 0.4, 0.3),
-        Happened(Event("goal", "info", "goal g done", id="g", outcome="done", seq=1, t=0.5, cycle=500, time=1.0)),
+        EventReport(Event("goal", "info", "goal g done", id="g", outcome="done", seq=1, t=0.5, cycle=500, time=1.0)),
         Status("g", 1.0, None),
         Welcome(("SCHED_FIFO: no",), 0.75),
     ],
@@ -73,13 +73,13 @@ def an_event(text: str) -> Event:
 
 def test_an_event_is_told_whole_up_to_the_size_of_a_packet() -> None:
     """And what does not fit is cut, in each of its words: nobody is told less than to whom it belongs."""
-    room = MAX_PACKET - len(packets.message(Happened(an_event("x" * 60_000)))) + 60_000
+    room = MAX_PACKET - len(packets.message(EventReport(an_event("x" * 60_000)))) + 60_000
     whole = an_event("x" * room)
     packet = packets.event_packet(whole)
     assert len(packet) == MAX_PACKET
-    assert packets.decode_answer(packet[1:]) == Happened(whole)
+    assert packets.decode_answer(packet[1:]) == EventReport(whole)
     cut = packets.decode_answer(packets.event_packet(an_event("x" * (room + 1)))[1:])
-    assert isinstance(cut, Happened)
+    assert isinstance(cut, EventReport)
     assert cut.event.message == f"{'x' * 1000}… ({room + 1} characters)"
     assert structs.replace(cut.event, message="") == an_event("")
 
@@ -90,7 +90,7 @@ def test_whatever_is_long_in_an_event_is_cut() -> None:
     packet = packets.event_packet(event)
     assert len(packet) <= MAX_PACKET
     told = packets.decode_answer(packet[1:])
-    assert isinstance(told, Happened)
+    assert isinstance(told, EventReport)
     for said in (told.event.message, told.event.id, told.event.reason, told.event.goal, told.event.user):
         assert said is not None
         assert said.startswith("x" * 100)

@@ -1,4 +1,4 @@
-"""Lay a part right by two marks that one camera is moved to: python align_with_a_moved_camera.py [ROBOT [LOCATOR]]."""
+"""Align a part by two marks with one camera that is moved to each: python align_with_a_moved_camera.py [ROBOT …]."""
 
 import sys
 import tempfile
@@ -17,7 +17,7 @@ with Robot(*sys.argv[1:]) as robot:
     robot.enable()
     part = dict(STOPS)
 
-    def look() -> Marks:
+    def capture_marks() -> Marks:
         """Move the camera to each of its stops, and find the mark there: each stop is a view of its own."""
         seen: dict[str, Pair] = {}
         for name, stop in STOPS.items():
@@ -26,12 +26,12 @@ with Robot(*sys.argv[1:]) as robot:
             seen |= camera.pixels_at(robot.state().pose)
         return seen
 
-    targets = look()
+    targets = capture_marks()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "camera.json"
-        calibration_file.write(file, robot.name, robot.calibrate_camera(look), targets)
+        calibration_file.write(file, robot.name, robot.calibrate_camera(capture_marks), targets)
         kept = calibration_file.read(file)  # for every part from now on
     part = {"left": (-0.0496, 0.0), "right": (0.0504, 0.0003)}
-    result = robot.align(look, kept.targets, kept.calibration, tolerance=20e-6, angle=1e-3)
+    result = robot.align(capture_marks, kept.targets, kept.calibration, tolerance=20e-6, angle=1e-3)
     print(f"{result.why} after {len(result.corrections)}: {1e6 * result.measurements[-1].worst:.2f} µm to go")
     sys.exit(0 if result.reached else 1)

@@ -1,4 +1,4 @@
-"""Lay a part right by two marks that one camera sees, with asyncio: python align_with_one_camera.py [ROBOT …]."""
+"""Align a part by two marks in the picture of one camera, with asyncio: python align_with_one_camera.py [ROBOT …]."""
 
 import asyncio
 import sys
@@ -14,20 +14,22 @@ DISC = MarkShape("disc", 200e-6)
 
 
 async def main() -> int:
-    """Calibrate with the part as it belongs, lay another one right, and say what is left."""
+    """Calibrate with a part at its target, align another one, and print the remaining error."""
     async with AsyncRobot(*sys.argv[1:]) as robot:
         await robot.enable()
         part = {"a": (0.017, 0.01), "b": (0.023, 0.01)}
 
-        async def look() -> Marks:
-            """Return the pixels of both marks; a real camera takes its time, and is waited for."""
+        async def capture_marks() -> Marks:
+            """Return the pixels of both marks; with a real camera, await its picture."""
             marks = {name: DrawnMark(DISC, place) for name, place in part.items()}
             return SimulatedCamera(VIEW, marks).pixels_at((await robot.state()).pose)
 
-        targets = await look()
-        calibration = await robot.calibrate_camera(look, views={"a": "camera", "b": "camera"})  # one that sees both
+        targets = await capture_marks()
+        calibration = await robot.calibrate_camera(
+            capture_marks, views={"a": "camera", "b": "camera"}
+        )  # one that sees both
         part = {"a": (0.0173, 0.0102), "b": (0.0233, 0.0102)}
-        result = await robot.align(look, targets, calibration, tolerance=20e-6, angle=5e-3)
+        result = await robot.align(capture_marks, targets, calibration, tolerance=20e-6, angle=5e-3)
         print(f"{result.why} after {len(result.corrections)}: {1e6 * result.measurements[-1].worst:.2f} µm to go")
         return 0 if result.reached else 1
 

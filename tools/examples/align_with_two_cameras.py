@@ -1,4 +1,4 @@
-"""Lay a part right by a disc in each of two cameras, here simulated: python align_with_two_cameras.py [ROBOT …]."""
+"""Align a part by a disc in each of two simulated cameras: python align_with_two_cameras.py [ROBOT …]."""
 
 import sys
 
@@ -21,19 +21,19 @@ with Robot(*sys.argv[1:]) as robot:
     rng = np.random.default_rng()
     part = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
 
-    def look() -> Marks:
+    def capture_marks() -> Marks:
         """Take a picture with each camera, and find the disc in it."""
         pose, seen = robot.state().pose, {}
         for name, place in part.items():
             camera = SimulatedCamera(VIEWS[name], {name: DrawnMark(DISC, place)}, 1280, 960, noise=2.0)
-            if found := find(camera.picture(lambda _: pose, 0.0, rng), MarkShape("disc", 40.0)):
-                seen[name] = (found.u, found.v)
+            if spot := find(camera.picture(lambda _: pose, 0.0, rng), MarkShape("disc", 40.0)):
+                seen[name] = (spot.u, spot.v)
         return seen
 
-    targets = look()  # the part lies right: this is where its marks belong
-    calibration = robot.calibrate_camera(look)
+    targets = capture_marks()  # the part lies right: this is where its marks belong
+    calibration = robot.calibrate_camera(capture_marks)
     part = {"left": (-0.0597, 0.0001), "right": (0.0603, 0.0005)}  # the next part, 0.3 mm off and askew
-    result = robot.align(look, targets, calibration, tolerance=20e-6, angle=1e-3)
+    result = robot.align(capture_marks, targets, calibration, tolerance=20e-6, angle=1e-3)
     for measured in result.measurements:
         print(f"{1e6 * measured.worst:.2f} µm to go")
     sys.exit(0 if result.reached else 1)

@@ -15,18 +15,18 @@ def camera() -> Iterator[tuple[tuple[float, float, float], tuple[float, float, f
     """Yield pose and velocity of the target, and when that was, by this machine's wall clock."""
     begins = time.time()
     for n in range(round(RATE * SECONDS)):
-        taken = begins + n / RATE
-        time.sleep(max(0.0, taken - time.time()))
-        c, s = math.cos(TURN * (taken - begins)), math.sin(TURN * (taken - begins))
-        yield (RADIUS * c, RADIUS * s, 0.0), (-RADIUS * TURN * s, RADIUS * TURN * c, 0.0), taken
+        time_of_picture = begins + n / RATE
+        time.sleep(max(0.0, time_of_picture - time.time()))
+        c, s = math.cos(TURN * (time_of_picture - begins)), math.sin(TURN * (time_of_picture - begins))
+        yield (RADIUS * c, RADIUS * s, 0.0), (-RADIUS * TURN * s, RADIUS * TURN * c, 0.0), time_of_picture
 
 
 with Robot(*sys.argv[1:]) as robot:
     robot.enable()
     lags = []
     with robot.track() as track:  # when the updates cease, for whatever reason, the robot brakes on its path
-        for pose, velocity, taken in camera():
-            track.update(pose, velocity, taken)
+        for pose, velocity, time_of_picture in camera():
+            track.update(pose, velocity, time_of_picture)
             lags.append(track.lag or 0.0)
     print(f"{len(lags)} updates, at most {1e3 * max(lags[len(lags) // 4 :]):.2f} mm behind after the first second")
     print("stands at", *(f"{value:.4f}" for value in robot.state().pose))

@@ -10,7 +10,7 @@ from trirail import Robot
 
 V, W = 0.02, 0.2  # [m/s], [rad/s]
 KEYS = {"a": (-V, 0, 0), "d": (V, 0, 0), "s": (0, -V, 0), "w": (0, V, 0), "q": (0, 0, W), "e": (0, 0, -W)}
-HELD = 0.7  # a key that does not repeat within this time has been let go [s]; terminals begin after 0.3 to 0.6 s
+HELD = 0.7  # a key that does not repeat within this time has been released [s]; terminals begin after 0.3 to 0.6 s
 
 
 def key(within: float | None = None) -> str:

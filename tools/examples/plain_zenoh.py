@@ -26,13 +26,13 @@ def ask(key: str, content: object = None) -> dict[str, object]:
 
 
 with zenoh.open(settings) as session:
-    told: queue.Queue[dict[str, object]] = queue.Queue()
+    events: queue.Queue[dict[str, object]] = queue.Queue()
     heard = session.declare_subscriber(
-        f"trirail/{robot}/event", lambda sample: told.put(json.loads(sample.payload.to_string()))
+        f"trirail/{robot}/event", lambda sample: events.put(json.loads(sample.payload.to_string()))
     )
     print(ask("cmd/plain/enable"))
     goal = ask("goal/plain", {"kind": "pose", "x": 0.0, "y": 0.02, "phi": -0.1})
     print(goal)
-    while (event := told.get(timeout=30.0)).get("id") != goal["id"]:  # every goal's id ends in exactly one event
+    while (event := events.get(timeout=30.0)).get("id") != goal["id"]:  # every goal's id ends in exactly one event
         pass
     print(event["outcome"], event["message"])

@@ -6,7 +6,7 @@ from trirail import Robot
 
 CORNERS = [(0.03, 0.03), (-0.03, 0.03), (-0.03, -0.03), (0.03, -0.03), (0.03, 0.03)]
 ROUND = 0.008
-"""How near to a corner the next side begins [m]."""
+"""Distance from a corner at which the next side begins [m]."""
 
 with Robot(*sys.argv[1:]) as robot:
     robot.enable()

@@ -22,7 +22,7 @@ FIELDS = {f"field_{n}": float | None for n in range(20)}
 
 
 def decode_in_two_threads(prepared: bool) -> None:
-    """Decode a new type in two threads at once."""
+    """Decode a new type in two threads at the same time."""
     kind = msgspec.defstruct("Inner", FIELDS.items())
     outer = msgspec.defstruct("Outer", [("first", str), ("inner", kind)])
     content = msgspec.json.encode({"first": "", "inner": dict.fromkeys(reversed(FIELDS), 1.0)})
@@ -43,15 +43,15 @@ def decode_in_two_threads(prepared: bool) -> None:
 
 def ended(children: int, prepared: bool) -> Counter[int]:
     """Return how many children ended with each status, a signal's as a negative number."""
-    found: Counter[int] = Counter()
+    statuses: Counter[int] = Counter()
     for _ in range(children):
         child = os.fork()
         if child == 0:
             sys.setswitchinterval(1e-5)  # it happens without, too: now and then
             decode_in_two_threads(prepared)
             os._exit(0)
-        found[os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])] += 1
-    return found
+        statuses[os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])] += 1
+    return statuses
 
 
 if __name__ == "__main__":

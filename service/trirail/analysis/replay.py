@@ -33,7 +33,7 @@ from trirail_drivers.interface import (
 )
 
 from trirail.config import Config
-from trirail.control.control import Control, Given
+from trirail.control.control import Control, TimedInput
 from trirail.control.local_planner import LocalPlanner
 from trirail.errors import ServiceError
 from trirail.motion.motion_planner import MotionPlanner, revision
@@ -167,7 +167,7 @@ def _run_cycle(
     # Inputs that arrived while the loop waited for its tick were decided separately, after the others.
     for waiting in (False, True):
         received = [entry for entry in decided if entry.waiting is waiting]
-        batch: list[Given] = [(entry.given, entry.now_ns) for entry in received]  # type: ignore[misc]
+        batch: list[TimedInput] = [(entry.given, entry.now_ns) for entry in received]  # type: ignore[misc]
         if isinstance(planner, LocalPlanner):
             batch += [(answer, 0) for answer in planner.answers()]
         else:

@@ -1,7 +1,7 @@
-"""Alignments: the user's camera and a connection to the robot carry out the steps, and report looks to the service.
+"""Alignments: procedures carried out with the user's camera and a connection to the robot.
 
-Recordings, reports and panels get the looks from the service. A failed report never ends an alignment, but causes a
-single warning.
+Each look is reported to the service, for recordings, reports and panels. A failed report never ends an alignment, but
+causes a single warning.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ from trirail.wire.text import quoted
 
 T = TypeVar("T")
 Look = Callable[[], Marks | Awaitable[Marks]]
-"""Takes a picture, or one of each camera, and returns where it shows the marks, {name: (u, v)} [pixel]; in an event
-loop it may be a coroutine function."""
-NOTHING_SEEN = Observation({}, (0.0, 0.0, 0.0), 0.0)
+"""Function that takes a picture, or one per camera, and returns the marks in it, {name: (u, v)} [pixel]; for AsyncRobot
+it may be a coroutine function."""
+EMPTY_OBSERVATION = Observation({}, (0.0, 0.0, 0.0), 0.0)
 GOAL_WITHIN = 60.0
 """Longest time of one motion [s]."""
-STANDS = ("done", "unsettled")
-"""Outcomes with which the robot is at its target, or near it: the next look measures the distance."""
+ENDS_AT_TARGET = ("done", "unsettled")
+"""Outcomes after which the robot is at its target or near it; the next look measures the distance."""
 
 
-class SentMotion(Protocol):
-    """A goal of an alignment that the service has accepted: GoalHandle or AsyncGoalHandle."""
+class MotionHandle(Protocol):
+    """Handle of a goal that the service has accepted: GoalHandle or AsyncGoalHandle."""
 
     @property
     def result(self) -> Result | None:
         """Result of the goal; None before its end."""
 
     def wait(self, timeout: float | None = None) -> Result | Awaitable[Result]:
-        """Wait for its end."""
+        """Wait for the end of the goal."""
 
 
 class StageRobot(Protocol):
-    """Calls of a connection to the robot that an alignment needs: of Robot, or of AsyncRobot, which are awaited."""
+    """Calls of Robot or AsyncRobot that an alignment needs."""
 
-    def send(self, make: Goal, /) -> SentMotion | Awaitable[SentMotion]:
+    def send(self, make: Goal, /) -> MotionHandle | Awaitable[MotionHandle]:
         """Send a goal."""
 
     def stop(self) -> Awaitable[None] | None:
@@ -68,24 +68,24 @@ class StageRobot(Protocol):
 
 
 def drive(
-    robot: StageRobot, look: Look, wishes: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
+    robot: StageRobot, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
 ) -> T:
-    """Carry out the requests of a conversation by a robot that is called without an event loop; return its result.
+    """Carry out the requests of a procedure with a Robot; return the procedure's result.
 
-    Otherwise like drive_async; Ctrl-C stops the motion.
+    As `drive_async`, without an event loop. Ctrl-C stops the motion.
     """
 
-    def take_picture() -> Marks:
+    def call_look() -> Marks:
         seen = look()
         if inspect.isawaitable(seen):
             raise TypeError("look is a coroutine function: it is for AsyncRobot")
         return seen
 
-    return finish(drive_async(robot, take_picture, wishes, speed, wait, time.sleep))
+    return finish(drive_async(robot, call_look, requests, speed, wait, time.sleep))
 
 
 def finish(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Return the result of a coroutine that never suspends, since every call in it blocks."""
+    """Run a coroutine that never suspends, since every call in it blocks; return its result."""
     try:
         coroutine.send(None)
     except StopIteration as end:
@@ -97,30 +97,44 @@ def finish(coroutine: Coroutine[Any, Any, T]) -> T:
 async def drive_async(
     robot: StageRobot,
     look: Look,
-    wishes: Generator[AlignmentRequest, Observation, T],
+    requests: Generator[AlignmentRequest, Observation, T],
     speed: float,
     wait: float,
     sleep: Callable[[float], Awaitable[None] | None] = asyncio.sleep,
 ) -> T:
-    """Carry out the requests of a conversation, and return its result.
+    """Carry out the requests of a procedure, and return its result; cancellation stops the motion.
 
-    `wait` is the time that a camera needs after a motion until its picture is current [s]. An earlier end, such as
-    cancellation, stops the motion.
+    Parameters
+    ----------
+    requests
+        Procedure that yields requests for looks and motions, and receives observations.
+    speed
+        Fraction of full speed.
+    wait
+        Time after a motion until a picture of the camera is current [s].
+    sleep
+        Function that waits, in the event loop or without one.
 
-    Raises RefusedError where a motion is refused or does not reach its target, and the errors of `look`.
+    Raises
+    ------
+    RefusedError
+        If a motion is refused or does not reach its target.
+    Exception
+        Any error of `look`.
+
     """
     check_wait(wait)
-    sight = NOTHING_SEEN
+    sight = EMPTY_OBSERVATION
     reports = LookReports()
     ids = reports.goal_ids()
     try:
-        wish = next(wishes)
+        request = next(requests)
         while True:
-            if isinstance(wish, LookReport):
-                await _report(robot, reports, reports.message(wish))
+            if isinstance(request, LookReport):
+                await _report(robot, reports, reports.message(request))
             else:
-                if isinstance(wish, StageMotion):
-                    for goal in goals(wish, speed):
+                if isinstance(request, StageMotion):
+                    for goal in goals(request, speed):
                         await _move(robot, goal, next(ids))
                     await completed(sleep(wait))
                     marks = sight.marks
@@ -128,7 +142,7 @@ async def drive_async(
                     marks = await completed(look())
                 state = await completed(robot.state())
                 sight = Observation(marks, state.pose, time.monotonic(), state.sliders.position)
-            wish = wishes.send(sight)
+            request = requests.send(sight)
     except StopIteration as end:
         return cast(T, end.value)
     except BaseException as error:
@@ -137,7 +151,7 @@ async def drive_async(
 
 
 async def completed(called: Any) -> Any:
-    """Return the result of a call, awaited if it is of AsyncRobot."""
+    """Return the result of a call, awaiting it if needed."""
     return await called if inspect.isawaitable(called) else called
 
 
@@ -151,7 +165,7 @@ async def _report(robot: StageRobot, reports: LookReports, message: bytes | None
 
 
 async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
-    handle: SentMotion = await completed(robot.send(structs.replace(goal, id=goal_id)))
+    handle: MotionHandle = await completed(robot.send(structs.replace(goal, id=goal_id)))
     try:
         check(await completed(handle.wait(GOAL_WITHIN)))
     except BaseException:
@@ -161,7 +175,7 @@ async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
 
 
 def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
-    """Yield the goals of a motion: one, or with an approach one beyond its end first."""
+    """Yield the goals of a motion; with an approach, first one beyond its end."""
     by, tool, beyond = motion.by, motion.tool, motion.approach
     first = by if beyond is None else _sum(by, beyond)
     if tool is None:
@@ -173,8 +187,8 @@ def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
 
 
 def check(result: Result) -> None:
-    """Raise RefusedError for a motion after which the robot is not at its target."""
-    if result.outcome not in STANDS:
+    """Raise RefusedError if a motion has not reached its target."""
+    if result.outcome not in ENDS_AT_TARGET:
         raise RefusedError(RefusalCode.FAILED, f"a motion of the alignment ended {result.outcome}: {result.message}")
 
 
@@ -187,11 +201,11 @@ def _negative(a: Triple) -> Triple:
 
 
 class UnrecordedAlignmentWarning(UserWarning):
-    """The service did not accept the report of an alignment; recordings and panels lack it."""
+    """Warning that the service did not accept the report of an alignment, so that recordings lack it."""
 
 
 class LookReports:
-    """Messages of one alignment, and the ids of its goals, which begin with its own."""
+    """Builder of the messages of one alignment, and of the ids of its goals, which begin with its own."""
 
     def __init__(self) -> None:
         self.id = f"align-{uuid.uuid4().hex[:8]}"
@@ -202,11 +216,11 @@ class LookReports:
         self._lost = False
 
     def goal_ids(self) -> Iterator[str]:
-        """Yield the ids of its goals."""
+        """Yield the ids of the alignment's goals."""
         return (f"{self.id}-{number}" for number in self._goals)
 
     def message(self, report: LookReport) -> bytes | None:
-        """Return the message of a look; None where it cannot be encoded, or an earlier one was not accepted."""
+        """Return the message of a look; None if it cannot be encoded, or an earlier one was not accepted."""
         if self._last is None or self._last.purpose != report.purpose:
             self._number, self._began = 0, _time(report)
         self._number = max(1, self._number + (report.observation is not None))
@@ -218,7 +232,7 @@ class LookReports:
             return None
 
     def failure(self, error: BaseException) -> bytes | None:
-        """Return the message of an end by an error; None where the end was reported, or before the first look."""
+        """Return the message of an end by an error; None if the end has been reported, or before the first look."""
         if self._last is None or self._last.end is not None:
             return None
         return self.message(LookReport(self._last.purpose, end="failed", words=str(error) or type(error).__name__))

@@ -56,18 +56,18 @@ if TYPE_CHECKING:  # numpy, which most programs do without
     from trirail.client.alignment import Look
 
 REPORT_WITHIN = 2.0
-"""Longest time of the answer to the report of a look [s]."""
+"""Time-out of the answer to the report of a look [s]."""
 HOME_WITHIN = 600.0
 """Longest time of homing [s]: three drives with the greatest time-out."""
 T = TypeVar("T")
 
 
 class AsyncRobot:
-    """A connection to one robot's service while its context lasts; for the tasks of one event loop.
+    """Connection to one robot's service inside its context, for the tasks of one event loop.
 
-    Arguments, names and errors are those of trirail.client.client.Robot, whose calls wait in threads for these. A
-    cancelled call leaves nothing behind: a goal that was being sent is stopped if the service has taken it. A goal that
-    was accepted continues, even if nobody waits for it.
+    Arguments, names and errors are those of trirail.client.client.Robot, which wraps these calls for threads.
+    Cancelling a call that sends a goal stops that goal if the service has received it. An accepted goal continues, even
+    if no task waits for it.
     """
 
     def __init__(
@@ -291,12 +291,12 @@ class AsyncRobot:
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
         """Send a timed trajectory that begins at the robot's pose; see trirail.client.client.Robot.follow."""
-        meant = points_of(points)
+        trajectory = points_of(points)
         if go_there:
-            check_arrived(await (await self.send(first_pose(meant))).wait())
+            check_arrived(await (await self.send(first_pose(trajectory))).wait())
         return await self.send(
             lambda name: TrajectoryGoal(
-                meant, stretch=stretch, settle=settle, id=name, marks=marks_of(marks), stop_at=stop_at_of(stop_at)
+                trajectory, stretch=stretch, settle=settle, id=name, marks=marks_of(marks), stop_at=stop_at_of(stop_at)
             ),
             id,
         )
@@ -383,8 +383,8 @@ class AsyncRobot:
         """
         from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves
 
-        wishes = calibrate_by_moves(DEFAULT_MOVES if moves is None else moves, views, lens, centre, looks, approach)
-        return await self._converse(look, wishes, speed, wait)
+        requests = calibrate_by_moves(DEFAULT_MOVES if moves is None else moves, views, lens, centre, looks, approach)
+        return await self._converse(look, requests, speed, wait)
 
     async def align(
         self,
@@ -415,8 +415,8 @@ class AsyncRobot:
         def task(known: CameraCalibration) -> AlignmentTask:
             return AlignmentTask(known, targets, tolerance, angle, corrections, distance, looks, approach)
 
-        wishes = align(task(calibration)) if calibration is not None else calibrate_and_align(task, looks, approach)
-        return await self._converse(look, wishes, speed, wait)
+        requests = align(task(calibration)) if calibration is not None else calibrate_and_align(task, looks, approach)
+        return await self._converse(look, requests, speed, wait)
 
     async def calibrate_geometry(
         self,
@@ -451,12 +451,12 @@ class AsyncRobot:
         return await self._converse(look, calibrate_geometry(task), speed, wait)
 
     async def _converse(
-        self, look: Look, wishes: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
+        self, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
     ) -> T:
         """Carry out the requests of a conversation of trirail.alignment.procedure; return its result."""
         from trirail.client.alignment import drive_async
 
-        return await drive_async(self, look, wishes, speed, wait)
+        return await drive_async(self, look, requests, speed, wait)
 
     async def _report_look(self, look: bytes) -> None:
         """Report a look of an alignment to the service: a trirail.wire.looks.AlignmentLook as JSON."""

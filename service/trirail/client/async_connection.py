@@ -77,7 +77,7 @@ class AsyncConnection:
         Raises as `fetch`.
         """
         came: asyncio.Queue[Outcome] = asyncio.Queue()
-        stop = StopOrder.of(self._connection.robot, user, name, content, within)
+        stop = StopOrder.create(self._connection.robot, user, name, content, within)
         with self._connection.copies(stop, self._in_loop(came.put_nowait)) as outcomes:
             try:
                 while (reply := outcomes.decide(await came.get())) is None:
@@ -114,14 +114,14 @@ class AsyncConnection:
             newest.put_nowait(state)
 
         with self._connection.subscribe_to_states(self._in_loop(keep_newest)):
-            async for state in _until_silent(newest, timeout):
+            async for state in _items_until_timeout(newest, timeout):
                 yield state
 
     async def events(self, history: bool, timeout: float | None) -> AsyncGenerator[Event]:
         """Yield events in order, each once, with `history` past ones first; end after `timeout` seconds without one."""
         received: asyncio.Queue[Event] = asyncio.Queue()
         with self.subscribe_to_events(once(received.put_nowait), history=history):
-            async for event in _until_silent(received, timeout):
+            async for event in _items_until_timeout(received, timeout):
                 yield event
 
     def overtaken(self, state: State) -> bool:
@@ -159,7 +159,7 @@ class AsyncConnection:
         return deliver_in_loop
 
 
-async def _until_silent(received: asyncio.Queue[Item], timeout: float | None) -> AsyncGenerator[Item]:
+async def _items_until_timeout(received: asyncio.Queue[Item], timeout: float | None) -> AsyncGenerator[Item]:
     """Yield received items, until none arrives for `timeout` seconds."""
     while True:
         try:

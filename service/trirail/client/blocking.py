@@ -1,4 +1,4 @@
-"""An event loop in a thread of its own, and its goals, jogs, leases and tracks for callers that wait in threads."""
+"""Event loop in a thread of its own, with blocking goals, jogs, leases and tracks for other threads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Held = TypeVar("Held", bound=AsyncJog | AsyncLease | AsyncTrack)
 
 
 class LoopThread:
-    """An event loop in its own thread, which runs coroutines for any other thread."""
+    """Event loop in a thread of its own, which runs coroutines for other threads."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -94,7 +94,7 @@ class LoopThread:
 
 
 class GoalHandle:
-    """A goal that the service has accepted: this object only follows it."""
+    """Handle of a goal that the service has accepted; dropping the handle does not stop the goal."""
 
     def __init__(
         self, goal: AsyncGoalHandle, loop: LoopThread, command: Callable[[str, CommandContent], object]
@@ -115,7 +115,7 @@ class GoalHandle:
 
     @property
     def reply(self) -> GoalReply:
-        """Reply of the service."""
+        """Reply of the service to the goal."""
         return self._goal.reply
 
     @property
@@ -135,7 +135,7 @@ class GoalHandle:
         return self._goal.expected
 
     def cancel(self) -> None:
-        """Stop it, under way or waiting for another one; return when the robot is at rest, or it no longer waits.
+        """Stop this goal, whether it is under way or waits; return when the robot is at rest, or the goal has ended.
 
         Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
         ServiceError if nobody answers.
@@ -143,16 +143,16 @@ class GoalHandle:
         self._command(Command.STOP, Stop(self.id))
 
     def wait(self, timeout: float | None = None) -> Result:
-        """Wait for its end, however it ends; look at `outcome` of the result.
+        """Wait for the end of the goal and return its result, whose `outcome` tells success from failure.
 
-        Raises WaitTimeoutError, a TimeoutError, if that takes longer than `timeout` seconds; the goal itself continues.
+        Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
         """
         within = seconds(timeout)
         return self._goal.result or self._loop.call(self._goal.wait(within))
 
 
 class Blocking(Generic[Held]):
-    """A context of the event loop that any other thread can enter and leave; it waits meanwhile."""
+    """Context manager of the event loop that another thread can enter and leave, blocking meanwhile."""
 
     def __init__(self, held: Held, loop: LoopThread) -> None:
         self._held = held
@@ -167,12 +167,14 @@ class Blocking(Generic[Held]):
 
 
 class Jog(Blocking[AsyncJog]):
-    """A velocity that is kept alive while the context lasts; `result` is its end afterwards.
+    """Jog at a velocity inside the context; `result` is its result afterwards.
 
-    It is renewed three times in each time-out. A program that hangs or dies stops renewing it, and the robot brakes:
-    the time-out is real time, at every override. A jog that was paused or timed out has ended; begin a new one.
-    Entering the context raises RefusedError where the service refuses it, leaving it TimeoutError where its end is not
-    reported. Leaving brakes immediately and waits for the standstill.
+    The jog is renewed three times per time-out, which is real time at every override: if the program hangs or dies, the
+    robot brakes. A jog that was paused or has timed out has ended; begin a new one. Leaving the context brakes
+    immediately and waits for standstill.
+
+    Raises RefusedError on entering if the service refuses the jog, and TimeoutError on leaving if the service does not
+    report its end.
     """
 
     @property
@@ -192,11 +194,12 @@ class Jog(Blocking[AsyncJog]):
 
 
 class Lease(Blocking[AsyncLease]):
-    """The lease while the context lasts; `lost` is the error if it was taken over, released or timed out before.
+    """Lease held inside the context; `lost` is the error if it was taken over, released or timed out earlier.
 
-    Entering raises RefusedError where another holds it, and returns when the motions of others have stopped.
-    A program that hangs or dies gives no more signs of life: the robot stops and the lease is free. Leaving releases
-    it, and returns when the robot is at rest.
+    Entering returns when the motions of other users have stopped. If the program hangs or dies, the lease is not
+    renewed: the robot stops, and the lease is free. Leaving releases the lease, and returns when the robot is at rest.
+
+    Raises RefusedError on entering if another client holds the lease.
     """
 
     @property
@@ -205,7 +208,7 @@ class Lease(Blocking[AsyncLease]):
         return self._held.lost
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is lost, for `timeout` seconds at most; return whether it is."""
+        """Wait until the lease is lost, for at most `timeout` seconds; return whether it is."""
         return self._loop.call(self._held.wait(timeout))
 
     def __exit__(self, *_: object) -> None:
@@ -214,15 +217,14 @@ class Lease(Blocking[AsyncLease]):
 
 
 class Track(Blocking[AsyncTrack]):
-    """Updates of a target's pose, 10 to 200 times a second; the robot follows it.
+    """Sender of a target's pose, 10 to 200 times a second; the robot follows the target.
 
-    Only `update` sends anything: where its calls cease, for whatever reason, the robot brakes on its path after the
-    time-out.
+    Only `update` sends anything: if its calls cease for any reason, the robot brakes on its path after the time-out.
     """
 
     @property
     def id(self) -> str:
-        """Id of its goal."""
+        """Id of the track's goal."""
         return self._held.id
 
     @property

@@ -1,4 +1,4 @@
-"""File of a camera calibration: JSON, of a version, with its date, the robot, and the looks that made it."""
+"""File of a camera calibration, in JSON: version, date, robot, and the looks from which it was computed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def write(
     made: datetime | None = None,
     geometry: str = "",
 ) -> None:
-    """Write the file such that a power cut leaves the old or the new one. Raises FileError."""
+    """Write the file atomically, so that a power cut leaves the old or the new one. Raises FileError."""
     content = CalibrationFile(VERSION, robot, made or datetime.now(UTC), calibration, dict(targets), geometry)
     try:
         files.replace(path, msgspec.json.format(msgspec.json.encode(content)) + b"\n")
@@ -78,4 +78,4 @@ def read(path: Path) -> CalibrationFile:
         return decoded(text, CalibrationFile)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         problem = str(error).replace("`", "")
-        raise FileError(f"{path}: {problem}; make it anew with trirail align calibrate") from error
+        raise FileError(f"{path}: {problem}; create it again with trirail align calibrate") from error

@@ -117,7 +117,7 @@ def _iterator(
 def _conversation(
     method: Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot that looks and moves by one of AsyncRobot, with the looks in the caller's thread."""
+    """Return the method of Robot for a procedure of AsyncRobot, with the pictures taken in the caller's thread."""
 
     @functools.wraps(method)
     def converse(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -288,11 +288,11 @@ class Robot:
     # ------------------------------------------------------------------ inside
 
     async def _converse(
-        self, look: Look, wishes: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
+        self, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
     ) -> T:
-        """Carry out the requests of a trirail.alignment.procedure conversation in this thread; return its result."""
+        """Carry out the requests of a trirail.alignment procedure in this thread; return its result."""
         from trirail.client.alignment import drive
 
-        return drive(self, look, wishes, speed, wait)
+        return drive(self, look, requests, speed, wait)
 
     _report_look = _call(AsyncRobot._report_look)

@@ -35,24 +35,24 @@ POST_WITHIN = 2.0
 CLOSED = "the connection is closed: open a new one, as Robot(…)"
 ZENOHS_TIMEOUT = b"Timeout"
 """Answer of Zenoh itself to a query after its time-out."""
-OVERTAKEN_WITHIN = 1.0
+MAX_OVERTAKEN_S = 1.0
 """Longest delay of a state that an answer or an event has overtaken [s].
 
 States of a service that was restarted within it, and counts from one, are accepted after it.
 """
 
 T = TypeVar("T", bound=msgspec.Struct)
-Said = TypeVar("Said")
+Message = TypeVar("Message")
 
 
 class SilenceError(ServiceError):
-    """Error of a query that nobody has answered."""
+    """Error of a query without an answer."""
 
 
 class Connection:
-    """A session to the service of a robot at a Zenoh locator. Raises ServiceError where that cannot be reached.
+    """Session to the service of a robot at a Zenoh locator; its user, if given, is visible to others while it is open.
 
-    Its user, if given, is visible to all others while it lasts.
+    Raises ServiceError if the locator cannot be reached.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Connection:
                 answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
             except RefusedError as error:
                 return ServiceError(f"somebody answered at {self._connect}, but {error}")
-            return self._noted(answer)
+            return self._note_sequence(answer)
         content = reply.err.payload.to_bytes() if reply.err is not None else b""
         if content == ZENOHS_TIMEOUT:
             return ServiceError(
@@ -120,7 +120,7 @@ class Connection:
     @contextlib.contextmanager
     def copies(self, stop: StopOrder, deliver: Callable[[Outcome], None]) -> Iterator[Outcomes]:
         """Send all copies of a stop, and deliver the outcome of each, from any thread, until the context ends."""
-        at_door = stop.at_door(self._connect, self._credentials, lambda outcome: deliver(self._noted(outcome)))
+        at_door = stop.at_door(self._connect, self._credentials, lambda outcome: deliver(self._note_sequence(outcome)))
         try:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
             self._post(query, CommandReply, deliver)
@@ -149,7 +149,7 @@ class Connection:
                 answers.append(error)
 
         def on_end() -> None:
-            silent = SilenceError(self._silent("is its service running?"))
+            silent = SilenceError(self._no_answer_message("is its service running?"))
             deliver(answers[0] if answers else silent)
 
         handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
@@ -167,11 +167,13 @@ class Connection:
         may ask for its role: the answer, within ROLE_WITHIN, distinguishes the two.
         """
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
-            self._silent("is its service up, is the name right (--robot), is it linked to the router if this is one?")
+            self._no_answer_message(
+                "is its service up, is the name right (--robot), is it linked to the router if this is one?"
+            )
         )
 
-    def _silent(self, why: str) -> str:
-        """Return the message that nobody answers."""
+    def _no_answer_message(self, why: str) -> str:
+        """Return the message of a query without an answer."""
         if is_starting(self._connect):
             why = "the service there is starting; try again when it says that it is up"
         return f"no robot {self.robot!r} answers at {self._connect}: {why}"
@@ -180,18 +182,18 @@ class Connection:
         """Return the refusal if the user's role does not allow the key of these parts, else None."""
         needed = least_role(*parts)
         if role is None:
-            problem = f"{user} has no role at {self.robot}: its [zenoh.users] does not name him, or he is revoked"
+            problem = f"{user} has no role at {self.robot}: [zenoh.users] does not list this user, or it is revoked"
         elif not Role(role).includes(needed):
             problem = f"{user} is {role} at {self.robot}: {'/'.join(parts)} needs {needed}"
         else:
             return None
         return RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
-    # ------------------------------------------------------------------ hearing
+    # ------------------------------------------------------------------ subscriptions
 
     def overtaken(self, state: State) -> bool:
         """Whether a state is older than this client's newest answer or event."""
-        return state.seq < self._known[0] and not self._forgets()
+        return state.seq < self._known[0] and not self._known_is_old()
 
     def subscribe_to_states(self, deliver: Callable[[State], None]) -> zenoh.Subscriber[None]:
         """Deliver every state, until the subscriber's context ends."""
@@ -202,7 +204,7 @@ class Connection:
         return declare_advanced_subscriber(
             self.session,
             self.key("event"),
-            self._reader.messages(Event, lambda event: deliver(self._noted(event))),
+            self._reader.messages(Event, lambda event: deliver(self._note_sequence(event))),
             history=HistoryConfig(detect_late_publishers=True) if history else None,
             recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
@@ -222,19 +224,19 @@ class Connection:
             raise ServiceError(CLOSED)
         return self._opened
 
-    def _noted(self, said: Said) -> Said:
-        """Note the first state that reflects a message of the service; return the message."""
-        seq = said.seq if isinstance(said, CommandReply) else said.cycle if isinstance(said, Event) else 0
-        if seq and (seq > self._known[0] or self._forgets()):
+    def _note_sequence(self, message: Message) -> Message:
+        """Record the first state that reflects a message of the service; return the message."""
+        seq = message.seq if isinstance(message, CommandReply) else message.cycle if isinstance(message, Event) else 0
+        if seq and (seq > self._known[0] or self._known_is_old()):
             self._known = seq, time.monotonic()
-        return said
+        return message
 
-    def _forgets(self) -> bool:
-        return time.monotonic() - self._known[1] > OVERTAKEN_WITHIN
+    def _known_is_old(self) -> bool:
+        return time.monotonic() - self._known[1] > MAX_OVERTAKEN_S
 
 
 def _ignore(_reply: zenoh.Reply) -> None:
-    """Discard an answer for which nobody waits."""
+    """Discard an answer that is not needed."""
 
 
 def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
@@ -244,13 +246,13 @@ def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
     """
     last = 0, 0.0
 
-    def take_new(event: Event) -> None:
+    def deliver_new(event: Event) -> None:
         nonlocal last
         if event.seq > last[0] or event.time > last[1]:
             last = event.seq, event.time
             deliver(event)
 
-    return take_new
+    return deliver_new
 
 
 def robots_at(connect: str) -> list[str]:

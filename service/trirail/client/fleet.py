@@ -1,4 +1,4 @@
-"""All robots that a user may see at a locator, mostly a router: their newest summaries, and need for attention."""
+"""Fleet: all robots visible to a user at a locator, usually a router, with their newest summaries."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from trirail.wire.credentials import credentials_for
 from trirail.wire.state import RobotSummary
 from trirail.wire.vocabulary import Mode
 
-SILENT: Final = 3.0
-"""Age of the newest data of a robot's loop from which the robot is silent [s]: a summary arrives once a second.
+MAX_SILENCE_S: Final = 3.0
+"""Age of a robot's newest data above which the robot counts as silent [s]; a summary arrives once a second.
 
-Liveliness tokens outlive an unclean death, so they are not used.
+Zenoh's liveliness tokens are not used, since they outlive a killed process.
 """
 
 
 class Attention(IntEnum):
-    """Need of a robot for attention, the greatest first."""
+    """Need of a robot for attention, in falling order."""
 
     SILENT = 0
     FAULT = 1
@@ -33,20 +33,20 @@ class Attention(IntEnum):
 
 
 class Member(NamedTuple):
-    """A robot of the fleet."""
+    """Robot of the fleet."""
 
     robot: str
     summary: RobotSummary
     heard: float
-    """Time of its arrival, by the monotonic clock here [s]."""
+    """Arrival of the summary, on the monotonic clock of this machine [s]."""
 
     def age(self, now: float) -> float:
-        """Return the time since the last data of its loop [s]."""
+        """Return the age of the newest data of the robot's loop [s]."""
         return now - self.heard + self.summary.age
 
     def need(self, now: float) -> Attention:
-        """Return its need for attention."""
-        if self.age(now) > SILENT:
+        """Return the robot's need for attention."""
+        if self.age(now) > MAX_SILENCE_S:
             return Attention.SILENT
         return Attention.FAULT if self.summary.mode == Mode.FAULT else Attention.NOTHING
 

@@ -1,4 +1,4 @@
-"""Goals that the service has accepted, until their end, and jogs."""
+"""Handles of accepted goals, and jogs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from trirail.wire.vocabulary import Command, Stop
 
 STANDS_WITHIN = 10.0
 """Time that the end of a jog may take beyond its own time-out [s]."""
-LETTING_GO = 0.05
+BRAKE_RENEWAL_S = 0.05
 """Time-out of a jog's last renewal, whose velocity is zero [s]."""
 
 Velocity = tuple[float, float, float]
@@ -55,7 +55,7 @@ def result_of(event: Event) -> Result | None:
 
 
 class AsyncGoalHandle:
-    """A goal that the service has accepted: this object only follows it.
+    """Handle of a goal that the service has accepted; dropping the handle does not stop the goal.
 
     `command` sends a command with its content: AsyncRobot.command.
     """
@@ -63,7 +63,7 @@ class AsyncGoalHandle:
     def __init__(self, goal_id: str, command: Callable[[Command, bytes], Awaitable[object]]) -> None:
         self.id = goal_id
         self.reply = GoalReply(goal_id, 0.0)
-        """Reply of the service."""
+        """Reply of the service to the goal."""
         self._command = command
         self._result: Result | None = None
         self._ended = asyncio.Event()
@@ -90,7 +90,7 @@ class AsyncGoalHandle:
         return f"{self.duration:.2f} s" if self.duration is not None else "no expected end while the override is 0"
 
     async def cancel(self) -> None:
-        """Stop it, under way or waiting for another one; return when the robot is at rest, or it no longer waits.
+        """Stop this goal, whether it is under way or waits; return when the robot is at rest, or the goal has ended.
 
         Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
         ServiceError if nobody answers. Cancelling a task that waits for it does not stop it.
@@ -98,9 +98,9 @@ class AsyncGoalHandle:
         await self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
 
     async def wait(self, timeout: float | None = None) -> Result:
-        """Wait for its end, however it ends; look at `outcome` of the result.
+        """Wait for the end of the goal and return its result, whose `outcome` tells success from failure.
 
-        Raises WaitTimeoutError, a TimeoutError, if that takes longer than `timeout` seconds; the goal itself continues.
+        Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
         """
         within = seconds(timeout)
         with contextlib.suppress(TimeoutError):
@@ -111,13 +111,13 @@ class AsyncGoalHandle:
         return self._result
 
     def end(self, result: Result) -> None:
-        """Set its result, and release the waiting tasks."""
+        """Set the result, and wake the waiting tasks."""
         self._result = result
         self._ended.set()
 
 
 class OpenGoals:
-    """Handles of the goals that a client has sent and whose end has not been reported yet.
+    """Registry of the handles of goals that a client has sent and that have not ended yet.
 
     Calls with one id share one handle: renewals of a jog, and goals that the service refuses because their id has been
     used. A refusal concerns its own call alone, so a handle is kept while another call with its id is under way or has
@@ -134,12 +134,12 @@ class OpenGoals:
         return len(self._handles)
 
     def open(self, handle: AsyncGoalHandle) -> AsyncGoalHandle:
-        """Register a goal that is sent now; return its handle, an earlier one where its id has one."""
+        """Register a goal that is about to be sent; return its handle, or the existing one with the same id."""
         self._calls[handle.id] += 1
         return self._handles.setdefault(handle.id, handle)
 
     def accept(self, handle: AsyncGoalHandle, reply: GoalReply) -> None:
-        """Keep the handle of a goal until its end: the service has accepted it."""
+        """Keep the handle of an accepted goal until the goal ends."""
         handle.reply = reply
         self._end_call(handle.id)
         if self._handles.get(handle.id) is handle:  # else it has ended already
@@ -172,11 +172,19 @@ class OpenGoals:
 
 
 class AsyncJog:
-    """A velocity that is kept alive while the context lasts; `result` is its end afterwards.
+    """Jog at a velocity inside the context; `result` is its result afterwards.
 
-    A task renews it three times in each time-out; the rest is as for trirail.client.blocking.Jog. `velocity` is that of
-    x, y [m/s] and phi [rad/s] in the base frame, of a `tool`, `timeout` in seconds. `send` sends a goal with an id:
-    AsyncRobot.send.
+    A task renews the jog three times per time-out; see trirail.client.blocking.Jog.
+
+    Parameters
+    ----------
+    send
+        Function that sends a goal with an id: AsyncRobot.send.
+    velocity
+        Velocity of the tool: x, y [m/s] and phi [rad/s] in the base frame.
+    timeout
+        Time-out of the jog [s].
+
     """
 
     def __init__(
@@ -218,7 +226,7 @@ class AsyncJog:
             await self._renewing  # a renewal that has been sent is not cancelled
         if self._goal is not None and self.result is None and self.error is None:
             with contextlib.suppress(TrirailError):  # it has ended, or will by its time-out
-                await self._send((0.0, 0.0, 0.0), LETTING_GO)
+                await self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S)
             await self._goal.wait(self._timeout + STANDS_WITHIN)
 
     async def _send(self, velocity: Velocity, timeout: float) -> AsyncGoalHandle:

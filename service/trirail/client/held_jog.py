@@ -1,4 +1,4 @@
-"""A jog that an operator holds: it lasts while signs of the hand arrive, and ends when they cease."""
+"""Hold-to-run jog: it runs while the operator's key is held, and ends when key events cease."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import uuid
 from collections.abc import Callable
 
 from trirail.client.blocking import GoalHandle
-from trirail.client.goal import LETTING_GO, Velocity
+from trirail.client.goal import BRAKE_RENEWAL_S, Velocity
 from trirail.errors import RefusalCode, RefusedError, TrirailError
 from trirail.wire.goals import Goal, Tool, VelocityGoal
 
 TIMEOUT = 0.2
-"""Real time after which the service brakes a jog that is not renewed [s]."""
+"""Time-out after which the service brakes a jog that is not renewed [s]."""
 
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Speeds that an operator can choose: shares of the platform's velocity limits."""
@@ -22,12 +22,19 @@ USUAL = 3
 
 
 class HeldJog:
-    """Sender of a short velocity goal for each sign of the hand, in its own thread; the service is the dead man.
+    """Hold-to-run control: a thread sends a short velocity goal for each key event, and the service's time-out brakes.
 
-    Nothing is renewed without a sign: when the hand, the program or the network is gone, the service's own time-out
-    brakes. A sign that has waited for longer than that time-out is discarded. A jog that the service has refused or
-    ended (a stop, a limit, a goal of somebody else) does not begin again before the hand has released it; `ended` gets
-    the reason, in one line. `send` sends a goal with an id: Robot.send.
+    The jog is renewed only by key events: when the key, the program or the network fails, the time-out of the service
+    brakes. A key event older than that time-out is discarded. A jog that the service has refused or ended (a stop, a
+    limit, another user's goal) begins again only after a release.
+
+    Parameters
+    ----------
+    send
+        Function that sends a goal with an id, such as Robot.send.
+    ended
+        Called with the reason of the end, in one line.
+
     """
 
     def __init__(self, send: Callable[[Callable[[str], Goal], str], GoalHandle], ended: Callable[[str], None]) -> None:
@@ -46,13 +53,13 @@ class HeldJog:
         self._thread.start()
 
     def hold(self, velocity: Velocity, tool: Tool | None = None) -> None:
-        """Take a sign of the hand, with the velocity of the tool that it requests now."""
+        """Renew the jog by a key event, with the requested velocity of the tool."""
         with self._changed:
             self._sign = velocity, tool, time.monotonic()
             self._changed.notify()
 
     def release(self) -> None:
-        """End the jog on release by the hand: the robot brakes immediately, and the next sign begins a new jog."""
+        """End the jog on release: the robot brakes immediately, and the next key event begins a new jog."""
         with self._changed:
             self._sign, self._let_go = None, True
             self._changed.notify()
@@ -89,7 +96,7 @@ class HeldJog:
             self._goal = self._send(velocity, TIMEOUT)
         except RefusedError as refusal:
             begun = self._goal is not None and refusal.code in (RefusalCode.JOG_OVER, RefusalCode.DUPLICATE_ID)
-            self._end("the jog has ended: let go, then press again" if begun else str(refusal), refusal)
+            self._end("the jog has ended: release, then press again" if begun else str(refusal), refusal)
         except TrirailError as error:
             self._end(str(error), error)
 
@@ -97,7 +104,7 @@ class HeldJog:
         goal, self._goal, self._over = self._goal, None, False
         if goal is not None and goal.result is None:
             try:
-                self._send((0.0, 0.0, 0.0), LETTING_GO, goal.id)
+                self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S, goal.id)
             except TrirailError:
                 return  # it has ended, or will by its time-out
 

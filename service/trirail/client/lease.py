@@ -1,4 +1,4 @@
-"""The lease of a client: taken, kept by signs of life, and released."""
+"""Lease held by a client: acquired, renewed and released."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
 SIGNS = 4
-"""Signs of life in each time-out: all but one may be lost."""
+"""Number of renewals per time-out; all but one may be lost."""
 
 
 class AsyncLease:
-    """The lease while the context lasts, as trirail.client.blocking.Lease; a task sends the signs of life.
+    """Lease held inside the context, renewed by a task; as trirail.client.blocking.Lease.
 
-    If entering is cancelled no sign follows, and the lease ends by its time-out. `command` sends a command with its
+    If entering is cancelled, the lease is not renewed, and ends by its time-out. `command` sends a command with its
     content: AsyncRobot.command.
     """
 
@@ -38,7 +38,7 @@ class AsyncLease:
         """Error that ended the lease; None while it is held."""
 
     async def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is lost, for `timeout` seconds at most; return whether it is."""
+        """Wait until the lease is lost, for at most `timeout` seconds; return whether it is."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds(timeout)):
                 await self._over.wait()

@@ -1,4 +1,4 @@
-"""A stop by a program without a session: it does not wait for one, which a flooded port may not give."""
+"""Stop by a program without a session, which does not wait for a session: a flooded port may not accept one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trirail.wire.messages import CommandReply
 
 
 class NewStop:
-    """A stop, quick_stop or disable: requested at the door, while a session opens that requests it too.
+    """Stop, quick_stop or disable, requested at the door for stops and by a session that opens meanwhile.
 
     Raises as Robot does.
     """
@@ -26,16 +26,16 @@ class NewStop:
         self, name: str, robot: str | None = None, connect: str | None = None, tls: Path | str | None = None
     ) -> None:
         robot, connect, user, credentials = identity(robot, connect, None, tls)
-        stop = StopOrder.of(robot, user, name, None, REPLY_WITHIN)
+        stop = StopOrder.create(robot, user, name, None, REPLY_WITHIN)
         self._came: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
         at_door = stop.at_door(connect, credentials, self._came.put)
         self._outcomes = Outcomes(1 if at_door is None else 2)
         self.opening = threading.Thread(target=self._query, args=(stop, connect, credentials), daemon=True)
-        """Thread with its own session. Opening a session cannot be cancelled in Zenoh."""
+        """Thread with its own session, since opening a session cannot be cancelled in Zenoh."""
         self.opening.start()
 
     def wait(self) -> CommandReply:
-        """Return the first answer. Raises RefusedError for a refusal, ServiceError where nobody answers."""
+        """Return the first answer. Raises RefusedError for a refusal, ServiceError for no answer."""
         while (reply := self._outcomes.decide(self._came.get())) is None:
             pass
         return reply

@@ -1,4 +1,4 @@
-"""A service in its own process, for programs with their own service: started, waited for, and ended."""
+"""Private service in a process of its own, for demos, tools and tests: start, wait until it is up, end."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def start(
 
 
 def end(process: Process) -> int:
-    """Have a service stop the robot and end; return its exit code: 0 for a regular end.
+    """End a service, which first stops the robot; return its exit code, 0 for a regular end.
 
     Raises subprocess.TimeoutExpired if it has not ended within END_WITHIN seconds.
     """
@@ -102,17 +102,29 @@ def end(process: Process) -> int:
 
 
 def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
-    """Write the simulated robot's configuration for a service that nobody else can reach, nor see without a port.
+    """Write a configuration of the simulated robot for a service that no other program can reach.
 
-    It tolerates stalls of a second by a busy machine, since only simulated sliders move. Returns the file, in
-    `folder`, and the locator to connect to.
+    The time-outs tolerate a busy machine that stalls for a second, since only simulated sliders move.
+
+    Parameters
+    ----------
+    live_port
+        Port of the live view; 0 for none.
+
+    Returns
+    -------
+    path
+        Configuration file in `folder`.
+    locator
+        Zenoh locator of the service.
+
     """
     locator = f"unixsock-stream/{folder}/zenoh"
     text = SIM.read_text(encoding="utf-8")
     for key, value in ({"listen": f'["{locator}"]', "live_port": str(live_port)} | PATIENT).items():
-        text, found = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
-        if found != 1:
-            raise ServiceError(f"{SIM}: {key} was expected once, it is there {found} times")
+        text, count = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
+        if count != 1:
+            raise ServiceError(f"{SIM}: {key} was expected once, it is there {count} times")
     path = folder / SIM.name
     path.write_text(text, encoding="utf-8")
     return path, locator
@@ -122,11 +134,11 @@ def _wait(process: Process, ready: socket.socket, report_start: Callable[[str], 
     deadline = time.monotonic() + START_WITHIN
     while time.monotonic() < deadline:
         with contextlib.suppress(TimeoutError):
-            said = ready.recv(1024).decode()
-            if said == "READY=1":
+            notification = ready.recv(1024).decode()
+            if notification == "READY=1":
                 return
             deadline = time.monotonic() + START_WITHIN
-            report_start(said.partition("STATUS=")[2].partition("\n")[0])
+            report_start(notification.partition("STATUS=")[2].partition("\n")[0])
         if process.poll() is not None:
             raise ServiceError("the service could not start, see above")
     raise ServiceError(f"the service was not up within {START_WITHIN:g} s")

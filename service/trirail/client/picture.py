@@ -16,7 +16,7 @@ from trirail.wire.state import Info, State
 from trirail.workspace import part_positions
 from trirail.workspace.part_positions import RobotParts
 
-WIDTH = 360
+WIDTH_PX = 360
 """Width of the drawing [px]."""
 MARGIN = 0.08
 """Margin around the drawing, as a share of the robot's size."""
@@ -75,7 +75,8 @@ def drawing(robot: DrawnRobot, state: State) -> str:
         _disc(state.pose[:2], 2.5 * thin, palette.CENTRE),
     ]
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" width="{WIDTH}" height="{WIDTH * height / width:.0f}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" '
+        f'width="{WIDTH_PX}" height="{WIDTH_PX * height / width:.0f}" '
         f'viewBox="{left - edge:.6g} {-top - edge:.6g} {width:.6g} {height:.6g}">'
         f"<title>{escape(_pose(state.pose))}</title>"
         f'<g transform="scale(1 -1)" fill="none" stroke-linecap="round">{"".join(shapes)}</g></svg>'
@@ -88,12 +89,12 @@ def _pose(pose: Sequence[float]) -> str:
 
 
 def _lines(lines: Iterable[NDArray[np.float64]], colours: Sequence[Colour], width: float) -> list[str]:
-    found = []
+    shapes = []
     for points, colour in zip(lines, colours, strict=True):
         at = " ".join(f"{x:.6g},{y:.6g}" for x, y in points)
         pale = f' stroke-opacity="{colour[3] / 255.0:.2g}"' if len(colour) == 4 else ""
-        found.append(f'<polyline points="{at}" stroke="{palette.code(colour)}" stroke-width="{width:.3g}"{pale}/>')
-    return found
+        shapes.append(f'<polyline points="{at}" stroke="{palette.code(colour)}" stroke-width="{width:.3g}"{pale}/>')
+    return shapes
 
 
 def _disc(at: Sequence[float] | NDArray[np.float64], radius: float, colour: Colour) -> str:

@@ -1,4 +1,4 @@
-"""Reading of published samples by a client: invalid ones are skipped, counted, and reported once."""
+"""Decoding of published samples by a client: invalid samples are skipped, counted, and reported once."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _LOG = logging.getLogger("trirail")
 
 
 class SampleReader:
-    """Reader of samples for one client, by Zenoh's callbacks, each for one kind of content.
+    """Decoder of samples for one client; each of its callbacks for Zenoh is for one kind of content.
 
-    Anybody on the network may publish anything on any key: no content raises an error, in any thread.
+    Any program on the network may publish anything on any key, so that invalid content must never raise an error.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
-"""A stop requested in two ways in parallel: at the service's door for stops, and over Zenoh. The first answer counts.
+"""Stop requested in two ways in parallel, at the service's door for stops and over Zenoh; the first answer counts.
 
-Both copies have one id, by which the service carries them out once. A separate thread asks at the door, repeatedly if
-the door closes the connection without reading, as one under attack may.
+Both copies have the same id, so that the service carries out the stop once. A separate thread connects to the door,
+repeatedly if the door closes the connection without an answer, as it may under a flood.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ Outcome = CommandReply | TrirailError
 
 
 class NoDoorError(ServiceError):
-    """Error that nobody has answered at the door for stops."""
+    """Error of a stop that got no answer at the door for stops."""
 
 
 class StopOrder(NamedTuple):
-    """A stop, quick_stop or disable, with the content of each copy."""
+    """Stop, quick_stop or disable to send, with the content of each copy."""
 
     robot: str
     user: str
@@ -46,22 +46,22 @@ class StopOrder(NamedTuple):
     within: float
     """Time-out for carrying it out [s]."""
     id: str
-    """Id that its copies share, so that the service carries it out once."""
+    """Id shared by both copies, so that the service carries the stop out once."""
 
     @classmethod
-    def of(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> StopOrder:
+    def create(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> StopOrder:
         """Return a stop with a new id."""
         return cls(robot, user, name, content, within, uuid.uuid4().hex)
 
     @property
     def parts(self) -> tuple[str, str, str]:
-        """Parts of its key over Zenoh."""
+        """Parts of the key over Zenoh."""
         return "cmd", self.user, self.name
 
     def at_door(
         self, locator: str, credentials: Credentials | None, deliver: Callable[[Outcome], None]
     ) -> StopCall | None:
-        """Request it at the door beside a locator, and deliver the outcome; return None where there is no door."""
+        """Send the stop to the door beside a locator, and deliver the outcome; return None if there is no door."""
         address = stop_address(locator)
         content = (self.content or b"").decode()
         line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
@@ -71,16 +71,17 @@ class StopOrder(NamedTuple):
 
 
 class Outcomes:
-    """Outcomes of the copies of a stop, until they decide."""
+    """Collector of the outcomes of a stop's copies."""
 
     def __init__(self, copies: int) -> None:
         self._copies = copies
         self._errors: list[TrirailError] = []
 
     def decide(self, outcome: Outcome) -> CommandReply | None:
-        """Return the reply; None while another copy may have one. Raises RefusedError or ServiceError without a reply.
+        """Add an outcome; return the reply, or None while another copy may bring one.
 
-        A refusal as busy is not the robot's answer while another copy may have one.
+        Raises RefusedError or ServiceError if there is no reply. A refusal as busy does not decide while another copy
+        is pending.
         """
         if isinstance(outcome, CommandReply):
             return outcome
@@ -93,7 +94,7 @@ class Outcomes:
 
 
 class StopCall:
-    """A stop at the door beside a locator; `deliver` gets its outcome, once, from a thread of its own."""
+    """Stop at the door beside a locator, in a thread that delivers the outcome once."""
 
     def __init__(
         self,
@@ -113,11 +114,11 @@ class StopCall:
         self._thread.start()
 
     def join(self) -> None:
-        """Wait until its outcome has been delivered."""
+        """Wait until the outcome has been delivered."""
         self._thread.join()
 
     def cancel(self) -> None:
-        """Stop trying: nobody waits for it."""
+        """Stop trying to reach the door."""
         self._cancelled.set()
 
     def _run(self) -> None:
@@ -129,7 +130,7 @@ class StopCall:
             self._deliver(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
 
     def _query_until_answered(self) -> CommandReply:
-        """Ask until there is an answer. Raises RefusedError for a refusal, ServiceError where none arrives."""
+        """Send the request until there is an answer. Raises RefusedError for a refusal, ServiceError for no answer."""
         secured = tls.client(self._credentials) if self._address.secured and self._credentials is not None else None
         why: OSError | None = None
         while (left := self._deadline - time.monotonic()) > 0.0 and not self._cancelled.is_set():

@@ -1,4 +1,4 @@
-"""A moving target that the platform follows, on the side of the program that observes it."""
+"""Client side of tracking: updates of a moving target that the platform follows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Taker = Callable[[GoalReply | TrirailError], None]
 
 
 class AsyncTrack:
-    """Updates of a target's pose, 10 to 200 times a second; the robot follows it.
+    """Sender of a target's pose, 10 to 200 times a second; the robot follows the target.
 
     `begin` sends a goal and returns its handle once it is accepted: AsyncRobot.send; `post` sends one and returns
     immediately. Only `update` sends anything: if its calls cease, for whatever reason, the robot brakes on its path

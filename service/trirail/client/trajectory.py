@@ -22,37 +22,41 @@ from trirail.wire.text import quoted
 
 COLUMNS = ("t", "x", "y", "phi")
 Points = str | os.PathLike[str] | Iterable[TrajectoryPoint | Iterable[float]]
-MEANT = "TrajectoryPoints, rows of t [s], x, y [m], phi [rad], as an array (N, 4), or the path of a CSV or JSON file"
-FEWEST = 2
-"""Least number of points of a trajectory: the first is the robot's pose."""
+POINTS_FORMAT = (
+    "TrajectoryPoints, rows of t [s], x, y [m], phi [rad], as an array (N, 4), or the path of a CSV or JSON file"
+)
+MIN_POINTS = 2
+"""Least number of points of a trajectory; the first is the robot's pose."""
 prepare(list[TrajectoryPoint])
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
 
 
-def points_of(given: Points) -> tuple[TrajectoryPoint, ...]:
+def points_of(source: Points) -> tuple[TrajectoryPoint, ...]:
     """Return the points of a trajectory, given as points, rows of t [s], x, y [m], phi [rad], or the path of a file.
 
     Raises TrirailError for anything else.
     """
-    if isinstance(given, str | os.PathLike):
-        return tuple(read(Path(given)))
+    if isinstance(source, str | os.PathLike):
+        return tuple(read(Path(source)))
     try:
-        points = tuple(itertools.starmap(_point_of, enumerate(given)))
+        points = tuple(itertools.starmap(_point_of, enumerate(source)))
     except TypeError as error:
-        raise RefusedError(RefusalCode.MALFORMED, f"points: {quoted(repr(given))} is none of these: {MEANT}") from error
+        raise RefusedError(
+            RefusalCode.MALFORMED, f"points: {quoted(repr(source))} is none of these: {POINTS_FORMAT}"
+        ) from error
     if why := too_many(len(points)):
         raise RefusedError(RefusalCode.MALFORMED, f"points: {why}")
     return points
 
 
 def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint:
-    """Return a point, or that of a row. Raises TypeError if it is no row, RefusedError for a row of other values."""
+    """Return a point, or the point of a row. Raises TypeError if it is no row, RefusedError for invalid values."""
     if isinstance(row, TrajectoryPoint):  # its goal computes with its time
         return row if isinstance(row.t, float) else structs.replace(row, t=number(row.t, f"points: t of point {n}"))
     values = [] if isinstance(row, str | bytes | Mapping) else list(row)
     if len(values) != len(COLUMNS):
-        found = f"{len(values)} values" if values else quoted(repr(row))
-        raise RefusedError(RefusalCode.MALFORMED, f"points: row {n} is {found}; wanted are {MEANT}")
+        actual = f"{len(values)} values" if values else quoted(repr(row))
+        raise RefusedError(RefusalCode.MALFORMED, f"points: row {n} is {actual}; wanted are {POINTS_FORMAT}")
     t, x, y, phi = (number(value, f"points: {name} of row {n}") for name, value in zip(COLUMNS, values, strict=True))
     return TrajectoryPoint(t, x, y, phi)
 
@@ -60,13 +64,13 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
 def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
     """Return a function of an id that returns the goal to the first pose of a trajectory."""
     if not points:
-        raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; wanted are {MEANT}")
+        raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; wanted are {POINTS_FORMAT}")
     x, y, phi = points[0].x, points[0].y, points[0].phi
     return lambda name: PoseGoal(x=x, y=y, phi=phi, id=name)
 
 
 def check_arrived(result: Result) -> None:
-    """Raise RefusedError where the goal that led to a trajectory's first point was not done."""
+    """Raise RefusedError if the goal to a trajectory's first point was not done."""
     if result.outcome != "done":
         text = f"the robot is not at the first point of the trajectory, which was not sent: {result.message}"
         raise RefusedError(RefusalCode.WRONG_START, text)
@@ -81,8 +85,8 @@ def parse(name: Path | str, text: str) -> list[TrajectoryPoint]:
     """Return the points in the text of a file named .json, or otherwise for CSV. Raises TrirailError as `read`."""
     path = Path(name)
     points = _points(path, text)
-    if len(points) < FEWEST:
-        raise TrirailError(f"{path}: {'one point' if points else 'no points'}: a trajectory has {FEWEST} at least")
+    if len(points) < MIN_POINTS:
+        raise TrirailError(f"{path}: {'one point' if points else 'no points'}: a trajectory has {MIN_POINTS} at least")
     if why := too_many(len(points)):
         raise TrirailError(f"{path}: {why}")
     return points

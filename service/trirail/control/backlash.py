@@ -1,11 +1,11 @@
-"""Compensation of backlash where a slider reverses; compiled, one cycle at a time.
+"""Backlash compensation when a slider reverses; compiled, one cycle at a time.
 
-A slider with backlash lags its motor by half the width. The setpoints are therefore the sliders' positions plus an
-offset of half a width in the direction in which the slider last moved, and a slider's position is the drive's
-measurement less the offset. The offset changes sides by trirail.motion.backlash_reserve, one change at a time: a slider
-that reverses again during a change waits for its end, and after two reversals it goes to the other side first, since it
-may have been left anywhere in its backlash. While the last direction of a slider is unknown, as after power-on, its
-offset is zero.
+A slider with backlash lags its motor by half the backlash. The setpoint of a drive is therefore the slider's position
+plus half the backlash in the direction of the last motion, and the slider's position is the drive's measurement less
+that offset. The offset changes sides over the time given by trirail.motion.backlash_reserve. Only one change runs at a
+time: a slider that reverses during a change waits for its end. After two reversals during a change the offset first
+goes to the other side, since the slider may be anywhere in its backlash. While the last direction of a slider is
+unknown, as after power-on, its offset is zero.
 """
 
 from __future__ import annotations
@@ -19,57 +19,75 @@ from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
 from trirail.motion.backlash_reserve import TakeUp
 
-__all__ = ["BACKLASH", "KEPT", "TURNS", "add_offset", "backlash", "due_offset", "keep_offset", "let_go", "taking_up"]
+__all__ = [
+    "BACKLASH",
+    "MIN_REVERSAL_M",
+    "OFFSETS_KEPT",
+    "add_offset",
+    "backlash",
+    "due_offset",
+    "keep_offset",
+    "release_offsets",
+    "taking_up",
+]
 
-TURNS = 5e-7
-"""Least distance of a reversal [m]: compensating less has no benefit, and wears the drive."""
-KEPT = 5
-"""Number of newest setpoints whose offsets are kept, for trirail.control.feedback."""
+MIN_REVERSAL_M = 5e-7
+"""Shortest motion that counts as a reversal [m]: compensating shorter ones has no benefit, and wears the drive."""
+OFFSETS_KEPT = 5
+"""Number of past setpoints whose offsets are kept, for trirail.control.feedback."""
 
 BACKLASH = np.dtype(
     [
         ("half", "<f8", 3),  # of the backlash [m]
-        ("step", "<f8"),  # share of the take-up that is done in a cycle; zero without backlash
+        ("step", "<f8"),  # share of a change per cycle; zero without backlash
         ("period", "<f8"),  # of a cycle [s]
         ("offset", "<f8", 3),  # in the newest setpoints [m]
-        ("begin", "<f8", 3),  # offset at the begin and at the end of the change [m]
+        ("begin", "<f8", 3),  # offset at the beginning and at the end of the change [m]
         ("end", "<f8", 3),
         ("done", "<f8", 3),  # share of the change that is done; one when complete
         ("turns", "<i8", 3),  # reversals of a slider since the change began
         ("heading", "<f8", 3),  # direction in which a slider last moved: 1 or -1; 0 while unknown
         ("farthest", "<f8", 3),  # farthest position in that direction [m]; NaN before the first command
-        ("offsets", "<f8", (KEPT, 3)),  # in the setpoints of the cycles before, the newest last
+        ("offsets", "<f8", (OFFSETS_KEPT, 3)),  # in the setpoints of the cycles before, the newest last
     ],
     align=True,
 )
 """State of the compensation between cycles, for compiled code."""
 
 
-def backlash(taken: TakeUp, period: float) -> NDArray[np.void]:
-    """Return the state, (2,): the current one, and the tried one."""
-    kept = np.zeros(2, BACKLASH)
-    kept["half"] = np.array(taken.widths) / 2.0
-    kept["step"] = 1.0 / math.ceil(taken.duration / period) if taken.duration > 0.0 else 0.0
-    kept["period"] = period
-    kept["done"], kept["farthest"] = 1.0, math.nan
-    return kept
+def backlash(take_up: TakeUp, period: float) -> NDArray[np.void]:
+    """Return the initial state, (2,): the current one, and room for a tentative one."""
+    state = np.zeros(2, BACKLASH)
+    state["half"] = np.array(take_up.widths) / 2.0
+    state["step"] = 1.0 / math.ceil(take_up.duration / period) if take_up.duration > 0.0 else 0.0
+    state["period"] = period
+    state["done"], state["farthest"] = 1.0, math.nan
+    return state
 
 
 @compiled()
-def add_offset(kept: NDArray[np.void], sliders: Array) -> None:
-    """Add to solved sliders (6, 3), rows lambda_10, v_10, gamma_10, the offset of the next cycle; write it to kept[1].
+def add_offset(states: NDArray[np.void], sliders: Array) -> None:
+    """Add the offset of the next cycle to solved sliders, and write the new state to states[1].
 
-    Another call without `kept[0] = kept[1]` in between begins from the same state.
+    The caller accepts the setpoints by `states[0] = states[1]`; without that, the next call begins from the same state.
+
+    Parameters
+    ----------
+    states : (2,)
+        Current and tentative state, of BACKLASH.
+    sliders : (6, 3)
+        Rows lambda_10, v_10, gamma_10, then those of the cross slides.
+
     """
-    if kept[0].step == 0.0:
+    if states[0].step == 0.0:
         return
-    kept[1] = kept[0]
-    tried = kept[1]
+    states[1] = states[0]
+    tried = states[1]
     for i in range(3):
         place, heading, farthest = sliders[0, i], tried.heading[i], tried.farthest[i]
         if math.isnan(farthest) or (heading != 0.0 and (place - farthest) * heading >= 0.0):
             tried.farthest[i] = place
-        elif abs(place - farthest) > TURNS:
+        elif abs(place - farthest) > MIN_REVERSAL_M:
             tried.heading[i] = math.copysign(1.0, place - farthest)
             tried.farthest[i] = place
             tried.turns[i] += 1
@@ -87,30 +105,30 @@ def add_offset(kept: NDArray[np.void], sliders: Array) -> None:
 
 
 @compiled()
-def taking_up(kept: NDArray[np.void]) -> bool:
-    """Whether backlash of any slider is being taken up."""
-    least: float = min(kept[0].done[0], kept[0].done[1], kept[0].done[2])
+def taking_up(states: NDArray[np.void]) -> bool:
+    """Return whether the offset of any slider is changing."""
+    least: float = min(states[0].done[0], states[0].done[1], states[0].done[2])
     return least < 1.0
 
 
 @compiled()
-def keep_offset(kept: NDArray[np.void]) -> None:
-    """Keep the offset of the setpoints that were written in the previous cycle."""
-    kept[0].offsets[:-1] = kept[0].offsets[1:]
-    kept[0].offsets[-1] = kept[0].offset
+def keep_offset(states: NDArray[np.void]) -> None:
+    """Append the offset of the setpoints of the previous cycle to the past offsets."""
+    states[0].offsets[:-1] = states[0].offsets[1:]
+    states[0].offsets[-1] = states[0].offset
 
 
 @compiled()
-def due_offset(kept: NDArray[np.void], age: int, i: int) -> float:
-    """Return the offset [m] in the setpoint that slider i was due at when measured, `age` SYNCs ago."""
-    due: float = kept[0].offsets[KEPT - 2 - age, i]
+def due_offset(states: NDArray[np.void], age: int, i: int) -> float:
+    """Return the offset [m] in the setpoint that was in force for slider i when it was measured, `age` SYNCs ago."""
+    due: float = states[0].offsets[OFFSETS_KEPT - 2 - age, i]
     return due
 
 
 @compiled()
-def let_go(kept: NDArray[np.void]) -> None:
-    """Freeze the offsets while the sliders move freely, so that nothing moves when they are held again."""
+def release_offsets(states: NDArray[np.void]) -> None:
+    """Freeze the offsets while the sliders move freely, so that holding them again causes no motion."""
     for i in range(3):
-        if kept[0].done[i] < 1.0:
-            kept[0].end[i], kept[0].done[i], kept[0].heading[i] = kept[0].offset[i], 1.0, 0.0
-        kept[0].farthest[i], kept[0].turns[i] = math.nan, 0
+        if states[0].done[i] < 1.0:
+            states[0].end[i], states[0].done[i], states[0].heading[i] = states[0].offset[i], 1.0, 0.0
+        states[0].farthest[i], states[0].turns[i] = math.nan, 0

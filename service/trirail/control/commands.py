@@ -1,4 +1,4 @@
-"""Commands of clients: the check before each, its effect, and the rule of its completion."""
+"""Commands of clients: the check before each one, its effect, and the rule for its completion."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 from trirail_drivers.interface import NAMES, PowerState
 
 from trirail.config import Config
-from trirail.control.feedback import CAN_MOVE, Measured
+from trirail.control.feedback import CAN_MOVE, MeasuredState
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter, LeaseChange
 from trirail.control.ledger import Ledger
@@ -27,22 +27,22 @@ _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
 class CommandProgress(NamedTuple):
-    """State by which a rule judges a command."""
+    """State of the robot by which a rule decides whether a command is complete."""
 
     mode: Mode
     latched: str | None
-    """Reason of the fault, if there is one."""
-    measured: Measured
+    """Reason of the latched fault, if any."""
+    measured: MeasuredState
     settled: bool
-    """Whether the time that the drives may take to leave their fault state has elapsed."""
+    """Whether the drives have had enough time to leave their fault state."""
 
 
 Rule = Callable[[CommandProgress], str | None]
-"""Returns "" when a command is carried out, None while it is not, else the reason why it never will be."""
+"""Function that returns "" for a completed command, None for one in progress, else the reason of its failure."""
 
 
-def at_once(_: CommandProgress) -> str:
-    """Return "": complete on arrival."""
+def completed_on_arrival(_: CommandProgress) -> str:
+    """Return "": the command is complete on arrival."""
     return ""
 
 
@@ -83,24 +83,24 @@ def cleared(now: CommandProgress) -> str | None:
 
 
 def _timed_out(now: CommandProgress) -> str:
-    """Return the message of a drive that has not obeyed in time; else ""."""
+    """Return the message of a drive that has timed out; else ""."""
     fault = now.measured.feedback.fault
     return fault.message if fault is not None and fault.cause == "timeout" else ""
 
 
-def still_powered(measured: Measured, latched: str | None) -> str:
-    """Name the drives that can still move, by their last states."""
+def powered_message(measured: MeasuredState, latched: str | None) -> str:
+    """Return the refusal of a reset that names the drives that can still move."""
     states = zip(NAMES, measured.feedback.state, strict=True)
-    said = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
-    return f"{said} by what it said last: send reset again when the drives stand (fault: {latched})"
+    drives = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
+    return f"{drives} by its last statusword: send reset again when the drives are at rest (fault: {latched})"
 
 
 SETTLE = 0.1
-"""Time that the drives may take to leave their fault state after a reset [s]."""
+"""Time for the drives to leave their fault state after a reset [s]."""
 
 
 class Commands:
-    """Execution of commands: each begins in the cycle of its arrival, and is answered when carried out."""
+    """Executor of commands: each begins in the cycle of its arrival, and is answered when complete."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class Commands:
         ledger: Ledger,
         goal_queue: GoalQueue,
         planner: PlanRequests,
-        measured: Measured,
+        measured: MeasuredState,
         setpoints: Setpoints,
         outputs: Outputs,
     ) -> None:
@@ -126,19 +126,19 @@ class Commands:
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
     def carry_out(self, request: CommandRequest) -> None:
-        """Begin to carry out a command. Raises RefusedError where that is not allowed."""
+        """Begin a command. Raises RefusedError if it is not allowed."""
         if not request.name.ignores_lease:
             self._lease.check(request.user)
         EFFECTS[request.name].begin(self, request)
         self._ledger.undertake(request, self._modes.cycle)
 
     def settle(self) -> None:
-        """Answer the commands that are carried out or have failed."""
+        """Answer the commands that are complete or have failed."""
         self._ledger.settle(self._verdict, self._modes.state.mode, self._modes.cycle + 1)
 
     def end_silent_lease(self) -> None:
-        """End a lease that its holder does not renew."""
-        if (over := self._lease.silent(self._modes.cycle)) is not None:
+        """End a lease that has not been renewed in time."""
+        if (over := self._lease.expire(self._modes.cycle)) is not None:
             self._change_lease(over)
 
     def _change_mode(self, request: CommandRequest) -> None:
@@ -147,23 +147,23 @@ class Commands:
         action = self._modes.check(event).action
         goal = self._ledger.goal
         if event is ModeEvent.PAUSE and goal is not None and goal.kind.renewed:
-            event = ModeEvent.STOP  # nobody would be at the key, nor where the target was, when it is resumed
+            event = ModeEvent.STOP  # a jog or a track cannot be resumed: its key is released, its target has moved on
         if action is Action.POWER_UP:
             self._setpoints.check_rest()
             if self._measured.homed and (outside := self._setpoints.check_start()) is not None:
                 self._ledger.notices.append(Notice("service", "warning", outside.text, **outside.fields))
         if action is Action.CLEAR and self._measured.powered:
-            raise RefusedError(RefusalCode.STOPPING, still_powered(self._measured, self._modes.fault))
+            raise RefusedError(RefusalCode.STOPPING, powered_message(self._measured, self._modes.fault))
         if action is Action.CLEAR and (unready := self._measured.unready):
             raise RefusedError(RefusalCode.FAULT, f"the cause is still there: {'; '.join(unready)}")
         if event is ModeEvent.QUICK_STOP:
             self._modes.trip(reason, FaultCause.QUICK_STOP)
         else:
-            self._modes.go(event, reason)
+            self._modes.apply_event(event, reason)
             self._modes.withdraw(event, reason)
 
     def _stop(self, request: CommandRequest) -> None:
-        """Stop the robot, or a single goal that has not begun."""
+        """Stop the robot, or only the named goal if it has not begun."""
         goal = request.content.goal
         if goal is None or not self._goal_queue.stop_alone(goal, _reason(request)):
             self._change_mode(request)
@@ -174,7 +174,7 @@ class Commands:
         self._change_mode(request)
 
     def _override(self, request: CommandRequest) -> None:
-        """Set the rate of this motion and of later ones."""
+        """Set the speed override of this motion and of later ones."""
         rate = self._planner.override = request.content.percent / 100.0
         self._planner.update_rate()
         words = f"override {rate:.0%} by {request.user}"
@@ -182,7 +182,7 @@ class Commands:
         self._ledger.notices.append(Notice("service", "info", text.text, user=request.user, **text.fields))
 
     def _set_output(self, request: CommandRequest) -> None:
-        """Set an output from the next setpoints on."""
+        """Set an output; it switches with the next setpoints."""
         name, value = request.content.output, request.content.value
         self._outputs.set(name, value, self._modes.state.mode)
         words = f"output {name} {'on' if value else 'off'} by {request.user}"
@@ -204,17 +204,17 @@ class Commands:
         text = change.message
         self._ledger.notices.append(Notice("lease", change.level, text.text, user=user, **text.fields))
         if user is None or not self._ledger.is_all_of(user):
-            self._modes.go(ModeEvent.STOP, text)
+            self._modes.apply_event(ModeEvent.STOP, text)
             self._modes.withdraw(ModeEvent.STOP, text)
 
     def _verdict(self, name: Command, since: int) -> str | None:
-        """Return the verdict of the Rule on a command that came in cycle `since`."""
+        """Return the result of the rule for a command that arrived in cycle `since`."""
         settled = self._modes.cycle - since >= self._settle_cycles
         return EFFECTS[name].rule(CommandProgress(self._modes.state.mode, self._modes.fault, self._measured, settled))
 
 
 class Effect(NamedTuple):
-    """Effect of a command, and the rule of its completion."""
+    """Effect of a command, and the rule for its completion."""
 
     rule: Rule
     begin: Callable[[Commands, CommandRequest], None] = Commands._change_mode
@@ -228,10 +228,10 @@ EFFECTS: dict[Command, Effect] = {
     Command.RESET: Effect(cleared),
     Command.HOME: Effect(homed, Commands._home),
     Command.PAUSE: Effect(standing),
-    Command.RESUME: Effect(at_once),
-    Command.OVERRIDE: Effect(at_once, Commands._override),
-    Command.SET_OUTPUT: Effect(at_once, Commands._set_output),
-    Command.ACQUIRE: Effect(at_once, Commands._acquire),
+    Command.RESUME: Effect(completed_on_arrival),
+    Command.OVERRIDE: Effect(completed_on_arrival, Commands._override),
+    Command.SET_OUTPUT: Effect(completed_on_arrival, Commands._set_output),
+    Command.ACQUIRE: Effect(completed_on_arrival, Commands._acquire),
     Command.RELEASE: Effect(standing, Commands._release),
 }
 """Effect of each command."""

@@ -1,8 +1,8 @@
-"""The robot's control, one cycle at a time, without a clock, a socket or a file.
+"""Control of the robot, one cycle at a time, without a clock, a socket or a file.
 
-A cycle only executes: `observe` the drives' feedback, `solve` the sliders, `write` the setpoints behind the last gate.
-Between two cycles, `conclude` evaluates the previous one, and `decide` chooses by the requests what the next one
-executes. Answers and notices wait in the `ledger`.
+A cycle executes three steps: `observe` the drives' feedback, `solve` the sliders, and `write` the setpoints accepted by
+the last gate. Between two cycles, `conclude` evaluates the previous one, and `decide` handles requests and so chooses
+the motion of the next one. Answers and notices wait in the `ledger`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from trirail import naming
 from trirail.config import Config, corrected_geometry
 from trirail.control import cycle
 from trirail.control.commands import Commands
-from trirail.control.feedback import Measured
+from trirail.control.feedback import MeasuredState
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.lease import LeaseArbiter
 from trirail.control.ledger import Ledger
@@ -49,31 +49,31 @@ from trirail.wire.plan_packets import PlanAnswer
 from trirail.wire.records import Part
 from trirail.wire.vocabulary import FaultCause, Mode
 
-Given = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
+TimedInput = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
 """Input of the control in a cycle, and its time by the monotonic clock [ns]."""
 
 
-class Calm(NamedTuple):
-    """State of the control for cycles in which nothing happens."""
+class SteadyState(NamedTuple):
+    """State of the control while cycles only continue, so that the compiled call can run them."""
 
     run: Run | None
     """Motion under way, if setpoints come from one."""
     follows: bool
-    """Whether setpoints follow the measurement; else, without a run, they stay."""
+    """Whether setpoints follow the measured sliders; otherwise, without a run, they stay unchanged."""
     held: bool
     """Argument of trirail.control.cycle.follow."""
-    stands: bool
+    at_rest: bool
     """Argument of trirail.control.cycle.observe."""
-    found: int
+    code: int
     """Result of trirail.control.cycle.command in the newest cycle."""
     until: float
-    """Last cycle before something is due."""
+    """Last cycle before Python is needed."""
     settles_by: int | None
-    """Cycle in which a goal that waits for the robot to be in position ends; None where none does."""
+    """Cycle of the time-out of a goal that waits for the robot to be in position; None for no such goal."""
 
 
 class Control:
-    """Modes, motion, kinematics and limits of one robot over one set of drives."""
+    """Control of one robot: its modes, motion, kinematics and limits, for one group of drives."""
 
     def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort) -> None:
         robot = corrected_geometry(config)
@@ -92,9 +92,9 @@ class Control:
         self._checks = PathChecks(config, planner, self._planner, self.schedule, self.ledger, frames, self.outputs)
         legs, step_length = robot.packed(), config.limits.slider.fastest * config.period
         self._following_error_limit = config.limits.slider.following_error
-        taken = reserve_for_backlash(config.correction.backlash, config.limits.slider)
-        self.measured = Measured(
-            legs, config.period, step_length, self._following_error_limit, config.limits.in_position, taken
+        take_up = reserve_for_backlash(config.correction.backlash, config.limits.slider)
+        self.measured = MeasuredState(
+            legs, config.period, step_length, self._following_error_limit, config.limits.in_position, take_up
         )
         bounds = Bounds(config.limits, config.period, SETPOINT_TOLERANCE, robot.labels)
         planned = planned_limits(config.limits, config.correction.backlash)
@@ -109,7 +109,7 @@ class Control:
         )
         self._returning = ReturningDrives(robot.labels, config.limits.in_position.sliders)
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
-        self._found = 0
+        self._solve_code = 0
         self._concluding = False
         """Whether the setpoints of the present cycle have been sent."""
 
@@ -120,16 +120,16 @@ class Control:
 
     @property
     def state(self) -> ModeState:
-        """Mode, and what follows once the robot is at rest."""
+        """Mode, and the action that follows once the robot is at rest."""
         return self.modes.state
 
     @property
     def fault(self) -> str | None:
-        """First reason of the fault; None where there is none."""
+        """Reason of the latched fault; None without a fault."""
         return self.modes.fault
 
-    def calm(self) -> Calm | None:
-        """Return the state for cycles in which nothing happens; None while something needs to be done."""
+    def steady_state(self) -> SteadyState | None:
+        """Return the state in which cycles only continue; None if Python must run the next cycle."""
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
@@ -141,14 +141,14 @@ class Control:
         if len(runs) > 1 or (mode is Mode.STOPPING and not runs):
             return None
         run = runs[0] if runs and not follows else None
-        found = self._found if run is not None else 0
-        if found and (cycle.refusal(found) or not self._waits(run)):
+        code = self._solve_code if run is not None else 0
+        if code and (cycle.refusal(code) or not self._waits(run)):
             return None
         until = min(self.lease.alive_until, self.goal_queue.due(self.modes.cycle) - 1)
         if goal is not None and not goal.released:
             until = min(until, goal.alive_until)
         held = mode not in (Mode.DISABLED, Mode.FAULT)
-        return Calm(run, follows, held, self._stands, found, until, settling.ends)
+        return SteadyState(run, follows, held, self._at_rest, code, until, settling.ends)
 
     @property
     def _follows(self) -> bool:
@@ -156,29 +156,37 @@ class Control:
         return self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
 
     def _waits(self, run: Run | None) -> bool:
-        """Whether a motion has ended and its goal waits."""
+        """Return whether a motion has ended and its goal waits, to settle or to be renewed."""
         if run is None or not run.arrived:
             return False
         goal = self.ledger.goal
         target = goal is not None and goal.kind.waits_at_end
         return self.state.mode is Mode.MOVING and (self.measured.settling.under_way or target)
 
-    def go_on(self, newest: int, time: float, found: int | None) -> None:
-        """Continue after calm cycles from the number of the newest one, and the time of the run's law in it [s].
+    def resume(self, newest: int, time: float, code: int | None) -> None:
+        """Continue after cycles that the compiled call has run.
 
-        `found` is the result of the compiled call in that cycle, if it needs handling.
+        Parameters
+        ----------
+        newest
+            Number of the newest cycle.
+        time
+            Time of the run's law in that cycle [s].
+        code
+            Result of the compiled call in that cycle if it must be handled, else None.
+
         """
         self.schedule.cycle += newest - self.cycles
         self.modes.cycle = newest + 1
         if self.schedule.runs:
             self.schedule.runs[0].time = time
-        if found is not None:
-            self.modes.cycle, self._found = newest, found
+        if code is not None:
+            self.modes.cycle, self._solve_code = newest, code
             self.conclude()
 
-    def cycle(self, read: Callable[[], Feedback], given: Iterable[Given] = ()) -> None:
-        """Decide by the input before a cycle, and run it on the feedback that is then `read`."""
-        self.decide(given)
+    def cycle(self, read: Callable[[], Feedback], inputs: Iterable[TimedInput] = ()) -> None:
+        """Run a whole cycle: handle the inputs, `read` the feedback, execute, and conclude."""
+        self.decide(inputs)
         self.execute(read())
         self.conclude()
 
@@ -190,10 +198,15 @@ class Control:
         behind: int | None = None,
         code: int | None = None,
     ) -> None:
-        """Run one cycle on the drives' feedback at its SYNC; `mark` is called at the end of each part.
+        """Run one cycle on the drives' feedback at its SYNC. An exception in it stops the robot.
 
-        No error in it leaves the robot moving. Where the compiled cycle has ended early, `behind` is the result of
-        its `observe`, and `code` that of its `command` or `hold` if it has reached them.
+        Parameters
+        ----------
+        mark
+            Called at the end of each part of the cycle.
+        behind, code
+            Results of the compiled `observe`, and of `command` or `hold`, if the compiled call has begun this cycle.
+
         """
         try:
             if code is None:
@@ -203,7 +216,7 @@ class Control:
             else:
                 self.schedule.cycle += 1
                 self._check_solved(code)
-        except Exception as error:  # noqa: BLE001 - whatever is wrong with the program, the robot must stop now
+        except Exception as error:  # noqa: BLE001 - after any error in the program the robot must stop now
             self._trip_for(error)
         self._switch_outputs()
         mark(Part.KINEMATICS)
@@ -217,24 +230,24 @@ class Control:
     # ------------------------------------------------------------------ the cycle, in its order
 
     def start(self, feedback: Feedback) -> None:
-        """Take the measured sliders for the commanded ones, before the first cycle."""
+        """Begin with the measured sliders as the commanded ones, before the first cycle."""
         if self.outputs.any:
             self.outputs.allow_paths(self._drives.path_outputs)
         self.measured.start(feedback)
         self.setpoints.start()
         self._follow_measured()
         self._planner.warm_up()
-        self._tell_warnings(feedback)
+        self._report_warnings(feedback)
 
     def observe(self, feedback: Feedback, behind: int | None = None) -> None:
-        """Read the drives' feedback at this SYNC, and stop all three if they must not continue.
+        """Evaluate the drives' feedback at this SYNC; trip on a fault or a following error.
 
-        `behind` is the result of the compiled `observe`, if that has been called.
+        `behind` is the result of the compiled `observe`, if it has been called.
         """
         before = self.measured.feedback
         if behind is None:
-            behind = self.measured.update(feedback, self._stands)
-        self._tell_warnings(feedback)
+            behind = self.measured.update(feedback, self._at_rest)
+        self._report_warnings(feedback)
         self._handle_edges(before, feedback)
         mode = self.state.mode
         if feedback.fault is not None:
@@ -255,10 +268,10 @@ class Control:
                 text = coded(words, EventCode.FOLLOWING_ERROR, slider=slider, value=error, limit=limit)
                 self.modes.trip(text, FaultCause.FOLLOWING_ERROR, NAMES[behind - 1])
             elif not feedback.homing:
-                self._homing_over()
+                self._end_homing()
 
-    def _tell_warnings(self, feedback: Feedback) -> None:
-        """Report the drives' warnings: each is in one feedback only, some in the first."""
+    def _report_warnings(self, feedback: Feedback) -> None:
+        """Report the drives' warnings; each is in a single feedback."""
         for warning in feedback.warnings:
             text = coded(warning, EventCode.DRIVE_WARNING, warning=warning)
             self.ledger.notices.append(Notice("service", "warning", warning, **text.fields))
@@ -266,23 +279,20 @@ class Control:
             self.ledger.notices.append(Notice("service", level, text.text, **text.fields))
 
     def solve(self) -> None:
-        """Advance the commanded motion by one period, solve the sliders by the paper's recursion, pass the last gate.
-
-        All of that is one compiled call.
-        """
+        """Advance the commanded motion by one period, and solve the sliders for it, in one compiled call."""
         run = self.schedule.begin_cycle()
         if self._follows:
-            self._found = 0
+            self._solve_code = 0
             self._follow_measured()
             return
         self._check_solved(self.setpoints.solve(self.schedule, run))
         if len(self.schedule.runs) > 1:
-            self.setpoints.tell_progress(*self.schedule.progress)
+            self.setpoints.record_progress(*self.schedule.progress)
 
     def _check_solved(self, code: int) -> None:
-        """Stop where the last gate has refused the setpoints."""
-        self._found = code
-        if refused := self.setpoints.refusal(self._found):
+        """Trip if the last gate has refused the setpoints."""
+        self._solve_code = code
+        if refused := self.setpoints.refusal(self._solve_code):
             self.modes.trip(coded(refused, EventCode.BAD_SETPOINT), FaultCause.LIMIT)
 
     def _switch_outputs(self) -> None:
@@ -297,7 +307,7 @@ class Control:
         self._drives.set_outputs(self.outputs.words.tolist())
 
     def _goal_ended(self, goal: str, outcome: Outcome) -> None:
-        """Close what a goal has open, and report its switches before its end is."""
+        """Switch back the outputs that a goal has open, and report its switches before its end."""
         self.outputs.close(goal, outcome, self.modes.cycle + self._concluding, self.measured.record)
         self._report_switches(all_=True)
 
@@ -308,7 +318,7 @@ class Control:
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
     def _handle_edges(self, before: Feedback, now: Feedback) -> None:
-        """Report the inputs that have changed; stop the goal that is to end at such an edge."""
+        """Report the inputs that have changed; stop a goal that ends at such an edge."""
         goal, pose = self.ledger.goal, self.measured.pose
         x, y, phi = pose
         for name, value in self.outputs.edges(before.inputs, now.inputs):
@@ -322,7 +332,7 @@ class Control:
                 reached = coded(f"input {name} {edge.edge}", EventCode.INPUT_REACHED, input=name, x=x, y=y, phi=phi)
                 self.ledger.end("stopped", reached, but=1)
                 self.modes.withdraw(ModeEvent.INPUT_EDGE, reached)
-                self.modes.go(ModeEvent.INPUT_EDGE, reached)
+                self.modes.apply_event(ModeEvent.INPUT_EDGE, reached)
 
     def write(self) -> None:
         """Send the setpoints."""
@@ -331,21 +341,18 @@ class Control:
     # ------------------------------------------------------------------ between two cycles
 
     def conclude(self) -> None:
-        """End goals, or the motion, by the compiled call's result and the measurement of this cycle.
-
-        Commands that are carried out are answered.
-        """
+        """Evaluate the cycle: end goals or the motion, and answer commands that are complete."""
         self._concluding = True
         try:
-            schedule, found = self.schedule, self._found
-            if found and schedule.runs:
+            schedule, code = self.schedule, self._solve_code
+            if code and schedule.runs:
                 for _ in range(schedule.end_cycle(schedule.runs[0])):
                     self.ledger.pass_on()
             self.goal_queue.expire(self.modes.cycle)
-            self._judge_arrival()
+            self._check_arrival()
             moves = self.state.mode in (Mode.MOVING, Mode.STOPPING)
-            if found and moves and schedule.runs and schedule.runs[0].at_rest:
-                self._stand(schedule.runs[0])
+            if code and moves and schedule.runs and schedule.runs[0].at_rest:
+                self._end_motion(schedule.runs[0])
             self._commands.settle()
             self._report_switches()
         except Exception as error:  # noqa: BLE001
@@ -353,55 +360,54 @@ class Control:
         self._concluding = False
         self.modes.cycle += 1
 
-    def decide(self, given: Iterable[Given]) -> None:
-        """Decide what the next cycle executes.
+    def decide(self, inputs: Iterable[TimedInput]) -> None:
+        """Prepare the next cycle.
 
-        `handle` the input, end a lease or a jog that is not renewed, begin a planned motion that is due, and ask for a
-        check.
+        Handle inputs, end a lease or jog that is not renewed, begin a planned motion, and request a check.
         """
         try:
-            for what, now_ns in given:
-                self.handle(what, now_ns)
+            for each, now_ns in inputs:
+                self.handle(each, now_ns)
             self._commands.end_silent_lease()
             released = self.ledger.release(self.modes.cycle) if self.state.mode is Mode.MOVING else None
             if released is not None:
                 words = f"goal {released.id} of {released.user} is not renewed"
                 late = coded(words, EventCode.NOT_RENEWED, goal=released.id, user=released.user)
-                self.modes.go(ModeEvent.NOT_RENEWED, late)
-            beginning = self.goal_queue.think(self.modes.cycle, self._admit, self._place)
+                self.modes.apply_event(ModeEvent.NOT_RENEWED, late)
+            beginning = self.goal_queue.step(self.modes.cycle, self._admit, self._place)
             if beginning is not None:
                 words = f"goal {beginning.id} of {beginning.user}"
                 begun = coded(words, EventCode.GOAL_STARTED, goal=beginning.id, user=beginning.user)
-                self.modes.go(ModeEvent.GOAL, begun, beginning)
-            self._checks.think(self._place_of_check)
+                self.modes.apply_event(ModeEvent.GOAL, begun, beginning)
+            self._checks.step(self._place_of_check)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
-    def handle(self, what: Request | Disturbance | PlanAnswer | PlannerLost, now_ns: int) -> None:
-        """Handle a request, a disturbance or a plan, received at a time of the monotonic clock."""
+    def handle(self, received: Request | Disturbance | PlanAnswer | PlannerLost, now_ns: int) -> None:
+        """Handle a request, a disturbance or a plan, received at a time of the monotonic clock [ns]."""
         try:
-            match what:
+            match received:
                 case Disturbance():
-                    self.modes.happen(ModeEvent[what.event], what.text)
-                    if what.event == ModeEvent.GATEWAY_LOST.name:
-                        self._checks.withdraw(what.reason)
+                    self.modes.handle_disturbance(ModeEvent[received.event], received.text)
+                    if received.event == ModeEvent.GATEWAY_LOST.name:
+                        self._checks.withdraw(received.reason)
                 case CheckRequest():
-                    self._checks.enqueue(what)
+                    self._checks.enqueue(received)
                 case GoalRequest() | CommandRequest():
-                    self._answer(what, now_ns)
+                    self._answer(received, now_ns)
                 case Announcement(notice):
                     self.ledger.notices.append(notice)
                 case PlannerLost():
-                    self._planner.lose(what.reason)
-                    self._checks.lose(what.reason)
+                    self._planner.fail(received.reason)
+                    self._checks.fail(received.reason)
                 case answer:
-                    self._planner.hear(answer)
+                    self._planner.receive(answer)
                     self._checks.receive(answer)
         except Exception as error:  # noqa: BLE001
             self._trip_for(error)
 
     def _answer(self, request: GoalRequest | CommandRequest, now_ns: int) -> None:
-        """Carry out a command immediately; enqueue a goal behind earlier ones."""
+        """Begin a command, or enqueue a goal; answer a refusal."""
         try:
             if isinstance(request, GoalRequest):
                 self.goal_queue.enqueue(request, now_ns, self.modes.cycle)
@@ -410,21 +416,21 @@ class Control:
         except RefusedError as refusal:
             self.ledger.refuse(request, refusal)
 
-    # ------------------------------------------------------------------ what others ask of it
+    # ------------------------------------------------------------------ state for reports
 
     @property
     def commanded(self) -> MotionState:
-        """Motion of the platform commanded in this cycle."""
+        """Commanded motion of the platform in this cycle."""
         return self.schedule.commanded
 
     @property
     def override(self) -> float:
-        """Rate at which motions shall run."""
+        """Speed override, as a factor."""
         return self._planner.override
 
     @property
     def target(self) -> Triple | None:
-        """Pose that the running goal leads to, or last reported pose of its target; None for a jog."""
+        """End pose of the goal under way, or the last reported pose of its target; None for a jog."""
         last, goal = self.schedule.last, self.ledger.goal
         if goal is None or last is None:
             return None
@@ -436,19 +442,20 @@ class Control:
     # ------------------------------------------------------------------ requests
 
     def _admit(self) -> bool:
-        """Whether the robot is moving to a goal. Raises RefusedError where it accepts none."""
+        """Return whether the robot is moving to a goal. Raises RefusedError if it accepts no goal now."""
         self.modes.check(ModeEvent.GOAL)
         self._check_homed()
         return self.state.mode is Mode.MOVING
 
     def _check_homed(self) -> None:
         if not self.measured.homed:
-            raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
+            raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
 
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
         """Return the pose from which a move begins: the end of the goals before it, or the measured pose.
 
-        Raises RefusedError while a goal waits half-way, paused or at override 0: a person means a move from there.
+        Raises RefusedError while a goal is stopped half-way, paused or at override 0: the user would expect a move from
+        there.
         """
         if origin == "measured":
             return self.measured.pose
@@ -476,43 +483,43 @@ class Control:
     # ------------------------------------------------------------------ from state to state
 
     @property
-    def _stands(self) -> bool:
-        """Whether the robot is commanded to be at rest."""
+    def _at_rest(self) -> bool:
+        """Whether the commanded motion is at rest."""
         return (self.state.mode is Mode.HOLDING and self.measured.homed) or self.measured.settling.under_way
 
-    def _stand(self, run: Run) -> None:
-        """Handle the end of the motion: at its target, or at a standstill of its law on the way.
+    def _end_motion(self, run: Run) -> None:
+        """Handle the end of the motion, at its target or at a standstill on the way.
 
         A goal whose path has ended stays under way until the robot is in position.
         """
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
-            self.modes.go(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
+            self.modes.apply_event(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
         elif self.state.mode is Mode.MOVING and goal is not None and goal.kind.waits_at_end:
-            return  # it waits for what renews it
+            return  # the goal waits for its renewal
         elif goal is None or not goal.settles:
-            self.modes.go(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
+            self.modes.apply_event(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
         elif not settling.under_way:
             settling.begin(self.modes.cycle)
 
-    def _judge_arrival(self) -> None:
-        """End the goal whose path has ended once the robot is in position, or the time-out has elapsed."""
+    def _check_arrival(self) -> None:
+        """End a goal whose path has ended, once the robot is in position or the time-out has elapsed."""
         settling = self.measured.settling
-        settled = settling.over(self.modes.cycle)
+        settled = settling.result(self.modes.cycle)
         if settled is None:
             return
         outcome: Outcome = "done" if settled.settle is not None else "unsettled"
         self.ledger.end(outcome, settling.describe(settled, self._labels), settled=settled)
-        self.modes.go(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
+        self.modes.apply_event(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
 
     def _power_up(self) -> None:
-        """Hold with each drive that is enabled already; continue when all are, trip after the time-out."""
+        """Continue once all drives are enabled; trip after the time-out."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
             if not self.measured.homed:
-                words = "all drives are enabled; where the sliders are is not known: send home"
-                self.modes.go(ModeEvent.POWERED, coded(words, EventCode.POWERED_NOT_HOMED))
+                words = "all drives are enabled; the positions of the sliders are unknown: send home"
+                self.modes.apply_event(ModeEvent.POWERED, coded(words, EventCode.POWERED_NOT_HOMED))
             elif self._rest_at_setpoints():
-                self.modes.go(ModeEvent.POWERED, coded("all drives are enabled", EventCode.POWERED))
+                self.modes.apply_event(ModeEvent.POWERED, coded("all drives are enabled", EventCode.POWERED))
         elif self.modes.cycle - self.modes.entered > self._enable_cycles:
             waiting = [
                 f"{naming.drive(name, self._labels)} is {state}"
@@ -529,10 +536,10 @@ class Control:
             text = coded(words, EventCode.ENABLE_TIMEOUT, drives=", ".join(names), timeout=seconds)
             self.modes.trip(text, FaultCause.ENABLE)
 
-    def _homing_over(self) -> None:
-        """Hold where homing has ended or was stopped."""
+    def _end_homing(self) -> None:
+        """Hold the position once homing has ended or was stopped."""
         if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self.schedule.runs:
-            return  # no homing has been under way
+            return  # no homing was under way
         if self.measured.homed:
             try:
                 outside = self.setpoints.check_start()
@@ -545,12 +552,12 @@ class Control:
             if not self._rest_at_setpoints():
                 return
         if self.state.mode is Mode.STOPPING:
-            self.modes.go(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
+            self.modes.apply_event(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
         else:
-            self.modes.go(ModeEvent.HOMED, coded("all drives are homed", EventCode.HOMED))
+            self.modes.apply_event(ModeEvent.HOMED, coded("all drives are homed", EventCode.HOMED))
 
     def _rest_at_setpoints(self) -> bool:
-        """Command the pose of the setpoints, at rest; trip where there is none."""
+        """Command the pose of the setpoints, at rest; trip and return False if they belong to no pose."""
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
@@ -558,7 +565,7 @@ class Control:
             self.modes.trip(coded(words, EventCode.BAD_POSITION), FaultCause.PLACE)
             return False
         self.schedule.commanded = rest(pose)
-        self.setpoints.stand_at(pose)
+        self.setpoints.set_cross_slides(pose)
         return True
 
     def _follow_measured(self) -> None:

@@ -1,4 +1,4 @@
-"""Measured state from the drives' feedback: the platform's pose, the sliders' velocities and following errors."""
+"""Measured state of the robot from the drives' feedback: pose, velocities and following errors."""
 
 from __future__ import annotations
 
@@ -20,11 +20,20 @@ CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerSta
 """States in which a drive can move its slider."""
 
 
-class Measured:
-    """Newest feedback, beside the setpoints that it answers; all of it in the cycle's record.
+class MeasuredState:
+    """Measured state by the newest feedback, kept in the cycle's record.
 
-    `step` [m] is a slider's greatest travel in a cycle, `limit` [m] the limit of following errors, `windows` the limits
-    of residuals at rest, `taken` the take-up of the sliders' backlash.
+    Parameters
+    ----------
+    step
+        Greatest travel of a slider in a cycle [m].
+    limit
+        Limit of following errors [m].
+    windows
+        Limits of residuals at rest.
+    take_up
+        Take-up of the sliders' backlash.
+
     """
 
     def __init__(
@@ -34,36 +43,36 @@ class Measured:
         step: float,
         limit: float = np.inf,
         windows: InPosition = WINDOWS,
-        taken: TakeUp = NO_BACKLASH,
+        take_up: TakeUp = NO_BACKLASH,
     ) -> None:
         self.feedback = Feedback(ZERO_RATES, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
         self.record = np.zeros(1, DTYPE)
-        """The cycle's record, (1,): measured values are written here, commanded ones by the setpoints."""
+        """The cycle's record, (1,); this class writes the measured values, Setpoints the commanded ones."""
         self.numbers = np.zeros(2, cycle.FEEDBACK)
-        """Numbers of the feedback, and of the one before."""
+        """Newest and previous feedback, as numbers."""
         self.jumping = np.zeros(3, np.bool)
-        """Whether each slider's position jumped faster than it can move: such positions are not followed."""
+        """Whether each slider's position has changed faster than the slider can move."""
         self.settling = Settling(windows, period)
         """Whether the robot is in position."""
-        self.backlash = backlash(taken, period)
+        self.backlash = backlash(take_up, period)
         """Backlash compensation of the setpoints, (2,) of trirail.control.backlash.BACKLASH."""
         self.legs = legs
         self._period = period
         self.fastest = 2.0 * step / period  # the age may be wrong by one, which doubles a step
         self.limit = limit
         self._packed = self.numbers.view(np.uint8).data
-        self.written = np.zeros((2 + cycle.OLDEST, 3))
-        self.room = np.zeros((2, 3))
+        self.written = np.zeros((2 + cycle.MAX_AGE, 3))
+        self.scratch = np.zeros((2, 3))
 
     @property
     def position(self) -> Triple:
-        """Newest positions of the sliders [m]; while cycles are quiet the feedback has older ones."""
+        """Newest positions of the sliders [m]; `feedback` is not updated by the compiled call."""
         x, y, z = self.numbers["position"][0].tolist()
         return x, y, z
 
     @property
     def pose(self) -> Triple:
-        """Newest pose to which measured sliders belonged."""
+        """Newest measured pose: that of the last measured sliders that close the loops."""
         return self._recorded("pose")
 
     @property
@@ -73,12 +82,12 @@ class Measured:
 
     @property
     def following_error(self) -> Triple:
-        """Setpoint due less position [m]; zero for a drive that moves by itself."""
+        """Setpoint in force less position [m]; zero for a drive that moves by itself."""
         return self._recorded("following_error")
 
     @property
     def jumps(self) -> tuple[bool, bool, bool]:
-        """Whether each slider's position jumped faster than it can move."""
+        """Whether each slider's position has changed faster than the slider can move."""
         a, b, c = self.jumping.tolist()
         return a, b, c
 
@@ -89,7 +98,7 @@ class Measured:
 
     @property
     def unready(self) -> tuple[str, ...]:
-        """Reasons why drives cannot be reset yet, a line for each, and one for all where the bus is lost."""
+        """Reasons why drives cannot be reset yet, one line each, without repetitions."""
         return tuple(dict.fromkeys(str(each) for each in self.feedback.unready if each is not None))
 
     @property
@@ -98,15 +107,15 @@ class Measured:
         return all(self.feedback.homed)
 
     def start(self, feedback: Feedback) -> None:
-        """Take the first feedback, also as the past setpoints."""
+        """Begin with the first feedback, and use its positions as past setpoints."""
         self._pack(feedback)
         self.numbers[1] = self.numbers[0]
         self.written[:] = self.record["commanded_position"] = feedback.position
 
-    def update(self, feedback: Feedback, stands: bool = False) -> int:
-        """Take the feedback of the next cycle; return 0, or 1 + i if slider i's following error is beyond its limit.
+    def update(self, feedback: Feedback, at_rest: bool = False) -> int:
+        """Evaluate the feedback of the next cycle; return 0, or 1 + i for a following error of slider i.
 
-        `stands` is whether the motion commanded until now is at rest.
+        `at_rest` is whether the commanded motion is at rest.
         """
         self._pack(feedback)
         return cycle.observe(
@@ -117,25 +126,25 @@ class Measured:
             self._period,
             self.fastest,
             self.limit,
-            stands,
+            at_rest,
             self.jumping,
-            self.room,
+            self.scratch,
             self.settling.monitored,
             self.record,
         )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
-        """Return the pose of setpoints that is nearest to the newest pose; None if they belong to none."""
-        self.room[:] = sliders, self.pose
-        self.room[0] -= self.backlash[0]["offset"]
-        if forward_into(self.legs, self.room[0], self.room[1], self.room[1]):
+        """Return the pose of slider setpoints that is nearest to the newest pose; None if they belong to no pose."""
+        self.scratch[:] = sliders, self.pose
+        self.scratch[0] -= self.backlash[0]["offset"]
+        if forward_into(self.legs, self.scratch[0], self.scratch[1], self.scratch[1]):
             return None
-        x, y, phi = self.room[1].tolist()
+        x, y, phi = self.scratch[1].tolist()
         return x, y, phi
 
     def _pack(self, feedback: Feedback) -> None:
         self.feedback = feedback
-        cycle.SAID.pack_into(
+        cycle.FEEDBACK_STRUCT.pack_into(
             self._packed,
             0,
             *feedback.position,

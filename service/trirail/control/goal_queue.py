@@ -1,4 +1,4 @@
-"""Queue of goals: the one to plan next, those that wait, and those that must no longer begin."""
+"""Queue of received goals: the one being planned, those that wait, and those that have expired."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from trirail.wire.messages import Notice, Outcome
 from trirail.wire.packets import GoalRequest
 
 MAX_PASSES = 8
-"""Goals of other users that are planned before one whose planning is lengthy; then they wait for it."""
-FURTHEST = 0.5
-"""Greatest age, or lead, of a target's time in a track [s]: beyond it the target's position is unknown."""
+"""Number of other users' goals that may overtake a goal with lengthy planning."""
+MAX_TARGET_AGE_S = 0.5
+"""Greatest difference between the time of a track's target and now [s]; beyond it the report is useless."""
 
 
-class _Sent(NamedTuple):
-    """A received goal, and the cycle in which it was sent: one that waited at the gateway is older than the cycle."""
+class _ReceivedGoal(NamedTuple):
+    """Received goal, with the time of its arrival at the gateway, as a cycle."""
 
     request: GoalRequest
     cycle: float
     passes: int = 0
-    """Number of goals of other users for which its planning has been given up."""
+    """Number of other users' goals that have overtaken it."""
 
     def known_since(self, period: float) -> float:
         """Return the time of a track's target, as a cycle."""
@@ -41,7 +41,7 @@ class _Sent(NamedTuple):
 
 
 class GoalQueue:
-    """Queue that passes goals to the planner in their order, and their outcomes to the ledger."""
+    """Queue that passes goals to the planner, users in turn, and reports their outcomes to the ledger."""
 
     def __init__(
         self,
@@ -62,11 +62,11 @@ class GoalQueue:
         self._queue = queue
         self._period = period
         self._outputs = outputs
-        self._waiting: deque[_Sent] = deque()
+        self._waiting: deque[_ReceivedGoal] = deque()
         self._served: dict[str, int] = {}
-        """Turn of each user's last goal, counted since the queue was last idle."""
-        self._planned: _Sent | None = None
-        self._told_busy = False
+        """Sequence number of each user's last served goal, since the queue was idle."""
+        self._planned: _ReceivedGoal | None = None
+        self._busy_reported = False
 
     @property
     def idle(self) -> bool:
@@ -74,7 +74,7 @@ class GoalQueue:
         return not self._waiting and not self._planner.busy
 
     def due(self, cycle: int) -> float:
-        """Return the cycle, `cycle` or a later one, before which `think` is due if nothing is received."""
+        """Return the cycle, `cycle` or a later one, before which `step` is due if nothing is received."""
         expiring = min((goal.expires for number, goal in enumerate(self._ledger.goals) if number), default=math.inf)
         if self._planner.busy and self._planned is not None:
             request, sent, _ = self._planned
@@ -86,12 +86,18 @@ class GoalQueue:
         return min(math.floor(expiring) + 1 if math.isfinite(expiring) else math.inf, cycle + self._planner.due)
 
     def enqueue(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Enqueue a goal before a cycle, at a time of the monotonic clock; it waits for its user's turn.
+        """Enqueue a goal; a frequent renewal replaces an earlier one that still waits.
 
-        A frequent renewal replaces the one before it that still waits.
+        Parameters
+        ----------
+        now_ns
+            Present time of the monotonic clock [ns].
+        cycle
+            Number of the next cycle.
+
         """
         age = (now_ns - request.received_ns) * 1e-9 / self._period
-        sent = _Sent(request, cycle - age)
+        sent = _ReceivedGoal(request, cycle - age)
         if self.idle:
             self._served.clear()
         if request.goal.frequent and self._ledger.renewed_by(request):
@@ -102,14 +108,19 @@ class GoalQueue:
         self._waiting.append(sent)
         self._ledger.keep_alive(request, self._alive_until(sent))
 
-    def think(self, cycle: int, admit: Callable[[], bool], place: PoseSource) -> GoalRequest | None:
-        """Have the next goal planned if none is, and take a finished plan; return a goal that begins.
+    def step(self, cycle: int, admit: Callable[[], bool], place: PoseSource) -> GoalRequest | None:
+        """Request the plan of the next goal, or accept a finished plan; return the goal that begins, if any.
 
-        `admit` raises RefusedError where the robot accepts no goal, and returns whether it is moving to one; `place`
-        returns the pose from which a move begins.
+        Parameters
+        ----------
+        admit
+            Function that returns whether the robot is moving to a goal, and raises RefusedError if it accepts none.
+        place
+            Function that returns the pose from which a move begins.
+
         """
         if self._planned is not None and self._is_passed(self._planned):
-            self._planner.give_up()
+            self._planner.cancel()
             self._waiting.appendleft(self._planned._replace(passes=self._planned.passes + 1))
         if not self._planner.busy and self._waiting:
             self._planned = self._next()
@@ -119,38 +130,39 @@ class GoalQueue:
                 self._ledger.refuse(self._planned.request, refusal)
         try:
             if self._planner.busy and self._planned is not None:
-                self._tell_busy(self._planned.request)
-                self._ledger.check_id(self._planned.request)  # it may end while its renewal is being planned
-                self._lease.check(self._planned.request.user)  # and the lease may have another holder by now
+                self._report_busy(self._planned.request)
+                # While it was being planned, a renewed goal may have ended, and the lease may have changed hands.
+                self._ledger.check_id(self._planned.request)
+                self._lease.check(self._planned.request.user)
                 self._check_age(self._planned, cycle)
             at_end = self._planner.busy and self._schedule.ended
-            taken = self._planner.think()
+            accepted = self._planner.step()
         except RefusedError as refusal:
-            self._planner.give_up()
+            self._planner.cancel()
             if self._planned is not None:
                 self._ledger.refuse(self._planned.request, refusal)
             return None
-        if taken is None or self._planned is None:
+        if accepted is None or self._planned is None:
             return None
         request, sent, _ = self._planned
         valid = request.goal.valid_for
         expires = sent + valid / self._period if valid is not None else math.inf
         same = [later for later in (self._planned, *self._waiting) if later.request.id == request.id]
-        self._ledger.begin(request, taken, expires, max(map(self._alive_until, same)), at_end=at_end)
+        self._ledger.begin(request, accepted, expires, max(map(self._alive_until, same)), at_end=at_end)
         return request
 
     def withdraw(self, outcome: Withdrawal, reason: str) -> None:
-        """End goals that have been sent but not begun."""
+        """End all goals that have been received but not begun."""
         requests = [sent.request for sent in self._waiting]
         if self._planner.busy and self._planned is not None:
             requests.insert(0, self._planned.request)
-        self._planner.give_up()
+        self._planner.cancel()
         self._waiting.clear()
         for request in requests:
             self._ledger.withdraw(request, outcome, reason)
 
     def stop_alone(self, goal_id: str, reason: EventText) -> bool:
-        """Stop a goal that has not begun; return False for the one under way. Raises RefusedError for any other id."""
+        """Stop a goal that has not begun; return False for the one under way. Raises RefusedError for an unknown id."""
         if self._ledger.goal is not None and self._ledger.goal.id == goal_id:
             return False
         for number, goal in enumerate(self._ledger.goals):
@@ -158,7 +170,7 @@ class GoalQueue:
                 self._drop(number, goal_id, "stopped", reason)
                 return True
         if self._planner.busy and self._planned is not None and self._planned.request.id == goal_id:
-            self._planner.give_up()
+            self._planner.cancel()
             self._ledger.withdraw(self._planned.request, "stopped", reason.text)
             return True
         for sent in self._waiting:
@@ -169,27 +181,27 @@ class GoalQueue:
         raise RefusedError(RefusalCode.NO_GOAL, f"goal {goal_id!r} is not under way: it has ended, or never was")
 
     def expire(self, cycle: int) -> None:
-        """Drop waiting goals that can no longer begin in time, and those behind them."""
+        """End planned goals that can no longer begin in time, and those behind them."""
         for number, goal in enumerate(self._ledger.goals):
             if number and cycle > goal.expires:
                 self._drop(number, goal.id, "expired", coded("it has not begun in time", EventCode.TOO_LATE))
                 return
 
-    def _next(self) -> _Sent:
-        """Take the oldest goal of the user with the longest wait for a turn."""
+    def _next(self) -> _ReceivedGoal:
+        """Remove and return the oldest goal of the user served longest ago."""
         sent = min(self._waiting, key=lambda sent: self._served.get(sent.request.user, 0))
         self._waiting.remove(sent)
         self._served[sent.request.user] = max(self._served.values(), default=0) + 1
         return sent
 
-    def _is_passed(self, planned: _Sent) -> bool:
-        """Whether another user's goal takes precedence over the one being planned."""
+    def _is_passed(self, planned: _ReceivedGoal) -> bool:
+        """Return whether another user's goal may overtake the one being planned."""
         if not self._planner.awaits_answer or not planned.request.goal.lengthy or planned.passes >= MAX_PASSES:
             return False
         return any(sent.request.user != planned.request.user for sent in self._waiting)
 
-    def _consider(self, sent: _Sent, cycle: int, admit: Callable[[], bool], place: PoseSource) -> None:
-        """Begin to plan a goal, or refuse it."""
+    def _consider(self, sent: _ReceivedGoal, cycle: int, admit: Callable[[], bool], place: PoseSource) -> None:
+        """Check a goal and request its plan. Raises RefusedError."""
         ledger, request, goal = self._ledger, sent.request, sent.request.goal
         ledger.check_id(request)
         if request.withdrawn is not None:
@@ -210,54 +222,54 @@ class GoalQueue:
             self._outputs.check_input(planned.stop_at.input)
         self._planner.plan(planned, blend, request.id)
 
-    def _timed(self, planned: Goal, sent: _Sent, cycle: int) -> Goal:
-        """Return a goal with its time in the schedule's count. Raises RefusedError where that is too far from now.
+    def _timed(self, planned: Goal, sent: _ReceivedGoal, cycle: int) -> Goal:
+        """Return a goal with the time of its target as a time of the schedule.
 
-        The setpoints of the schedule's cycle, which is commanded now, are taken up at this cycle's SYNC: that is now.
+        Raises RefusedError if the time is too far from now.
         """
+        # Now is the SYNC of this cycle, at which the drives accept the setpoints of the schedule's present cycle.
         if not planned.timed:
             return planned
         ago = (cycle - sent.known_since(self._period)) * self._period
-        if ago > FURTHEST >= abs(sent.request.age):
+        if ago > MAX_TARGET_AGE_S >= abs(sent.request.age):
             waited = ago - sent.request.age
             text = (
-                f"what was told of the target has waited {waited:.3f} s behind its sender's others: send fewer a second"
+                f"the report of the target has waited {waited:.3f} s behind its sender's other messages: "
+                "send fewer per second"
             )
             raise RefusedError(RefusalCode.BUSY, text, value=waited)
-        if not abs(ago) <= FURTHEST:
+        if not abs(ago) <= MAX_TARGET_AGE_S:
             when = f"{ago:.3f} s ago" if ago > 0.0 else f"in {-ago:.3f} s"
-            text = (
-                f"the target is said to be there {when}, by the clock of this machine: {FURTHEST:g} s at most is taken"
-            )
-            raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(FURTHEST, ago))
+            text = f"the time of the target is {when} by this machine: at most {MAX_TARGET_AGE_S:g} s is allowed"
+            raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(MAX_TARGET_AGE_S, ago))
         return planned.at(self._schedule.cycle * self._period - ago)
 
-    def _tell_busy(self, request: GoalRequest) -> None:
-        """Report that a goal waits for a busy planner, once until the planner answers."""
-        busy = self._planner.how_busy
-        if busy and not self._told_busy:
+    def _report_busy(self, request: GoalRequest) -> None:
+        """Report that a goal waits for a busy planner, once per request."""
+        busy = self._planner.busy_message
+        if busy and not self._busy_reported:
             words, silence = f"{busy}: goal {request.id} waits", self._planner.silence
             text = coded(words, EventCode.PLANNER_BUSY, goal=request.id, silence=silence)
             self._ledger.notices.append(Notice("service", "warning", text.text, user=request.user, **text.fields))
-        self._told_busy = bool(busy)
+        self._busy_reported = bool(busy)
 
-    def _check_age(self, sent: _Sent, cycle: int) -> None:
+    def _check_age(self, sent: _ReceivedGoal, cycle: int) -> None:
         """Raise RefusedError for a goal that can no longer begin in time."""
         valid = sent.request.goal.valid_for
-        why = f"; {self._planner.how_busy}" if self._planner.how_busy else ""
+        why = f"; {self._planner.busy_message}" if self._planner.busy_message else ""
         if valid is not None and cycle - sent.cycle > valid / self._period:
-            raise RefusedError(RefusalCode.EXPIRED, f"the goal came too late: it was valid for {valid:g} s{why}")
+            raise RefusedError(RefusalCode.EXPIRED, f"the goal is too late: it was valid for {valid:g} s{why}")
         if cycle > self._alive_until(sent):
             raise RefusedError(
-                RefusalCode.EXPIRED, f"it came too late: its timeout was over before it could begin{why}"
+                RefusalCode.EXPIRED, f"the goal is too late: its timeout has elapsed before it could begin{why}"
             )
 
-    def _alive_until(self, sent: _Sent) -> float:
-        """Return the cycle in which a goal ends unless renewed; infinite for goals that need no renewal."""
+    def _alive_until(self, sent: _ReceivedGoal) -> float:
+        """Return the cycle in which a goal ends unless renewed; infinite for a goal that needs no renewal."""
         return sent.cycle + sent.request.goal.timeout / self._period
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: EventText) -> None:
-        """End a waiting goal and those behind it."""
+        """End a planned goal and those behind it."""
         words = f"goal {goal_id} before it {outcome}"
         before = coded(words, EventCode.EARLIER_GOAL_ENDED, goal=goal_id, outcome=outcome)
         self._ledger.end("stopped", before, but=number + 1)

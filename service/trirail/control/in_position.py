@@ -1,7 +1,7 @@
-"""Detection of in-position from the measurement: the windows, the dwell and the time-out.
+"""Detection of "in position": windows, dwell and time-out.
 
-While the commanded motion is at rest, each cycle's measured sliders and their pose are compared with the commanded
-ones. In position means: all six inside their windows, in every cycle of the dwell, up to the newest.
+While the commanded motion is at rest, each cycle compares the measured sliders and pose with the commanded ones. The
+robot is in position if all six values have been inside their windows in every cycle of the dwell.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from trirail.naming import Labels
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Residual
 
-__all__ = ["MONITOR", "Settled", "Settling", "monitor"]
+__all__ = ["MONITOR", "Settling", "SettlingResult", "monitor"]
 
-MOVES = 1e-9
-"""Greatest velocity of a slider's setpoints that is rounding [m/s]."""
+MIN_VELOCITY = 1e-9
+"""Velocity of setpoints above which a slider counts as moving [m/s]; a lower one is rounding."""
 
 MONITOR = np.dtype(
     [
@@ -39,19 +39,19 @@ MONITOR = np.dtype(
 """State of the monitor between cycles, for compiled code."""
 
 
-class Settled(NamedTuple):
-    """Settling of a goal, or its residuals at the time-out; fields of the event of its end."""
+class SettlingResult(NamedTuple):
+    """Result of settling, with the fields of the event of the goal's end."""
 
     settle: float | None
-    """Time from the end of the path to the first cycle of the dwell [s]; None where it did not settle."""
+    """Time from the end of the path to the first cycle of the dwell [s]; None if it did not settle in time."""
     residual: Residual
-    """Commanded less measured at its end."""
+    """Commanded less measured values at the end."""
     overshoot: Triple
     """Greatest distance of each slider beyond its target since the end of the path [m]."""
 
 
 class Settling:
-    """Judgement of the goal whose path has ended; `monitored` is the state of the compiled cycle."""
+    """Monitor of a goal whose path has ended; `monitored` is its state in the compiled cycle."""
 
     def __init__(self, limits: InPosition, period: float) -> None:
         self.monitored = np.zeros(1, MONITOR)
@@ -69,21 +69,21 @@ class Settling:
 
     @property
     def ends(self) -> int | None:
-        """Cycle of the goal's time-out; None where there is no such goal."""
+        """Cycle of the time-out; None while no goal settles."""
         return self._since + self._timeout if self._since is not None else None
 
     def begin(self, cycle: int) -> None:
-        """Begin to settle: the path has ended with the setpoints of this cycle."""
+        """Begin to monitor a goal whose path has ended with the setpoints of this cycle."""
         self._since = cycle
         self.monitored["inside"] = 0
         self.monitored["overshoot"] = 0.0
 
-    def leave(self) -> None:
-        """Stop judging the goal."""
+    def cancel(self) -> None:
+        """Stop monitoring the goal."""
         self._since = None
 
-    def over(self, cycle: int) -> Settled | None:
-        """Return the result by the measurement of this cycle; None while undecided."""
+    def result(self, cycle: int) -> SettlingResult | None:
+        """Return the result after this cycle; None while undecided."""
         if self._since is None:
             return None
         inside = int(self.monitored["inside"][0])
@@ -91,21 +91,21 @@ class Settling:
             return self.now((cycle + 1 - inside - self._since) * self._period)
         return self.now(None) if cycle - self._since >= self._timeout else None
 
-    def now(self, settle: float | None) -> Settled:
-        """Return the current residuals and overshoot."""
+    def now(self, settle: float | None) -> SettlingResult:
+        """Return a result with the present residuals and overshoot."""
         sliders, pose, overshoot = map(
             tuple, (*self.monitored["residual"][0].tolist(), *self.monitored["overshoot"].tolist())
         )
-        return Settled(settle, Residual(sliders, pose), overshoot)
+        return SettlingResult(settle, Residual(sliders, pose), overshoot)
 
-    def describe(self, settled: Settled, labels: Labels = NAMES) -> EventText:
-        """Return the goal's settling time, or its residuals, as text."""
+    def describe(self, settled: SettlingResult, labels: Labels = NAMES) -> EventText:
+        """Return a result as text, with the settling time or the residuals."""
         if settled.settle is not None:
             x, y, phi = map(abs, settled.residual.pose)
-            left = (
+            residual = (
                 f"{max(map(abs, settled.residual.sliders)) * 1e6:.2f} µm of a slider, {max(x, y) * 1e6:.2f} µm in x, y"
             )
-            words = f"arrived, settled in {settled.settle * 1e3:g} ms; left to go: {left}, {phi * 1e6:.2f} µrad"
+            words = f"arrived, settled after {settled.settle * 1e3:g} ms; residual {residual}, {phi * 1e6:.2f} µrad"
             return coded(words, EventCode.SETTLED, settle=settled.settle)
         x, y, phi = settled.residual.pose
         errors = zip(labels, settled.residual.sliders, strict=True)
@@ -113,33 +113,43 @@ class Settling:
         residuals += [f"x {x * 1e3:.3f} mm", f"y {y * 1e3:.3f} mm", f"phi {phi * 1e3:.3f} mrad"]
         words = (
             f"not in position {self._limits.timeout:g} s after the end of its path; "
-            f"left to go: {', '.join(residuals)} (limits.in_position)"
+            f"residuals: {', '.join(residuals)} (limits.in_position)"
         )
         return coded(words, EventCode.NOT_IN_POSITION, timeout=self._limits.timeout)
 
 
 @compiled()
-def monitor(record: NDArray[np.void], known: bool, stands: bool, monitored: NDArray[np.void]) -> None:
-    """Compare the measured values in the record with the commanded ones; record whether the robot has settled.
+def monitor(record: NDArray[np.void], known: bool, at_rest: bool, monitored: NDArray[np.void]) -> None:
+    """Compare the measured values in the record with the commanded ones, and record whether the robot is in position.
 
-    `known` is whether the measured sliders belong to a pose, `stands` whether the commanded motion is at rest.
+    Parameters
+    ----------
+    record : (1,)
+        The cycle's record.
+    known
+        Whether the measured sliders belong to a pose.
+    at_rest
+        Whether the commanded motion is at rest.
+    monitored : (1,)
+        State of the monitor.
+
     """
-    kept, told = monitored[0], record[0]
-    if not stands:
+    state, row = monitored[0], record[0]
+    if not at_rest:
         for i in range(3):
-            if kept.moved == 0:
-                kept.heading[i] = 0.0
-            if abs(told.commanded_velocity[i]) > MOVES:
-                kept.heading[i] = math.copysign(1.0, told.commanded_velocity[i])
-        kept.moved, kept.inside, told.settled = 1, 0, 0
+            if state.moved == 0:
+                state.heading[i] = 0.0
+            if abs(row.commanded_velocity[i]) > MIN_VELOCITY:
+                state.heading[i] = math.copysign(1.0, row.commanded_velocity[i])
+        state.moved, state.inside, row.settled = 1, 0, 0
         return
-    kept.moved = 0
+    state.moved = 0
     within = known
     for i in range(3):
-        kept.residual[0, i] = told.commanded_position[i] - told.position[i]
-        kept.residual[1, i] = told.commanded_pose[i] - told.pose[i]
-        within &= abs(kept.residual[0, i]) <= kept.window[0, i] and abs(kept.residual[1, i]) <= kept.window[1, i]
-        beyond = -kept.residual[0, i] * kept.heading[i] if kept.heading[i] != 0.0 else abs(kept.residual[0, i])
-        kept.overshoot[i] = max(kept.overshoot[i], beyond)
-    kept.inside = kept.inside + 1 if within else 0
-    told.settled = kept.inside >= kept.dwell
+        state.residual[0, i] = row.commanded_position[i] - row.position[i]
+        state.residual[1, i] = row.commanded_pose[i] - row.pose[i]
+        within &= abs(state.residual[0, i]) <= state.window[0, i] and abs(state.residual[1, i]) <= state.window[1, i]
+        beyond = -state.residual[0, i] * state.heading[i] if state.heading[i] != 0.0 else abs(state.residual[0, i])
+        state.overshoot[i] = max(state.overshoot[i], beyond)
+    state.inside = state.inside + 1 if within else 0
+    row.settled = state.inside >= state.dwell

@@ -1,7 +1,7 @@
-"""The lease: the exclusive right of one user to move the robot, for as long as the user's client gives signs of life.
+"""Lease: the exclusive right of one user to move the robot, as long as the user's client renews it.
 
-It is kept here, behind gateway and planner, so that the loss of any link to the holder ends it: their program, the
-network, the gateway. Time is counted in cycles, so that a recorded session can be reproduced.
+The control keeps the lease, and not the gateway, so that the loss of any link to the holder ends it: program, network
+or gateway. Its time-out counts cycles, so that recorded sessions can be replayed.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from trirail.wire.messages import Level
 from trirail.wire.vocabulary import AcquireLease, LeasePolicy, ReleaseLease
 
 REMEMBERED_IDS = 1000
-"""Number of ended leases that a late sign of life cannot revive; older ones are forgotten."""
+"""Number of ended leases that are remembered, so that a late renewal cannot revive them."""
 
 
 class LeaseChange(NamedTuple):
-    """Notice to everyone that the lease has another holder, or none."""
+    """Change of the lease's holder, to be announced."""
 
     level: Level
     message: EventText
 
 
-class _Held(NamedTuple):
+class _Lease(NamedTuple):
     user: str
     id: str | None
     timeout: float
     alive_until: int
-    """Last cycle of the lease without another sign of life."""
+    """Last cycle of the lease unless renewed."""
 
 
 class LeaseArbiter:
-    """Holder of the lease, and its rules; `check` raises for a user that may not move the robot."""
+    """Rules of the lease, and its present holder; `check` raises for a user who must not move the robot."""
 
     def __init__(self, policy: LeasePolicy, period: float) -> None:
         self._required = policy == "required"
         self._period = period
-        self._held: _Held | None = None
-        self._over: dict[tuple[str, str], str] = {}
-        """Leases that have ended, by user and id, and why."""
+        self._held: _Lease | None = None
+        self._ended: dict[tuple[str, str], str] = {}
+        """Reason of the end of each ended lease, by user and id."""
 
     @property
     def user(self) -> str | None:
@@ -50,11 +50,11 @@ class LeaseArbiter:
 
     @property
     def alive_until(self) -> float:
-        """Last cycle of the lease without another sign of life; infinite where nobody holds it."""
+        """Last cycle of the lease unless renewed; infinite if nobody holds it."""
         return self._held.alive_until if self._held is not None else math.inf
 
     def check(self, user: str) -> None:
-        """Raise RefusedError where a user may not move the robot now."""
+        """Raise RefusedError if a user must not move the robot now."""
         if self._held is None:
             if self._required:
                 raise RefusedError(
@@ -63,13 +63,13 @@ class LeaseArbiter:
                 )
         elif self._held.user != user:
             raise RefusedError(
-                RefusalCode.LEASED, f"{self._held.user} holds the lease: only his goals and commands count"
+                RefusalCode.LEASED, f"{self._held.user} holds the lease: goals and commands of others are refused"
             )
 
     def acquire(self, user: str, lease: AcquireLease, cycle: int) -> LeaseChange | None:
-        """Give a user the lease; return None for a sign of life of its holder. Raises RefusedError."""
+        """Grant or renew a lease; return None for a renewal. Raises RefusedError if another client holds it."""
         before = self._held
-        if lease.id is not None and (why := self._over.get((user, lease.id))) is not None:
+        if lease.id is not None and (why := self._ended.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: acquire a new one")
         again = before is not None and (before.user, before.id) == (user, lease.id)
         change = (
@@ -83,25 +83,25 @@ class LeaseArbiter:
                 problem = f"{whose} holds the lease: wait until it is free, or take it over"
                 raise RefusedError(RefusalCode.LEASED, problem)
             words = f"lease taken over by {user} from {before.user}"
-            taken = coded(words, EventCode.LEASE_TAKEN_OVER, user=user, before=before.user)
-            change = self._end("warning", taken)
-        self._held = _Held(user, lease.id, lease.timeout, cycle + round(lease.timeout / self._period))
+            text = coded(words, EventCode.LEASE_TAKEN_OVER, user=user, before=before.user)
+            change = self._end("warning", text)
+        self._held = _Lease(user, lease.id, lease.timeout, cycle + round(lease.timeout / self._period))
         return change
 
     def release(self, user: str, lease: ReleaseLease) -> LeaseChange:
-        """Release a user's lease. Raises RefusedError where they have none, or not that one."""
+        """Release a user's lease. Raises RefusedError if the user does not hold this lease."""
         held = self._held
         if held is not None and held.user == user and lease.id in (None, held.id):
             return self._end("info", coded(f"lease released by {user}", EventCode.LEASE_RELEASED, user=user))
-        if lease.id is not None and (why := self._over.get((user, lease.id))) is not None:
+        if lease.id is not None and (why := self._ended.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: there is nothing to release")
         if held is None:
             raise RefusedError(RefusalCode.NO_LEASE, "nobody holds the lease: there is nothing to release")
         whose = "another client of the same user" if held.user == user else held.user
         raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease, and only its holder can release it")
 
-    def silent(self, cycle: int) -> LeaseChange | None:
-        """End the lease where no sign of life has arrived in time."""
+    def expire(self, cycle: int) -> LeaseChange | None:
+        """End the lease if it has not been renewed in time; return None if it has."""
         held = self._held
         if held is None or cycle <= held.alive_until:
             return None
@@ -112,7 +112,7 @@ class LeaseArbiter:
     def _end(self, level: Level, why: EventText) -> LeaseChange:
         held, self._held = self._held, None
         if held is not None and held.id is not None:
-            self._over[held.user, held.id] = why.text
-            if len(self._over) > REMEMBERED_IDS:
-                del self._over[next(iter(self._over))]
+            self._ended[held.user, held.id] = why.text
+            if len(self._ended) > REMEMBERED_IDS:
+                del self._ended[next(iter(self._ended))]
         return LeaseChange(level, why)

@@ -1,4 +1,4 @@
-"""Goals and commands with their users and outcomes: every goal ends once, every command is answered once."""
+"""Ledger of goals and commands: every goal ends exactly once, and every command is answered exactly once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from msgspec import structs
 from trirail_drivers.interface import Triple
 
-from trirail.control.in_position import Settled
+from trirail.control.in_position import SettlingResult
 from trirail.control.plan_requests import AcceptedPlan
 from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.event_codes import EventCode, EventText, coded
@@ -20,15 +20,15 @@ from trirail.wire.messages import REMEMBERED_IDS, GoalReply, Level, Notice, Outc
 from trirail.wire.packets import (
     Accepted,
     Answer,
+    CommandDone,
     CommandRequest,
-    Confirmed,
     GoalRequest,
     Refused,
 )
 from trirail.wire.vocabulary import Command
 
 Withdrawal = Literal["stopped", "faulted"]
-"""Outcome of a goal that was sent but did not begin: in its event, and as the code of its refusal."""
+"""Outcome of a goal that ends before it begins: in its event, and as the code of its refusal."""
 _LEVELS: dict[Outcome, Level] = {
     "faulted": "error",
     "rejected": "warning",
@@ -38,23 +38,23 @@ _LEVELS: dict[Outcome, Level] = {
 
 
 class ActiveGoal(NamedTuple):
-    """A goal that the robot is moving to, or a queued one."""
+    """Goal under way, or a queued one."""
 
     id: str
     user: str
     kind: type[Goal]
     blend: float | None
-    """Distance from its end at which the next goal may begin [m]; None where that preempts it."""
+    """Distance from its end at which the next goal may begin [m]; None if the next goal preempts it."""
     expires: float
     """Last cycle in which it may begin."""
     alive_until: float
     """Cycle in which it ends unless renewed."""
     released: bool = False
-    """Whether that cycle has passed: a late renewal does not revive it."""
+    """Whether that cycle has passed, so that a late renewal does not revive the goal."""
     bound: str | None = None
-    """Limit before which a jog stops, or beyond which a track's target is."""
+    """Limit at which a jog stops, or beyond which the target of a track is."""
     settles: bool = True
-    """Whether it is done only when the robot is in position."""
+    """Whether the goal is done only once the robot is in position."""
     target: Triple | None = None
     """Last reported pose of a track's target."""
     stop_at: StopAt | None = None
@@ -63,8 +63,8 @@ class ActiveGoal(NamedTuple):
     """Last lag of a track: trirail.wire.messages.GoalReply."""
 
 
-class _Ended(NamedTuple):
-    """End of a goal; `bound` is that of its ActiveGoal, where a jog has ended there."""
+class _GoalEnd(NamedTuple):
+    """End of a goal; `bound` is the limit at which a jog has ended."""
 
     user: str
     kind: type[Goal]
@@ -72,8 +72,8 @@ class _Ended(NamedTuple):
     reason: str
     bound: str | None
 
-    def over(self, goal_id: str) -> RefusedError:
-        """Return the error for a renewal of the ended goal."""
+    def renewal_error(self, goal_id: str) -> RefusedError:
+        """Return the refusal of a renewal of the ended goal."""
         if self.bound is not None:
             text = f"jog {goal_id!r} has ended at the limit of {self.bound}: begin a new one, away from it"
             return RefusedError(RefusalCode.AT_LIMIT, text)
@@ -84,7 +84,7 @@ class _Ended(NamedTuple):
 
 
 class Ledger:
-    """Goals and commands under way; outgoing messages wait in `answers` and `notices`."""
+    """Ledger of goals and commands under way; outgoing messages wait in `answers` and `notices`."""
 
     def __init__(self, on_end: Callable[[str, Outcome], None] = lambda _goal, _outcome: None) -> None:
         """`on_end` is called with the id and outcome of each goal that ends, before that is announced."""
@@ -94,7 +94,7 @@ class Ledger:
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
         self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
-        self._ended: dict[str, _Ended] = {}
+        self._ended: dict[str, _GoalEnd] = {}
         self._refused: tuple[str, RefusalCode] | None = None
         """Id of the last refused frequent goal, and the code of the refusal."""
 
@@ -106,28 +106,28 @@ class Ledger:
         return self.goals[0] if self.goals else None
 
     def check_id(self, request: GoalRequest) -> None:
-        """Raise RefusedError if the id has been used; a renewal shares its goal's id."""
+        """Raise RefusedError if the id of a goal has been used, unless the goal renews the one under way."""
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
         ended = self._ended.get(goal_id)
         if ended is not None and ended.kind.renewed and (ended.kind, ended.user) == (type(request.goal), request.user):
-            raise ended.over(goal_id)
+            raise ended.renewal_error(goal_id)
         if ended is not None or (running and not self.renewed_by(request)):
             raise RefusedError(RefusalCode.DUPLICATE_ID, f"goal id {goal_id!r} has been used: every goal needs its own")
         if self.goal is not None and self.goal.released and self.renewed_by(request):
             raise _not_renewed(goal_id)
 
     def pass_over(self, request: GoalRequest) -> None:
-        """Accept a renewal that a newer one replaces."""
+        """Accept a renewal that a newer one has replaced."""
         self.answers.append(Accepted(request.ticket, GoalReply(request.id, None)))
 
     def keep_alive(self, request: GoalRequest, until: float) -> None:
-        """Extend the goal under way until a cycle, if the request renews it and it is not ending."""
+        """Extend the goal under way until a cycle, if the request renews it and the goal is not ending."""
         if self.renewed_by(request) and self.goals[0].alive_until > -math.inf:
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> ActiveGoal | None:
-        """Return the goal under way if it has not been renewed in time; only once."""
+        """Return the goal under way, once, if it has not been renewed in time."""
         goal = self.goal
         if goal is None or goal.released or cycle <= goal.alive_until:
             return None
@@ -135,19 +135,27 @@ class Ledger:
         return goal
 
     def begin(
-        self, request: GoalRequest, taken: AcceptedPlan, expires: float, alive_until: float, *, at_end: bool = False
+        self, request: GoalRequest, plan: AcceptedPlan, expires: float, alive_until: float, *, at_end: bool = False
     ) -> None:
-        """Accept a goal; those before it are preempted, unless it follows them or renews the one under way.
+        """Accept a goal; it preempts those before it, unless it follows them or renews the one under way.
 
-        `at_end` is whether the motion before it has ended: if that was to a goal with a blend, the goal is done.
+        Parameters
+        ----------
+        expires
+            Last cycle in which the goal may begin.
+        alive_until
+            Cycle in which the goal ends unless renewed.
+        at_end
+            Whether the previous motion has ended; a previous goal with a blend is then done.
+
         """
-        self.answers.append(Accepted(request.ticket, structs.replace(taken.reply, id=request.id)))
+        self.answers.append(Accepted(request.ticket, structs.replace(plan.reply, id=request.id)))
         if self.renewed_by(request):
-            self._renew(request, taken)
+            self._renew(request, plan)
             return
         goal, last = request.goal, self.goals[-1] if self.goals else None
         passes = at_end and last is not None and last.blend is not None and goal.follows
-        if not taken.reply.queued and not passes:
+        if not plan.reply.queued and not passes:
             self.end("preempted", coded(f"preempted by goal {request.id}", EventCode.PREEMPTED, goal=request.id))
         begun = ActiveGoal(
             request.id,
@@ -163,30 +171,30 @@ class Ledger:
         if passes:
             self.pass_on()
         if goal.renewed:
-            self._renew(request, taken)
-        if marks := taken.reply.marks:
+            self._renew(request, plan)
+        if marks := plan.reply.marks:
             words = f"goal {request.id} switches outputs at {len(marks)} mark{'s' * (len(marks) > 1)} on its path"
             text = coded(words, EventCode.MARKS_PLANNED, goal=request.id, number=len(marks))
             self.notices.append(Notice("output", "info", text.text, goal=request.id, planned=marks, **text.fields))
 
-    def _renew(self, request: GoalRequest, taken: AcceptedPlan) -> None:
-        """Update the goal under way from its renewal; notify everyone where a target is out of reach."""
-        goal, told = request.goal, self.goals[0]
-        if goal.target is not None and taken.bound not in (None, told.bound):
-            words = f"the target of goal {told.id} is beyond the limit of {taken.bound}: the robot waits there"
-            text = coded(words, EventCode.BEYOND_LIMIT, goal=told.id)
-            self.notices.append(Notice("service", "warning", text.text, user=told.user, **text.fields))
-        bound = taken.bound or (told.bound if goal.target is not None else None)  # a limit is reported once
-        self.goals[0] = told._replace(bound=bound, target=goal.target, lag=taken.reply.lag)
+    def _renew(self, request: GoalRequest, plan: AcceptedPlan) -> None:
+        """Update the goal under way by a renewal; announce a target that is out of reach."""
+        goal, goal_under_way = request.goal, self.goals[0]
+        if goal.target is not None and plan.bound not in (None, goal_under_way.bound):
+            words = f"the target of goal {goal_under_way.id} is beyond the limit of {plan.bound}: the robot waits there"
+            text = coded(words, EventCode.BEYOND_LIMIT, goal=goal_under_way.id)
+            self.notices.append(Notice("service", "warning", text.text, user=goal_under_way.user, **text.fields))
+        bound = plan.bound or (goal_under_way.bound if goal.target is not None else None)  # a limit is reported once
+        self.goals[0] = goal_under_way._replace(bound=bound, target=goal.target, lag=plan.reply.lag)
 
     def pass_on(self) -> None:
-        """End the first goal as done: the one behind it has begun."""
+        """End the first goal as done, since the next one has begun."""
         goal = self.goals.popleft()
         following = self.goals[0].id
         reason = coded(f"passed on the way to goal {following}", EventCode.PASSED, goal=following)
-        self._ending(goal.id, goal.user, goal.kind, "done", reason)
+        self._end_goal(goal.id, goal.user, goal.kind, "done", reason)
 
-    def end(self, outcome: Outcome, reason: EventText, but: int = 0, settled: Settled | None = None) -> None:
+    def end(self, outcome: Outcome, reason: EventText, but: int = 0, settled: SettlingResult | None = None) -> None:
         """End all goals except the first `but`."""
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
@@ -194,29 +202,30 @@ class Ledger:
             at_limit = outcome == "done" and not goal.released and not goal.kind.waits_at_end
             bound = goal.bound if at_limit else None
             text = coded(f"at the limit of {bound}", EventCode.STOPPED_AT_LIMIT) if bound else reason
-            self._ending(goal.id, goal.user, goal.kind, outcome, text, bound, settled)
+            self._end_goal(goal.id, goal.user, goal.kind, outcome, text, bound, settled)
         self.goals.extend(kept)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
-        """Answer that a goal has ended before it began."""
+        """End a goal that has not begun, and answer its request."""
         self.answers.append(
             Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
         )
         if not self.renewed_by(request):
             refusal = RefusedError(RefusalCode(outcome), reason)
             ended = coded(reason, EventCode.REFUSED)
-            self._ending(request.id, request.user, type(request.goal), outcome, ended, refusal=refusal)
+            self._end_goal(request.id, request.user, type(request.goal), outcome, ended, refusal=refusal)
 
     def is_all_of(self, user: str | None) -> bool:
-        """Whether all goals and commands under way that need the lease belong to a user."""
+        """Return whether all goals and commands under way that need the lease belong to a user."""
         commands = (request for under_way in self._commands.values() for request, _ in under_way)
         senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.ignores_lease]
         return all(sender == user for sender in senders)
 
     def refuse(self, request: GoalRequest | CommandRequest, refusal: RefusedError) -> None:
-        """Answer that a request is refused. A refused goal has ended; a used id already has its own end.
+        """Refuse a request, and announce that. A refused goal has ended, unless its id was in use.
 
-        Everyone is notified, of frequent renewals once: hundreds may follow before the answer reaches their sender.
+        Of frequent renewals only the first refusal is announced: hundreds may follow before the answer reaches their
+        sender.
         """
         text = answered = str(refusal)
         if isinstance(request, GoalRequest) and request.goal.frequent and not self.renewed_by(request):
@@ -242,10 +251,10 @@ class Ledger:
                     self.keep_alive(request, -math.inf)
             else:
                 reason = coded(text, EventCode.REFUSED)
-                self._ending(request.id, request.user, type(request.goal), outcome, reason, refusal=refusal)
+                self._end_goal(request.id, request.user, type(request.goal), outcome, reason, refusal=refusal)
 
     def renewed_by(self, request: GoalRequest) -> bool:
-        """Whether a request renews the goal under way; only its own user can."""
+        """Return whether a request renews the goal under way: same id, user and kind."""
         goal = self.goal
         return (
             goal is not None
@@ -254,7 +263,7 @@ class Ledger:
             and type(request.goal) is goal.kind
         )
 
-    def _ending(
+    def _end_goal(
         self,
         goal_id: str,
         user: str,
@@ -262,25 +271,27 @@ class Ledger:
         outcome: Outcome,
         reason: EventText,
         bound: str | None = None,
-        settled: Settled | None = None,
+        settled: SettlingResult | None = None,
         refusal: RefusedError | None = None,
     ) -> None:
-        if goal_id in self._ended:  # by the same event, which also withdraws its renewals
+        if goal_id in self._ended:  # the event that has ended the goal also withdraws its renewals
             return
         self._on_end(goal_id, outcome)
         level = _LEVELS.get(outcome, "info")
-        self._ended[goal_id] = _Ended(user, kind, outcome, reason.text, bound)
+        self._ended[goal_id] = _GoalEnd(user, kind, outcome, reason.text, bound)
         if len(self._ended) > REMEMBERED_IDS:
             del self._ended[next(iter(self._ended))]
         words = f"goal {goal_id} {outcome}: {reason}"
-        said = Notice("goal", level, words, id=goal_id, outcome=outcome, reason=reason.text, user=user, **reason.fields)
-        said = _with_code(said, refusal) if refusal is not None else said
-        self.notices.append(structs.replace(said, **settled._asdict()) if settled is not None else said)
+        notice = Notice(
+            "goal", level, words, id=goal_id, outcome=outcome, reason=reason.text, user=user, **reason.fields
+        )
+        notice = _with_code(notice, refusal) if refusal is not None else notice
+        self.notices.append(structs.replace(notice, **settled._asdict()) if settled is not None else notice)
 
     # ------------------------------------------------------------------ commands
 
     def undertake(self, request: CommandRequest, cycle: int) -> None:
-        """Add a command; it is answered once it has been carried out."""
+        """Add a command, to be answered once it is complete."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
     @property
@@ -289,11 +300,19 @@ class Ledger:
         return any(self._commands.values())
 
     def settle(self, verdict: Callable[[Command, int], str | None], mode: str, cycle: int) -> None:
-        """Answer the commands that are done or never will be.
+        """Answer the commands that are complete or have failed.
 
-        `verdict`, given a command's name and the cycle of its arrival, is "" for done, None for not yet, else the
-        reason. The effect shows from `cycle` on. A command is never done before an earlier one of its name: while that
-        one is not done, later ones are not judged.
+        Commands of the same name complete in the order of their arrival.
+
+        Parameters
+        ----------
+        verdict
+            Function of a command's name and the cycle of its arrival, with the result of a Rule.
+        mode
+            Mode after the command.
+        cycle
+            First cycle that shows the effect.
+
         """
         for name, under_way in self._commands.items():
             while under_way and (why := verdict(name, under_way[0][1])) is not None:
@@ -301,7 +320,7 @@ class Ledger:
                 if why:
                     self.answers.append(Refused(request.ticket, RefusalCode.FAILED, f"{name} failed: {why}"))
                 else:
-                    self.answers.append(Confirmed(request.ticket, name, mode, cycle))
+                    self.answers.append(CommandDone(request.ticket, name, mode, cycle))
 
 
 def _refused(text: str, user: str, refusal: RefusedError) -> Notice:
@@ -309,7 +328,7 @@ def _refused(text: str, user: str, refusal: RefusedError) -> Notice:
 
 
 def _with_code(notice: Notice, refusal: RefusedError) -> Notice:
-    """Return a notice with the fields of a refusal, for programs."""
+    """Return a notice with the fields of a refusal."""
     about = {name: getattr(refusal, name) for name in ("code", "slider", "value", "limit")}
     return structs.replace(notice, **about)
 

@@ -1,4 +1,4 @@
-"""Planner in this process, for replays, tests and tools: it answers a set number of cycles after each request."""
+"""Planner in the calling process, for replays, tests and tools, which answers after a fixed number of cycles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 
 
 class LocalPlanner:
-    """Planner of this process: a trirail.control.plan_requests.PlannerPort."""
+    """Planner that implements trirail.control.plan_requests.PlannerPort by a direct call."""
 
     def __init__(self, config: Config, delay: int = 1) -> None:
         self.delay = delay
@@ -20,11 +20,11 @@ class LocalPlanner:
         self._turns = 0
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Plan now, to answer later."""
+        """Compute the plan now, and answer later."""
         self._answers.append((self._turns + self.delay, self._planner.plan(request)))
 
     def answers(self) -> list[PlanAnswer]:
-        """Return the answers that are due in this cycle; call once in each."""
+        """Return the answers that are due; call once in each cycle."""
         self._turns += 1
         due = []
         while self._answers and self._answers[0][0] <= self._turns:

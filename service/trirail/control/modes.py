@@ -10,7 +10,7 @@ from trirail.wire.vocabulary import Mode
 
 
 class ModeEvent(Enum):
-    """Event of the state machine: a request, a report of the motion or the drives, or a failure."""
+    """Event of the state machine: a request, a report of motion or drives, or a failure."""
 
     ENABLE = auto()
     DISABLE = auto()
@@ -21,7 +21,7 @@ class ModeEvent(Enum):
     PAUSE = auto()
     RESUME = auto()
     NOT_RENEWED = auto()  # the jog or the track is no longer renewed
-    INPUT_EDGE = auto()  # an input has changed at which the goal under way is to end
+    INPUT_EDGE = auto()  # an input at which the goal under way ends has changed
     HOME = auto()
     POWERED = auto()  # all drives reached operation enabled
     HOMED = auto()  # all drives know their position, and follow setpoints again
@@ -34,7 +34,7 @@ class ModeEvent(Enum):
 
 
 class Action(Enum):
-    """Action of the loop between one state and the next, in the same cycle."""
+    """Action of the loop on a change of state, in the same cycle."""
 
     NOTHING = auto()
     POWER_UP = auto()
@@ -49,7 +49,10 @@ class Action(Enum):
 
 
 class ModeState(NamedTuple):
-    """A mode, and what follows once the robot is at rest: its drives disabled, the same goal again, or a jog's end."""
+    """Mode, and what follows once the robot is at rest.
+
+    `disable_after` disables the drives, `paused` keeps the goal to be resumed, and `released` ends a jog or track.
+    """
 
     mode: Mode
     disable_after: bool = False
@@ -63,14 +66,14 @@ class ModeState(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Next state, and the action on the way."""
+    """Next state, and the action on the way to it."""
 
     state: ModeState
     action: Action = Action.NOTHING
 
 
 class Refusal(NamedTuple):
-    """Refusal of an event that makes no sense in a mode: the state stays."""
+    """Refusal of an event that is not allowed in a mode; the state stays."""
 
     code: RefusalCode
     message: str
@@ -106,12 +109,12 @@ _NOT_PAUSED = Refusal(RefusalCode.NOT_PAUSED, "there is no paused goal to resume
 _POWER_OFF = Step(DISABLED, Action.POWER_DOWN)
 _TRIP = Step(FAULT, Action.QUICK_STOP)
 
-_ALWAYS: dict[ModeEvent, Step | Refusal] = {
+_IN_ALL_MODES: dict[ModeEvent, Step | Refusal] = {
     ModeEvent.RESET: _NO_FAULT,
     ModeEvent.QUICK_STOP: _TRIP,
     ModeEvent.FAULT: _TRIP,
 }
-_WITHOUT_GOAL = _ALWAYS | {ModeEvent.PAUSE: _NO_GOAL, ModeEvent.RESUME: _NOT_PAUSED}
+_WITHOUT_GOAL = _IN_ALL_MODES | {ModeEvent.PAUSE: _NO_GOAL, ModeEvent.RESUME: _NOT_PAUSED}
 
 _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
     DISABLED: _WITHOUT_GOAL
@@ -148,7 +151,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.HOME: Step(HOMING, Action.HOME),
         ModeEvent.SHUTDOWN: _POWER_OFF,
     },
-    MOVING: _ALWAYS
+    MOVING: _IN_ALL_MODES
     | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE, Action.BRAKE),
         ModeEvent.GOAL: Step(MOVING, Action.START),
@@ -179,7 +182,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.STANDSTILL: _POWER_OFF,
         ModeEvent.ARRIVED: _POWER_OFF,
     },
-    PAUSING: _ALWAYS
+    PAUSING: _IN_ALL_MODES
     | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
         ModeEvent.GOAL: Step(MOVING, Action.START),
@@ -193,7 +196,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.LATE: Step(STOPPING),
         ModeEvent.SHUTDOWN: Step(STOPPING_TO_DISABLE),
     },
-    PAUSED: _ALWAYS
+    PAUSED: _IN_ALL_MODES
     | {
         ModeEvent.DISABLE: _POWER_OFF,
         ModeEvent.GOAL: Step(MOVING, Action.START),
@@ -204,7 +207,7 @@ _TABLE: dict[ModeState, dict[ModeEvent, Step | Refusal]] = {
         ModeEvent.GATEWAY_LOST: Step(HOLDING),
         ModeEvent.SHUTDOWN: _POWER_OFF,
     },
-    RELEASING: _ALWAYS
+    RELEASING: _IN_ALL_MODES
     | {
         ModeEvent.DISABLE: Step(STOPPING_TO_DISABLE),
         ModeEvent.GOAL: Step(MOVING, Action.START),
@@ -232,8 +235,7 @@ STATES = tuple(_TABLE)
 def step(state: ModeState, event: ModeEvent) -> Step | Refusal:
     """Return the effect of `event` in `state`; an event without an entry in the table changes nothing.
 
-    Requests that are already fulfilled are confirmed, not refused: enabling an enabled robot, stopping one at rest.
-    The first fault stays latched: only a reset leaves it, a second fault does not, and a reset never leads further
-    than to disabled.
+    Requests that are fulfilled already are confirmed and not refused, such as stopping a robot at rest. The first fault
+    stays latched until a reset, which leads to disabled.
     """
     return _TABLE[state].get(event, Step(state))

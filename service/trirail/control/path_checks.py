@@ -1,6 +1,6 @@
-"""Checks of goals: the planner plans each from rest, where the motion under way ends, for the answer alone.
+"""Checks of goals: each is planned from rest at the end of the motion under way, only to answer the request.
 
-Nothing moves, no event is made, and neither mode nor lease matters. A goal that is sent is planned first.
+Nothing moves, no event is published, and mode and lease do not matter. Goals take precedence over checks.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from msgspec import structs
 from trirail.config import Config
 from trirail.control.ledger import Ledger
 from trirail.control.outputs import Outputs
-from trirail.control.plan_requests import LEAST_LEAD, PlannerPort, PlanRequests
+from trirail.control.plan_requests import MIN_LEAD_CYCLES, PlannerPort, PlanRequests
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.goal_motion import PoseSource
 from trirail.motion.goal_planner import resolve_goal
@@ -26,7 +26,7 @@ NO_MOTION = (0.0, 0.0, 0.0)
 
 
 class PathChecks:
-    """Queue of checks, of which the planner has one while it plans no goal."""
+    """Queue of checks; the planner gets one at a time, while it plans no goal."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class PathChecks:
 
     @property
     def due(self) -> bool:
-        """Whether a check waits that the planner can be asked for now."""
+        """Whether a check waits and can be requested from the planner now."""
         return bool(self._waiting) and not self._planner.busy and not self._under_way
 
     @property
@@ -64,8 +64,8 @@ class PathChecks:
         """Enqueue a check behind the others."""
         self._waiting.append(request)
 
-    def think(self, place: PoseSource) -> None:
-        """Ask the planner for the next check if it is due; `place` returns the pose from which it begins."""
+    def step(self, place: PoseSource) -> None:
+        """Request the next check from the planner if it is due; `place` returns the pose from which it begins."""
         while self.due:
             request = self._waiting[0]
             try:
@@ -84,7 +84,7 @@ class PathChecks:
         reply = structs.replace(answer.reply, id=request.goal.id or "")
         self._ledger.answers.append(Checked(request.ticket, reply))
 
-    def lose(self, reason: str) -> None:
+    def fail(self, reason: str) -> None:
         """Refuse the pending check: the planner will not answer its request."""
         if self._under_way:
             self._refuse(RefusedError(RefusalCode.PLANNER_LOST, f"{reason}: send the check again"))
@@ -105,7 +105,7 @@ class PathChecks:
         rate = min(self._planner.override, goal.greatest_rate)
         begin, cycle, version = ((x, y, phi), NO_MOTION, NO_MOTION), self._schedule.cycle, self._schedule.version
         self._port.request_plan(
-            PlanRequest(self._number, version, self._revision, cycle, LEAST_LEAD, rate, begin, (), goal)
+            PlanRequest(self._number, version, self._revision, cycle, MIN_LEAD_CYCLES, rate, begin, (), goal)
         )
 
     def _refuse(self, refusal: RefusedError) -> None:

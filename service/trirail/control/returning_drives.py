@@ -1,4 +1,4 @@
-"""Events of drives that restart or disappear, and of their sliders when they are back."""
+"""Events about drives that restart or disappear, and about their sliders when they return."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from trirail.wire.messages import Level
 
 
 class ReturningDrives:
-    """Comparison of each feedback with the one before, for drives that are not configured."""
+    """Detector of drives that are lost or configured again, by comparing each feedback with the previous one."""
 
     def __init__(self, labels: tuple[str, str, str], windows: Triple) -> None:
-        """Set the `windows`: changes of the sliders' positions that are not reported [m]."""
+        """Set the labels, and the `windows`: greatest changes of the sliders' positions that are not reported [m]."""
         self._labels = labels
         self._windows = windows
         self._before: tuple[Unready | None, ...] = (None, None, None)
         self._last: list[float | None] = [None, None, None]
-        """Positions of the drives when they were lost [m]; None where they were not homed."""
+        """Position of each drive when it was lost [m]; None if it was not homed."""
 
     def update(self, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
-        """Yield messages for people, with their levels."""
+        """Yield messages about changes, with their levels."""
         if feedback.unready == self._before:
             return
         reported = {feedback.fault.message} if feedback.fault is not None else set()
@@ -30,7 +30,7 @@ class ReturningDrives:
             if now is not None and before is None:
                 self._last[i] = feedback.position[i] if feedback.homed[i] else None
             if now is not None and (before is None or now.reason != before.reason):
-                if now.reason not in reported:  # where the bus is lost, it is one reason for all
+                if now.reason not in reported:  # a lost bus is the same reason for all drives
                     name = self._labels[i]
                     yield "warning", coded(now.reason, EventCode.DRIVE_NOT_READY, drive=name, reason=now.reason)
                 reported.add(now.reason)
@@ -49,7 +49,7 @@ class ReturningDrives:
             words = f"drive {label} is configured; every drive is: send reset, then enable"
             yield "info", coded(words, EventCode.DRIVES_READY, drive=label)
         if not feedback.homed[i]:
-            words = f"slider {label}: its position is not known since its drive was off: send home"
+            words = f"slider {label}: position unknown since its drive was off: send home"
             yield "warning", coded(words, EventCode.POSITION_UNKNOWN, slider=label)
         elif last is not None and abs(position - last) > self._windows[i]:
             moved = (

@@ -1,4 +1,4 @@
-"""Setpoints of the sliders: solved for the commanded motion behind the last gate, or led to the measured sliders."""
+"""Setpoints of the sliders: solved for the commanded motion and checked by the last gate, or following the sliders."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from trirail_drivers.interface import NAMES, Triple
 
 from trirail.control import cycle
-from trirail.control.feedback import Measured
+from trirail.control.feedback import MeasuredState
 from trirail.errors import RefusalCode, RefusedError
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.closed_forward import sign_of_det_j2
@@ -28,10 +28,16 @@ _ALLOWED = {Mode.HOLDING: AllowedMotion.NONE, Mode.STOPPING: AllowedMotion.BRAKI
 class Setpoints:
     """Setpoints of the next SYNC.
 
-    `tolerance` is trirail.motion.limits.standing_tolerance, `step` [m] a slider's greatest travel in a cycle.
+    Parameters
+    ----------
+    tolerance
+        Result of trirail.motion.limits.standing_tolerance.
+    step
+        Greatest travel of a slider in a cycle [m].
+
     """
 
-    def __init__(self, legs: Array, bounds: Bounds, tolerance: Array, measured: Measured, step: float) -> None:
+    def __init__(self, legs: Array, bounds: Bounds, tolerance: Array, measured: MeasuredState, step: float) -> None:
         self._legs = legs
         self._tolerance = tolerance
         self._bounds = bounds
@@ -48,13 +54,13 @@ class Setpoints:
         return self._bounds.packed
 
     @property
-    def found(self) -> Array:
-        """Values of the last gate's refusal, (2,)."""
+    def refused_values(self) -> Array:
+        """Values that the last gate has refused, (2,)."""
         return self._bounds.last_violation
 
     @property
     def rows(self) -> list[list[float]]:
-        """Rows position, velocity, acceleration of the sliders, then those of the cross slides."""
+        """Rows position, velocity and acceleration of the sliders, then those of the cross slides."""
         return self.sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not annotate the type of its lists
 
     @property
@@ -68,83 +74,89 @@ class Setpoints:
         self.sliders[0, 0] = self._measured.position
 
     def allow(self, mode: Mode) -> None:
-        """Set the last gate to refuse motion that a mode, entered now, does not allow."""
+        """Set the motion that the last gate allows, for a new mode."""
         self.bounds[0]["allowed"] = _ALLOWED.get(mode, AllowedMotion.ANY)
 
     def solve(self, schedule: Schedule, run: Run | None) -> int:
-        """Advance the commanded motion by the run under way, and solve the sliders by the paper's recursion.
+        """Advance the commanded motion by one period of the run, and solve the sliders.
 
-        Where the last gate refuses the result, they stay unchanged. Returns the code of trirail.control.cycle.command.
+        They stay unchanged if the last gate refuses the result. Returns the code of trirail.control.cycle.command.
         """
-        legs, bounds, found = self._legs, self._bounds.packed, self._bounds.last_violation
+        legs, bounds, refused_values = self._legs, self._bounds.packed, self._bounds.last_violation
         motion, sliders, record = schedule.motion, self.sliders, self._measured.record
-        kept = self._measured.backlash
+        backlash = self._measured.backlash
         if run is None:
-            return cycle.hold(legs, bounds, motion, sliders, kept, found, record)
+            return cycle.hold(legs, bounds, motion, sliders, backlash, refused_values, record)
         path, law, (begun, end, arrival) = run.path, run.law, run.goal_span
         return cycle.command(
             *(legs, bounds, *path, law.knots, law.pieces, run.time, run.target, run.furthest),
-            *(begun, end, arrival, motion, sliders, kept, found, record),
+            *(begun, end, arrival, motion, sliders, backlash, refused_values, record),
         )
 
     def refusal(self, code: int) -> str | None:
-        """Return the reason of the last gate's refusal; None where it has not refused."""
+        """Return the reason of a refusal by the last gate; None if the code has no refusal."""
         refused = cycle.refusal(code)
         if refused == 0:
             return None
         now, other = self._bounds.last_violation.tolist()
         if refused == cycle.BACKWARDS:
             return f"no setpoint: time along the path would run backwards, from {other:.6g} to {now:.6g} s"
-        if refused == cycle.DRIFTS:
+        if refused == cycle.DRIFTING:
             return (
                 f"setpoint refused: the platform would move by {now:.3g} m or rad in a cycle while the mode is holding"
             )
-        if refused == cycle.RUNS_ON:
-            return f"setpoint refused: the motion would run on at {now:.0%} of its speed while the mode is stopping"
+        if refused == cycle.NOT_BRAKING:
+            return f"setpoint refused: the motion would continue at {now:.0%} of its speed while the mode is stopping"
         if refused <= len(NAMES):
             slider = f"slider {self._bounds.labels[refused - 1]}"
             return f"{slider}: no setpoint, the commanded pose is singular or not a number"
         return f"setpoint refused: {self._bounds.violation(refused - len(NAMES))}"
 
     def follow(self, schedule: Schedule, *, held: bool, stopped_now: bool) -> None:
-        """Command the measured pose, and each drive that holds no position to its measured one.
+        """Command the measured pose, and lead the setpoint of each drive that holds no position to its measured one.
 
-        Nothing moves on enable. A setpoint that differs from the measured position moves there at the slider's speed:
-        a drive that missed the command to stop must not jump either. A position that jumps is not followed. A drive
-        that moves by itself, to home, follows no setpoint: its setpoint is its position immediately. `held` is whether
-        enabled drives hold theirs, `stopped_now` whether all were stopped in this cycle: then no setpoint is sent.
+        Setpoints follow at the speed of a slider, so that nothing moves on enable, and a drive that has missed the
+        command to stop does not jump. A drive that moves by itself, to home, gets its position as its setpoint.
+
+        Parameters
+        ----------
+        held
+            Whether enabled drives keep their setpoints.
+        stopped_now
+            Whether all drives were stopped in this cycle, so that all keep their setpoints.
+
         """
         measured = self._measured
         arrays = schedule.motion, self.sliders, measured.backlash, measured.record
         cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self.step, *arrays)
 
-    def stand_at(self, pose: Sequence[float]) -> None:
-        """Set the cross slides to their positions at a pose: the next setpoint is compared with those."""
+    def set_cross_slides(self, pose: Sequence[float]) -> None:
+        """Set the positions of the cross slides for a pose; the gate compares the next setpoint with them."""
         self._motion[:] = 0.0
         self._motion[0] = pose
         if inverse_into(self._legs, self._motion, self._tried) == 0:
             self.sliders[0, 3:] = self._tried[3:]
 
-    def tell_progress(self, progress: float, remaining: float) -> None:
-        """Record the progress of the goal under way, as a share, and the time that remains [s]."""
+    def record_progress(self, progress: float, remaining: float) -> None:
+        """Record the progress of the goal under way, as a share, and the remaining time [s]."""
         record = self._measured.record
         record["progress"], record["remaining"] = progress, remaining
 
     def check_rest(self) -> None:
-        """Raise RefusedError on enable while a setpoint still moves towards its slider."""
+        """Raise RefusedError, on enable, while a setpoint still follows its slider."""
         places = self._measured.position
         for name, setpoint, position in zip(self._bounds.labels, self.rows[0], places, strict=True):
             if not abs(setpoint - position) <= self.step:
                 raise RefusedError(
                     RefusalCode.NOT_AT_REST,
-                    f"slider {name} moves too fast for its setpoint to follow: enable when it stands",
+                    f"slider {name} moves too fast for its setpoint to follow: enable when it is at rest",
                 )
 
     def check_start(self) -> EventText | None:
-        """Return a warning where the robot is beyond a limit by more than the measurement's tolerance; else None.
+        """Return a warning if the robot is outside its limits by more than the tolerance; else None.
 
-        From there only motion back is accepted. Raises RefusedError where the robot is at or behind a singular pose,
-        which no motion may pass.
+        From there only motion back is accepted. Raises RefusedError if the robot is at or behind a singular pose, which
+        no motion may pass.
         """
         pose = self._measured.pose_of(self._measured.position)
         self._motion[:] = 0.0
@@ -155,7 +167,7 @@ class Setpoints:
             )
         if sign_of_det_j2(self._legs, pose) != sign_of_det_j2(self._legs, ZERO_RATES):
             raise RefusedError(
-                RefusalCode.SINGULAR, "the robot stands behind a singular pose: move it back by hand, then enable"
+                RefusalCode.SINGULAR, "the robot is behind a singular pose: move it back by hand, then enable"
             )
         self._tried[0] += self._measured.backlash[0]["offset"]
         violation = self._bounds.standing_violation(
@@ -163,7 +175,7 @@ class Setpoints:
         )
         if violation is None:
             return None
-        words = f"the robot stands outside its limits, only motion back is accepted: {violation}"
+        words = f"the robot is outside its limits, only motion back is accepted: {violation}"
         return coded(
             words,
             EventCode.OUTSIDE_LIMITS,

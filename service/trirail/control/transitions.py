@@ -1,4 +1,4 @@
-"""Changes of mode: the actions on drives, motion and goals in the same cycle."""
+"""Changes of mode, with their actions on drives, motion and goals in the same cycle."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from trirail_drivers.interface import DriveGroup
 
-from trirail.control.feedback import Measured
+from trirail.control.feedback import MeasuredState
 from trirail.control.goal_queue import GoalQueue
 from trirail.control.ledger import Ledger
 from trirail.control.modes import DISABLED, HOLDING, Action, ModeEvent, ModeState, Refusal, Step, step
@@ -26,7 +26,7 @@ _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.INPUT_EDGE: "done",
     ModeEvent.FAULT: "faulted",
 }
-"""Outcome of a goal on an event that ends it; "stopped" on all others."""
+"""Outcome of a goal ended by an event; "stopped" for events not listed."""
 _ORDERS: dict[Action, Callable[[DriveGroup], None]] = {
     Action.POWER_UP: lambda drives: drives.enable(),
     Action.POWER_DOWN: lambda drives: drives.disable(),
@@ -35,24 +35,24 @@ _ORDERS: dict[Action, Callable[[DriveGroup], None]] = {
     Action.HOME: lambda drives: drives.home(),
     Action.STOP_HOMING: lambda drives: drives.stop_homing(),
 }
-"""Order to the drives for an action; the others concern the motion alone."""
-_GO_ON = (
+"""Order to the drives for an action; actions not listed concern only the motion."""
+_KEEPS_GOALS = (
     ModeEvent.GOAL,
     ModeEvent.STANDSTILL,
     ModeEvent.ARRIVED,
     ModeEvent.POWERED,
-    # Homing moves the sliders: goals sent before would not begin from their intended pose.
+    # Not HOME: homing moves the sliders, so that earlier goals would not begin from their intended pose.
     *(
         ModeEvent[name.name]
         for name in Command
         if not name.stops and name.name in ModeEvent.__members__ and name is not Command.HOME
     ),
 )
-"""Events that do not withdraw goals that have been sent but not begun."""
+"""Events that do not withdraw goals that are received but not begun."""
 
 
 class Transitions:
-    """Mode of the robot, and the cycle of its entry; `cycle` is the number of the present cycle, or the next."""
+    """Mode of the robot, and its changes; `cycle` is the number of the present cycle, or of the next between two."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Transitions:
         planner: PlanRequests,
         ledger: Ledger,
         goal_queue: GoalQueue,
-        measured: Measured,
+        measured: MeasuredState,
         setpoints: Setpoints,
     ) -> None:
         self._drives = drives
@@ -74,24 +74,24 @@ class Transitions:
         self.cycle = 1
         self.state: ModeState = DISABLED
         self.fault: str | None = None
-        """First reason since the last reset."""
+        """Reason of the first fault since the last reset."""
         self.entered = 0
         """Cycle in which the mode was entered."""
         self._edge: EventText | None = None
-        """Edge of an input at which the goal under way ends."""
+        """Edge of an input that has ended the goal under way."""
         self.orders = 0
         """Number of orders sent to the drives."""
 
     def check(self, event: ModeEvent) -> Step:
-        """Return the effect that an event would have now. Raises RefusedError where it makes no sense in this mode."""
+        """Return the effect that an event would have now. Raises RefusedError if this mode does not allow it."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             because = f" (fault: {self.fault})" if self.fault else ""
             raise RefusedError(decided.code, f"{decided.message}{because}")
         return decided
 
-    def go(self, event: ModeEvent, reason: EventText, goal: GoalRequest | None = None) -> None:
-        """Change the mode and carry out the action, where the event makes sense; `goal` is the one that begins."""
+    def apply_event(self, event: ModeEvent, reason: EventText, goal: GoalRequest | None = None) -> None:
+        """Change the mode and carry out the action, if the mode allows the event; `goal` is the goal that begins."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             return
@@ -105,9 +105,9 @@ class Transitions:
             self.entered = self.cycle
             self._setpoints.allow(self.state.mode)
         if goal is not None or not self.state.has_goal:
-            self._measured.settling.leave()
+            self._measured.settling.cancel()
         if not self.state.has_goal:
-            self._schedule.stop_on_path()  # also where it brakes already: no goal begins on the way
+            self._schedule.stop_on_path()  # also if it brakes already, so that no later goal begins on the way
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = EventCode.RELEASED if before.released else EventCode.ARRIVED
             at_end = self._edge if self._edge is not None else coded(arrived.value, arrived)
@@ -121,30 +121,30 @@ class Transitions:
             )
         if self.state.mode in (Mode.DISABLED, Mode.FAULT) or self.state == HOLDING:
             self._schedule.replace_runs(deque())
-            self._setpoints.tell_progress(0.0, 0.0)
+            self._setpoints.record_progress(0.0, 0.0)
             self._planner.discard_rate_change()
 
-    def happen(self, event: ModeEvent, reason: EventText) -> None:
+    def handle_disturbance(self, event: ModeEvent, reason: EventText) -> None:
         """Handle a disturbance: the gateway is lost, ticks are late, the service ends."""
         decided = step(self.state, event)
         if not isinstance(decided, Refusal) and decided.state != self.state:
             self._ledger.notices.append(Notice("service", "warning", reason.text, **reason.fields))
-            self.go(event, reason)
+            self.apply_event(event, reason)
         self.withdraw(event, reason)
 
     def trip(self, reason: EventText, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives in this cycle and latch the reason; cause, drive and code are those of FaultDetail."""
+        """Stop all three drives in this cycle, and latch the reason; cause, drive and code are as in FaultDetail."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason.text
         detail = FaultDetail(cause, drive, code)
         self._ledger.notices.append(Notice("fault", "error", reason.text, fault=detail, **reason.fields))
-        self.go(ModeEvent.FAULT, reason)
+        self.apply_event(ModeEvent.FAULT, reason)
         self.withdraw(ModeEvent.FAULT, reason)
 
     def withdraw(self, event: ModeEvent, reason: EventText) -> None:
-        """End goals that have been sent but not begun, where the event stops the robot: after the goals before them."""
-        if event not in _GO_ON:
+        """End goals that are received but not begun, if the event stops the robot; call after `apply_event`."""
+        if event not in _KEEPS_GOALS:
             self._goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason.text)
 
     def _act(self, decided: Step) -> None:
@@ -155,7 +155,7 @@ class Transitions:
             case Action.CLEAR:
                 self.fault = None
             case Action.BRAKE:
-                if not decided.state.paused:  # on the path of the motion under way; later goals do not follow
+                if not decided.state.paused:  # stop on the present path: later goals do not begin
                     self._schedule.stop_on_path()
                 self._planner.set_running(False)
             case Action.RESUME:

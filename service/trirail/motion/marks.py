@@ -105,7 +105,7 @@ class GoalMarks:
         Each has its time along that path [s], its value, the duration of its pulse [s] (NaN for none), whether it
         opens what closes again, and the index of its mark.
         """
-        for k in self._of(output):
+        for k in self._pending_rows(output):
             s, width, mark, on = self._rows[k].tolist()
             if self.begin + s <= end:
                 opens = self._marks[mark].closes and bool(on) == self._marks[mark].value
@@ -113,9 +113,9 @@ class GoalMarks:
 
     def note_passed(self, output: str, number: int) -> None:
         """Note that a number of switches of an output have happened, besides those noted before."""
-        self._passed[self._of(output)[:number]] = True
+        self._passed[self._pending_rows(output)[:number]] = True
 
-    def _of(self, output: str) -> NDArray[np.int64]:
+    def _pending_rows(self, output: str) -> NDArray[np.int64]:
         named = np.array([mark.output == output for mark in self._marks], np.bool)
         return np.flatnonzero(~self._passed & named[self._rows["mark"]]) if len(self._rows) else np.zeros(0, np.int64)
 

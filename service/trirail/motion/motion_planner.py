@@ -21,7 +21,7 @@ from trirail.motion.marks import place_marks
 from trirail.motion.packing import pack_path, pack_run, unpack_run
 from trirail.motion.runs import MotionState
 from trirail.motion.schedule import Schedule
-from trirail.wire.plan_packets import Extended, NotPlanned, PackedRun, PlanAnswer, Planned, PlanRequest
+from trirail.wire.plan_packets import NotPlanned, PackedRun, PathExtension, PlanAnswer, PlanRequest, PreemptingMotion
 
 
 def revision(config: Config) -> int:
@@ -58,8 +58,8 @@ class MotionPlanner:
             return _refusal(request, refusal)
         reply, switches = structs.replace(decided.reply, marks=placed.marks), placed.switches.tobytes()
         if isinstance(decided, Extension):
-            return Extended(number, version, decided.s, pack_path(decided.path), reply, switches)
-        return Planned(
+            return PathExtension(number, version, decided.s, pack_path(decided.path), reply, switches)
+        return PreemptingMotion(
             number,
             version,
             decided.first,
@@ -76,7 +76,7 @@ class MotionPlanner:
         runs: tuple[PackedRun, ...] = ()
         for goal in (goal for motion in MOTIONS.values() for goal in motion.examples):
             answer = self.plan(PlanRequest(0, 0, self._revision, 0, 2, 1.0, start, runs, goal))
-            if isinstance(answer, Planned):
+            if isinstance(answer, PreemptingMotion):
                 runs = (answer.run,)
 
     def _decide(self, request: PlanRequest) -> PlannedMotion | Extension:

@@ -1,6 +1,6 @@
-"""Work of each child process of the service, and its messages to the supervisor, in lines of JSON.
+"""Entry point of each child process, and its messages to the supervisor.
 
-It reports functions being compiled, once that it is up, events for the log, and measurements.
+The messages are lines of JSON: names of functions being compiled, one ready message, events for the log, measurements.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ HAPPENED = "happened"
 MEASURED = "measured"
 """Key of a process's measurements, for the metrics."""
 LOG_WITHIN = 0.05
-"""Longest wait of a log line for a supervisor whose own output is held up, before it is left out [s]."""
+"""Longest wait for a supervisor whose own output is blocked, before a log line is dropped [s]."""
 DRIVES: Final = "drives"
 """Name of the simulated drives' process, and of its socket in the service's folder of sockets."""
 DRIVES_WITHIN: Final = 60.0
-"""Longest time for the drives to be there [s]."""
+"""Longest wait for the socket of the simulated drives [s]."""
 LOOK_EVERY: Final = 0.005
-"""Interval of the checks that they are [s]."""
+"""Interval of the checks for that socket [s]."""
 
 
 class Child:
-    """A child process as it sees itself."""
+    """Context of a child process, with its link to the supervisor."""
 
     def __init__(
         self, name: str, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int], voice: int
@@ -57,38 +57,41 @@ class Child:
         self.heartbeats = heartbeats
         self.sockets = sockets
         """Sockets that the loop listens on."""
-        # It stays open: by its end the supervisor learns of this process's end.
-        self._voice = voice
+        # Stays open until the process ends: the supervisor detects the end by the closed pipe.
+        self._pipe = voice
 
-    def ready(self, content: object) -> None:
-        """Report that it is up. Its first sign of life comes before that: a hang from then on is found."""
+    def report_ready(self, content: object) -> None:
+        """Report that the process is up.
+
+        The first heartbeat precedes the message, so that a hang right after it is detected.
+        """
         if self.name in PROCESSES:
-            self.heartbeats.of(self.name).beat()
-        self._say(content)
+            self.heartbeats.heart(self.name).beat()
+        self._send(content)
 
-    def _say(self, content: object) -> None:
-        with suppress(BrokenPipeError):  # a supervisor that was killed: the loop ends by itself, and the others with it
-            os.write(self._voice, msgspec.json.encode(content) + b"\n")
+    def _send(self, content: object) -> None:
+        with suppress(BrokenPipeError):  # the supervisor was killed: the loop ends by itself, and the others with it
+            os.write(self._pipe, msgspec.json.encode(content) + b"\n")
 
-    def compiling(self, function: str) -> None:
+    def report_compiling(self, function: str) -> None:
         """Report the function that is being compiled."""
-        self._say({COMPILING: function})
+        self._send({COMPILING: function})
 
     def log(self, event: Event) -> None:
         """Report an event."""
-        if select.select([], [self._voice], [], LOG_WITHIN)[1]:
-            self._say({HAPPENED: event})
+        if select.select([], [self._pipe], [], LOG_WITHIN)[1]:
+            self._send({HAPPENED: event})
 
-    def measured(self, content: msgspec.Struct) -> None:
+    def report_measurements(self, content: msgspec.Struct) -> None:
         """Report measurements, unless the pipe is full: new ones follow in a second."""
         line = msgspec.json.encode({MEASURED: content}) + b"\n"
-        if len(line) <= select.PIPE_BUF and select.select([], [self._voice], [], 0.0)[1]:
+        if len(line) <= select.PIPE_BUF and select.select([], [self._pipe], [], 0.0)[1]:
             with suppress(BrokenPipeError):
-                os.write(self._voice, line)
+                os.write(self._pipe, line)
 
 
 def run(child: Child) -> int:
-    """Run the child of that name; return its exit code."""
+    """Run the child process; return its exit code."""
     try:
         return _run(child)
     except TrirailError as error:
@@ -102,7 +105,7 @@ def _run(child: Child) -> int:
     if name in ("loop", "planner"):
         from trirail.kinematics.compiled import on_compile
 
-        on_compile(child.compiling)
+        on_compile(child.report_compiling)
     if name == DRIVES:
         return _serve_drives(child)
     if name == "loop":
@@ -111,25 +114,27 @@ def _run(child: Child) -> int:
         gateway, recorder, planner = (socket.socket(fileno=number) for number in child.sockets)
         ports = Ports(links.Port(gateway), links.Port(recorder), links.Port(planner))
         bus = partial(_bus, config.can, child.runtime / DRIVES)
-        return loop_process.main(config, bus, ports, child.heartbeats, child.ready)
+        return loop_process.main(config, bus, ports, child.heartbeats, child.report_ready)
     if name == "planner":
         return _plan(child)
-    heart = child.heartbeats.of(name)
+    heart = child.heartbeats.heart(name)
     link = links.connect(child.runtime / name)
     if name == "gateway":
         from trirail.processes import gateway as gate
 
-        order, hurrying = child.order, child.heartbeats.hurrying
-        return gate.main(order, link, heart.beat, child.ready, child.log, child.measured, hurrying)
+        order, urgent_section = child.order, child.heartbeats.urgent_section
+        return gate.main(
+            order, link, heart.beat, child.report_ready, child.log, child.report_measurements, urgent_section
+        )
     from trirail.processes import recording
 
-    return recording.main(config, child.order.record, link, heart, child.ready, child.measured)
+    return recording.main(config, child.order.record, link, heart, child.report_ready, child.report_measurements)
 
 
 def _plan(child: Child) -> int:
-    """Run the planner: answer the loop's requests, one at a time, until the loop has gone.
+    """Run the planner: answer the loop's requests, one at a time, until the loop has ended.
 
-    It runs beside the loop and never on its processor; it keeps nothing, so it may be killed at any time.
+    The planner never runs on the loop's processor. It has no state, so it can be killed at any time.
     """
     from trirail.motion.motion_planner import MotionPlanner
 
@@ -141,12 +146,12 @@ def _plan(child: Child) -> int:
 
     serving = False
     poll = select.poll()
-    config, heart = child.order.config, child.heartbeats.of(child.name)
+    config, heart = child.order.config, child.heartbeats.heart(child.name)
     planner = MotionPlanner(config, beat)
     planner.warm_up()
     lacking = realtime.stay_beside(config.loop, realtime.PLANNER_BELOW)
     link = links.connect(child.runtime / child.name)
-    child.ready({"lacking": lacking})
+    child.report_ready({"lacking": lacking})
     poll.register(link.fileno(), select.POLLIN)
     serving = True
     try:
@@ -165,9 +170,10 @@ def _plan(child: Child) -> int:
 
 
 def _serve_drives(child: Child) -> int:
-    """Run the simulated drives until the loop has gone: it has them on a bus between processes, as real ones on theirs.
+    """Run the simulated drives until the loop has ended.
 
-    They keep nothing, so they may be killed after it.
+    The loop reaches them over a bus between processes, as it reaches real drives over CAN. They have no state, so they
+    can be killed once the loop has ended.
     """
     from trirail_drivers.connection.serving import serve
 
@@ -175,10 +181,10 @@ def _serve_drives(child: Child) -> int:
 
     def begin() -> None:
         lacking = realtime.stay_beside(config.loop, realtime.DRIVES_BELOW)
-        child.ready({"lacking": lacking})
+        child.report_ready({"lacking": lacking})
 
     def connected() -> None:
-        # The loop stops the robot first, on any signal to end; its end is the end of this process.
+        # On SIGTERM the loop stops the robot first; this process ends when the loop disconnects.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     serve(child.runtime / DRIVES, config.can, config.drives, begin, connected)
@@ -186,7 +192,10 @@ def _serve_drives(child: Child) -> int:
 
 
 def _bus(can: Can, drives: Path) -> Can:
-    """Return [can] of the bus that the loop is on; with simulated drives, once their process serves them."""
+    """Return the loop's [can] section; for simulated drives, wait for their process and return its socket.
+
+    Raises ServiceError if the socket does not appear within DRIVES_WITHIN.
+    """
     if can.interface != "simulated":
         return can
     deadline = time.monotonic() + DRIVES_WITHIN

@@ -1,7 +1,8 @@
-"""Fixed-rate ticks on absolute deadlines of the monotonic clock, with calls served meanwhile.
+"""Fixed-rate ticks on absolute deadlines of the monotonic clock; messages that arrive during a wait end it early.
 
-The wait is compiled, for both ways of the loop. A call with time left before the deadline is served immediately, not a
-cycle later.
+A neighbour is a process connected to the loop; it calls by sending a packet or by disconnecting. A call that arrives
+early enough before the deadline is served immediately, not a cycle later. The wait is compiled, and used by the Python
+cycle and the compiled one alike.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ from numpy.typing import NDArray
 from trirail.kinematics.compiled import compiled
 from trirail.wire.links import Port
 
-# Of libc, by name: time.h, poll.h.
+# Functions of libc, resolved by name: time.h, poll.h.
 _clock_nanosleep: Any = types.ExternalFunction("clock_nanosleep", i4(i4, i4, types.intp, types.intp))
 _clock_gettime: Any = types.ExternalFunction("clock_gettime", i4(i4, types.intp))
 _poll: Any = types.ExternalFunction("poll", i4(types.intp, u8, i4))
 _ppoll: Any = types.ExternalFunction("ppoll", i4(types.intp, u8, types.intp, types.intp))
 
-DOORS = i4[:, ::1]
+POLLFDS = i4[:, ::1]
 SPARE_NS: Final = 500_000
-"""Time allowed to Python for a call [ns]; one that comes later before a deadline waits behind its setpoints."""
+"""Time that Python needs to serve a call [ns]; with less time before the deadline, a call waits for the next cycle."""
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
-"""TIMER_ABSTIME of clock_nanosleep: to a deadline."""
+"""TIMER_ABSTIME of clock_nanosleep."""
 _INTERRUPTED: Final = 4
 """EINTR of errno.h."""
 _POLLIN: Final = 1
@@ -50,77 +51,85 @@ def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
         pass
 
 
-@compiled(b1(DOORS))
-def called(doors: NDArray[np.int32]) -> bool:
-    """Return whether a peer is at a door, or has gone from one; `doors` (n, 2) is an array for poll."""
-    return bool(_poll(doors.ctypes.data, np.uint64(len(doors)), 0) != 0)
+@compiled(b1(POLLFDS))
+def called(pollfds: NDArray[np.int32]) -> bool:
+    """Return whether a neighbour calls; `pollfds` (n, 2) is an array of struct pollfd."""
+    return bool(_poll(pollfds.ctypes.data, np.uint64(len(pollfds)), 0) != 0)
 
 
-@compiled(b1(i8, DOORS, i8[::1]), releases=True)
-def wait(deadline_ns: int, doors: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
-    """Wait until the deadline or, more than SPARE_NS before it, until a peer is at a door; return whether one is.
+@compiled(b1(i8, POLLFDS, i8[::1]), releases=True)
+def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
+    """Wait for the deadline, or for a call that arrives more than SPARE_NS before it; return whether there is a call.
 
-    `doors` and `moment` as in `called` and `now_ns`. The two waits are separate: with one call that watches the doors
-    until the deadline, ticks come later.
+    Parameters
+    ----------
+    deadline_ns : int
+        Time of the monotonic clock [ns].
+    pollfds : (n, 2)
+        Sockets of the neighbours, as in `called`.
+    moment : (2,)
+        Room for a struct timespec.
+
     """
+    # Two separate waits: one ppoll that watches the sockets until the deadline wakes up later than clock_nanosleep.
     left = deadline_ns - SPARE_NS - now_ns(moment)
     while left > 0:
         moment[0], moment[1] = left // _SECOND, left % _SECOND
-        if _ppoll(doors.ctypes.data, np.uint64(len(doors)), moment.ctypes.data, 0) > 0:
+        if _ppoll(pollfds.ctypes.data, np.uint64(len(pollfds)), moment.ctypes.data, 0) > 0:
             return True
         left = deadline_ns - SPARE_NS - now_ns(moment)
     sleep(deadline_ns, moment)
     return False
 
 
-class Doors:
-    """Neighbours' doors, for compiled code."""
+class PollSet:
+    """Sockets of the neighbours, to poll in compiled code."""
 
     def __init__(self, ports: Sequence[Port]) -> None:
         self._ports = ports
-        self.room = np.zeros((len(ports), 2), np.int32)
-        """Array for poll."""
+        self.pollfds = np.zeros((len(ports), 2), np.int32)
+        """Array of struct pollfd."""
         self._moment = np.zeros(2, np.int64)
 
     def refresh(self) -> None:
-        """Write the peers that are connected now into the room."""
-        for door, port in zip(self.room, self._ports, strict=True):
-            door[:] = port.fileno(), _POLLIN
+        """Update the array with the present connections."""
+        for pollfd, port in zip(self.pollfds, self._ports, strict=True):
+            pollfd[:] = port.fileno(), _POLLIN
 
     def called(self) -> bool:
-        """Return whether a peer is at a door."""
+        """Return whether a neighbour calls."""
         self.refresh()
-        return bool(called(self.room))
+        return bool(called(self.pollfds))
 
     def wait(self, deadline_ns: int) -> bool:
-        """Wait as the function `wait` does."""
+        """Wait for the deadline or an early call, as in `wait`."""
         self.refresh()
-        return bool(wait(deadline_ns, self.room, self._moment))
+        return bool(wait(deadline_ns, self.pollfds, self._moment))
 
 
 class Tick(NamedTuple):
-    """One tick."""
+    """One tick of the loop."""
 
     deadline_ns: int
-    """Time at which it was due."""
+    """Time at which it was due [ns]."""
     lateness_ns: int
-    """Delay of the tick after that."""
+    """Delay after the deadline [ns]."""
     missed: int
-    """Ticks skipped since the one before."""
+    """Number of ticks skipped before it."""
 
 
 class Overruns:
-    """Counts of missed ticks, of which `allowed` may be in a row."""
+    """Counter of missed ticks, with a limit `allowed` on consecutive ones."""
 
     def __init__(self, allowed: int) -> None:
         self.allowed = allowed
         self.all = 0
-        """Number since the start."""
+        """Number of missed ticks since the start."""
         self.in_a_row = 0
-        """Number before the newest tick and, if ticks were missed before that as well, before those."""
+        """Number of consecutive missed ticks, up to the newest tick."""
 
     def too_many(self, missed: int) -> int:
-        """Count the ticks missed before one; return how many are in a row, if that is more than allowed."""
+        """Count the ticks missed before a tick; return the consecutive ones if they exceed the limit, else 0."""
         self.all += missed
         in_a_row = self.in_a_row + missed if missed else 0
         self.in_a_row = in_a_row if in_a_row <= self.allowed else 0
@@ -135,7 +144,7 @@ def sleep_until(deadline_ns: int) -> None:
 
 
 class Ticker:
-    """Ticks every `period_ns`; a tick that is missed is skipped and counted, never caught up in a burst."""
+    """Source of ticks every `period_ns`; a missed tick is skipped and counted, never caught up in a burst."""
 
     def __init__(
         self,
@@ -149,36 +158,36 @@ class Ticker:
         self.deadline_ns = now()
         """Time at which the newest tick was due."""
 
-    def come(self) -> int:
-        """Sleep to the next deadline by an injected clock, and return its time [ns].
+    def sleep_if_injected(self) -> int:
+        """Sleep until the next deadline of an injected clock, and return its time [ns].
 
-        With the machine's clock, return -1 immediately: the caller can wait for that one by itself.
+        Return -1 immediately for the machine's clock, since compiled code waits for that clock itself.
         """
         if self._now is time.monotonic_ns:
             return -1
-        self._sleep_on()
+        self._sleep_to_next()
         return self._now()
 
-    def listen(self, doors: Doors) -> bool:
-        """Wait for the next deadline or, with time left before it, for a peer at a door; return whether one is."""
+    def listen(self, poll_set: PollSet) -> bool:
+        """Wait for the next deadline or an early call; return whether there is a call."""
         if self._now is time.monotonic_ns:
-            return doors.wait(self.deadline_ns + self._period_ns)
-        self._sleep_on()
-        return doors.called()
+            return poll_set.wait(self.deadline_ns + self._period_ns)
+        self._sleep_to_next()
+        return poll_set.called()
 
     def wait(self) -> Tick:
-        """Sleep until the next deadline that is not over yet by a whole period."""
-        self._sleep_on()
+        """Sleep until the next deadline, skipping those missed by a whole period or more."""
+        self._sleep_to_next()
         self.deadline_ns += self._period_ns
         return self.tick()
 
-    def _sleep_on(self) -> None:
-        """Sleep to the next deadline, if it is not over."""
+    def _sleep_to_next(self) -> None:
+        """Sleep until the next deadline, if it is in the future."""
         if self._now() < self.deadline_ns + self._period_ns:
             self._sleep(self.deadline_ns + self._period_ns)
 
     def tick(self) -> Tick:
-        """Return the tick whose deadline has come, after a wait by the caller."""
+        """Return the tick that is due, after the caller has waited for it."""
         lateness_ns = self._now() - self.deadline_ns
         missed = max(0, lateness_ns // self._period_ns)
         self.deadline_ns += missed * self._period_ns

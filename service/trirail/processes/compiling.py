@@ -1,6 +1,6 @@
-"""Compilation of the mathematics, once, at the first start: reports about it, and doing it ahead of the first start.
+"""Compilation of the numerical functions at the first start, with progress reports.
 
-`python -m trirail.processes.compiling` compiles all that a service needs.
+`python -m trirail.processes.compiling` compiles everything ahead of the first start.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import sys
 from collections.abc import Callable
 
 from trirail.processes.operating_system import notify
-from trirail.processes.realtime import give_back
+from trirail.processes.realtime import release_startup_memory
 
-LOADED = "trirail.processes.loop_process"
-"""Module that is imported last, once all compiled rooms are."""
+LAST_MODULE = "trirail.processes.loop_process"
+"""Module imported last: once it is loaded, all compiled modules are."""
 QUARTERS = 4
 """Number of progress reports."""
 
@@ -31,7 +31,7 @@ class Progress:
         if not self._begun:
             return "the start is interrupted, nothing has moved"
         place = len(self._begun)
-        return f"compiling is interrupted at function {place}: those before it are kept, the next start goes on there"
+        return f"compiling is interrupted at function {place}: those before it are kept, the next start continues there"
 
     def begin(self, name: str) -> None:
         """Report that a function is being compiled; the next one may follow after the patience [s]."""
@@ -53,10 +53,10 @@ class NotKeptError(Exception):
 
 
 def load() -> bool:
-    """Import the compiled rooms for good, which takes a second; return False if something would have to be compiled."""
-    if LOADED in sys.modules:
+    """Import the compiled modules, which takes a second; return False if a function is not cached yet."""
+    if LAST_MODULE in sys.modules:
         return True
-    # numba imports it where it is installed, 0.15 s and 10 MB, for linear algebra that nothing compiled here asks for.
+    # numba imports scipy if it is installed, 0.15 s and 10 MB, for linear algebra that no compiled function here uses.
     sys.modules.setdefault("scipy", None)  # type: ignore[arg-type]
     from trirail.kinematics.compiled import compile_no_more, on_compile
 
@@ -69,7 +69,7 @@ def load() -> bool:
     except NotKeptError:
         return False
     compile_no_more()
-    give_back()
+    release_startup_memory()
     return True
 
 

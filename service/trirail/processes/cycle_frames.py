@@ -1,8 +1,8 @@
-"""Frames of a cycle, for compiled code: sending, receiving, detecting anything new, and encoding setpoints.
+"""Compiled exchange of a cycle's CAN frames: send, receive, recognise expected frames, encode setpoints.
 
-It knows no protocol, only the tables of trirail_drivers.driver.cyclic: `axes` (3,) of AXIS, `expected` (n,) of
-EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. A driver's use of them is in its axes.
-Frames are exchanged by libc on the bus' socket, or by Python functions if the bus has none.
+The code knows no drive protocol, only the tables of trirail_drivers.driver.cyclic: `axes` (3,) of AXIS, `expected` (n,)
+of EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. Each driver fills these tables.
+Frames pass through libc on the socket of the bus, or through Python functions for a bus without a socket.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LENGTH_AT = 4
 """Offset of the data length in a frame."""
 
 
-# Of libc, by name: sys/socket.h, errno.h, string.h.
+# Functions of libc, resolved by name: sys/socket.h, errno.h, string.h.
 _sendmmsg: Any = types.ExternalFunction("sendmmsg", i4(i4, types.intp, types.uint32, i4))
 _recvmmsg: Any = types.ExternalFunction("recvmmsg", i4(i4, types.intp, types.uint32, i4, types.intp))
 _errno: Any = types.ExternalFunction("__errno_location", types.intp())
@@ -39,8 +39,8 @@ memcpy: Any = types.ExternalFunction("memcpy", types.intp(types.intp, types.intp
 
 _NOTHING_THERE: Final = 11
 """EAGAIN of errno.h."""
-_KEPT: Final = -1
-"""Error that the next receiver meets again: the other end has gone, or Python has caught one and keeps it."""
+_PERSISTENT_ERROR: Final = -1
+"""Error that the next call returns again: the other end has disconnected, or Python has stored an exception."""
 _FLAGS: Final = 0x40 | 0x4000
 """MSG_DONTWAIT, MSG_NOSIGNAL."""
 _FRAME: Final = CAN_FRAME.size
@@ -49,10 +49,10 @@ _FRAME: Final = CAN_FRAME.size
 def _call(_typing: Any, _address: Any, _frames: Any, _number: Any) -> Any:
     """Compile a call of the function at an address with two numbers, which returns one."""
 
-    def build(_context: Any, builder: Any, _signature: Any, given: Any) -> Any:
+    def build(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         word = ir.IntType(64)
-        function = builder.inttoptr(given[0], ir.FunctionType(word, (word, word)).as_pointer())
-        return builder.call(function, given[1:])
+        function = builder.inttoptr(arguments[0], ir.FunctionType(word, (word, word)).as_pointer())
+        return builder.call(function, arguments[1:])
 
     return i8(i8, i8, i8), build
 
@@ -62,24 +62,38 @@ _called: Any = intrinsic(_call)
 
 @compiled()
 def receive_frames(
-    bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], room: NDArray[np.int64]
+    bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], scratch: NDArray[np.int64]
 ) -> tuple[int, int]:
-    """Receive the frames that have arrived; return their number, and the error that followed them.
+    """Receive the frames that have arrived.
 
-    `bus` (3,) is a BusAccess; `headers` and `frames` are of PackedFrames, with room for
-    MOST_FRAMES. An error is a number of errno.h; 0 for none, below 0 if the next receiver meets it again.
+    Parameters
+    ----------
+    bus : (3,)
+        A BusAccess.
+    headers, frames
+        Arrays of PackedFrames, with room for MOST_FRAMES.
+    scratch : (1,)
+        Scratch space.
+
+    Returns
+    -------
+    number : int
+        Number of frames received.
+    error : int
+        Error after them, a number of errno.h; 0 for none, negative for one that the next call returns again.
+
     """
     if bus[0] < 0:
         number = _called(bus[1], frames.ctypes.data, MOST_FRAMES)
-        return (number, 0) if number >= 0 else (~number, _KEPT)
+        return (number, 0) if number >= 0 else (~number, _PERSISTENT_ERROR)
     number = _recvmmsg(bus[0], headers.ctypes.data, np.uint32(MOST_FRAMES), _FLAGS, 0)
     if number < 0:
-        room[0] = 0
-        memcpy(room.ctypes.data, _errno(), np.uint64(4))
-        return 0, (room[0] if room[0] != _NOTHING_THERE else 0)
+        scratch[0] = 0
+        memcpy(scratch.ctypes.data, _errno(), np.uint64(4))
+        return 0, (scratch[0] if scratch[0] != _NOTHING_THERE else 0)
     for i in range(number):
         if headers[i, 7] & np.uint64(0xFFFFFFFF) != np.uint64(_FRAME):
-            return i, _KEPT
+            return i, _PERSISTENT_ERROR
     return number, 0
 
 
@@ -87,10 +101,7 @@ def receive_frames(
 def send_frames(
     bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], times: NDArray[np.void]
 ) -> int:
-    """Send frames, of PackedFrames, and count the bits that they take of the bus.
-
-    Return how many it has accepted, before the first that it has refused.
-    """
+    """Send frames of PackedFrames and count their bits; return the number accepted before the first refused one."""
     if len(headers) == 0:
         return 0
     if bus[0] < 0:
@@ -121,7 +132,7 @@ def _signed(number: int) -> int:
 def _answers_in_time(axis: Any) -> bool:
     """Count a position as the answer to a SYNC, as trirail_drivers.driver.axis.Answers.answer does.
 
-    Return False, and count nothing, for the second answer to a SYNC, and where one has been late or lost.
+    Return False, and count nothing, for a second answer to the same SYNC, or after a late or lost answer.
     """
     to_the_one_before = not axis.between and not axis.prompt and axis.sampled < axis.syncs - 1
     sampled = axis.syncs - to_the_one_before
@@ -133,8 +144,8 @@ def _answers_in_time(axis: Any) -> bool:
 
 
 @compiled()
-def _take_position(axis: Any, counts: int, now: float) -> bool:
-    """Accept a position [counts]; return False, and change nothing, if `_answers_in_time` does."""
+def _accept_counts(axis: Any, counts: int, now: float) -> bool:
+    """Store a position [counts]; return False, and change nothing, if it is not an answer in time."""
     if not _answers_in_time(axis):
         return False
     if abs(counts - axis.stands_at) > axis.still:
@@ -149,8 +160,8 @@ def _take_position(axis: Any, counts: int, now: float) -> bool:
 
 
 @compiled()
-def _take_turns(axis: Any, turns: float) -> bool:
-    """Accept a position [turns]; return False, and change nothing, if it is not finite or `_answers_in_time` does."""
+def _accept_turns(axis: Any, turns: float) -> bool:
+    """Store a position [turns]; return False, and change nothing, if it is not finite or not an answer in time."""
     if not math.isfinite(turns) or not _answers_in_time(axis):
         return False
     axis.position = turns / axis.counts_per_metre + axis.zero
@@ -158,7 +169,7 @@ def _take_turns(axis: Any, turns: float) -> bool:
 
 
 @compiled(i8(FRAMES, i8, EXPECTATIONS, AXES, TIMINGS, f8))
-def take_frames(
+def process_frames(
     frames: NDArray[np.uint8],
     number: int,
     expected: NDArray[np.void],
@@ -166,9 +177,18 @@ def take_frames(
     times: NDArray[np.void],
     now: float,
 ) -> int:
-    """Process frames received by a time [s] up to the first that holds anything new; return how many.
+    """Process received frames up to the first unexpected one; return the number processed.
 
-    The frames from that one on are untouched: the caller continues there.
+    A frame is unexpected if its identifier, length or masked data match no row of `expected`, or if its position is not
+    an answer in time. The caller passes it and the frames after it to Python.
+
+    Parameters
+    ----------
+    frames : (n, 16)
+        Frames, the first `number` of them received.
+    now : float
+        Time of reception [s].
+
     """
     for i in range(number):
         frame = frames[i]
@@ -186,9 +206,9 @@ def take_frames(
         if row.position_at != NO_OFFSET:
             at = DATA_AT + row.position_at
             if axis.floats:
-                if not _take_turns(axis, float(frames[i, at : at + 4].view(np.float32)[0])):
+                if not _accept_turns(axis, float(frames[i, at : at + 4].view(np.float32)[0])):
                     return i
-            elif not _take_position(axis, _signed(_number(frame, at, 4)), now):
+            elif not _accept_counts(axis, _signed(_number(frame, at, 4)), now):
                 return i
         if row.status_at != NO_OFFSET:
             axis.statusword = _number(frame, DATA_AT + row.status_at, 2)
@@ -275,7 +295,7 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
 
 @compiled()
 def needs_python(axes: NDArray[np.void], words: NDArray[np.int64]) -> bool:
-    """Whether wanted outputs, words (3,) of bits of 60FEh, differ from those of a drive that takes them by SDO only."""
+    """Return whether an output has changed on a drive that accepts outputs only by SDO; `words` (3,) are 60FEh."""
     for i in range(3):
         axis = axes[i]
         if axis.has_outputs and not axis.maps_outputs and words[i] != axis.outputs_sent:
@@ -291,9 +311,9 @@ def send_outputs(
     axes: NDArray[np.void],
     times: NDArray[np.void],
 ) -> bool:
-    """Send the outputs that differ from those sent last, each in the frame of its drive, up to the first refused one.
+    """Send the changed outputs, each in the frame of its drive; return whether the bus has accepted all.
 
-    Return whether the bus has accepted all. `headers` and `frames` are of PackedFrames, a frame for each drive or none.
+    `headers` and `frames` are arrays of PackedFrames with one frame per drive, or empty.
     """
     for i in range(len(headers)):
         axis = axes[i]
@@ -320,7 +340,7 @@ def exchange_frames(
     lateness: NDArray[np.int64],
     work: NDArray[np.int64],
 ) -> int:
-    """Run cycles that exchange frames and compute nothing, to measure the machine; return the frames received.
+    """Run cycles that exchange frames without computing, to measure the machine; return the number of frames received.
 
     Parameters
     ----------

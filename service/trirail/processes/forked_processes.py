@@ -1,6 +1,6 @@
-"""The fork server and the processes that it has forked, from the supervisor's side.
+"""Supervisor's side of the fork server and of the processes forked by it.
 
-Each reports on a pipe that it is ready, and its measurements; the pipe's end is its end.
+Each child reports on a pipe that it is ready, and its measurements; the pipe closes when the child ends.
 """
 
 from __future__ import annotations
@@ -17,144 +17,155 @@ from typing import Any
 import msgspec
 
 from trirail.processes.child_process import COMPILING, HAPPENED, MEASURED
-from trirail.processes.fork_server import LARGEST, MATHEMATICS, OF_TERMINAL, Ended, Fork, Forked, Inheritance, fork
+from trirail.processes.fork_server import (
+    MATHEMATICS,
+    MAX_PACKET_BYTES,
+    TERMINAL_SIGNALS,
+    ChildEnd,
+    ChildStart,
+    Fork,
+    Inheritance,
+    fork,
+)
 from trirail.processes.heartbeats import Heartbeats
 from trirail.processes.order import Order
 from trirail.wire.decoding import converted, decoded, prepare
 from trirail.wire.messages import Event
 
-TELLS_WITHIN = 1.0
-"""Longest time after the end of a child for the fork server to report how it ended [s]."""
-IMPORTS_WITHIN = 6.0
-"""The same while it may be importing the mathematics [s]."""
-UNTOLD = os.EX_UNAVAILABLE
-"""Exit code of a child whose parent, gone, frozen or busy, does not report how it ended; none has it by itself."""
+END_REPORT_TIMEOUT_S = 1.0
+"""Longest wait for the fork server's report after a child has ended [s]."""
+IMPORT_TIMEOUT_S = 6.0
+"""The same while the fork server may be importing the compiled modules [s]."""
+EXIT_CODE_UNKNOWN = os.EX_UNAVAILABLE
+"""Exit code of a child whose end the fork server does not report; no child exits with it by itself."""
 
-prepare(Forked | Ended)
+prepare(ChildStart | ChildEnd)
 
 
 class ServerProcess:
-    """Process of the fork server, as Popen is for one's own child."""
+    """Process of the fork server, with the interface of Popen."""
 
     def __init__(self, inheritance: Inheritance) -> None:
         self._pid = fork(inheritance)
         self._code: int | None = None
 
     def wait(self) -> int:
-        """Wait for its end, and return its exit code, or the negative number of the signal that killed it."""
+        """Wait for the end; return the exit code, or the negative number of the signal that killed the process."""
         if self._code is None:
             self._code = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
         return self._code
 
     def kill(self) -> None:
-        """Kill it, unless its end has been waited for."""
+        """Kill the process, unless `wait` has returned."""
         if self._code is None:
             os.kill(self._pid, signal.SIGKILL)
 
 
 class ForkServerLink:
-    """Link to the fork server: starts it, requests children, receives their ends; only for a process of one thread."""
+    """Link to the fork server: starts it, requests children, receives reports of their ends.
+
+    The process that creates the link must have a single thread, since it forks.
+    """
 
     def __init__(self, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int]) -> None:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
-        # The supervisor alone acts on what a terminal sends to all: also while the server is still importing.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, OF_TERMINAL)
+        # Blocked across the fork: a terminal's signals must not end the server before it ignores them.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
         with theirs:
             self._process = ServerProcess(Inheritance(theirs, order, runtime, heartbeats, sockets))
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        self._asked: dict[int, ChildProcess] = {}
+        self._requested: dict[int, ChildProcess] = {}
         self._numbers = 0
         self._hung_for = 0.0
-        self.tells_within = IMPORTS_WITHIN
-        """Longest wait for its next message; 0 after a wait in vain [s]."""
+        self.report_timeout = IMPORT_TIMEOUT_S
+        """Longest wait for the next message [s]; 0 after a wait that timed out."""
         self.gone = False
-        """Whether it has ended: then SIGTERM has been sent to the loop as well."""
+        """Whether the fork server has ended; the kernel has then sent SIGTERM to the loop."""
 
     def fileno(self) -> int:
-        """Return the descriptor for select."""
+        """Return the descriptor to pass to select."""
         return self._control.fileno()
 
     def fork(self, child: ChildProcess, record: str | None, voice: int, *, again: bool = False) -> None:
-        """Request a child that sends its messages on the descriptor `voice`."""
+        """Request a child that sends its messages to the descriptor `voice`."""
         self._numbers += 1
-        self._asked[self._numbers] = child
+        self._requested[self._numbers] = child
         request = Fork(self._numbers, child.name, record, again)
         try:
             socket.send_fds(self._control, [msgspec.json.encode(request)], [voice])
         except OSError:
-            self._lost()
+            self._on_end()
 
-    def hear(self) -> None:
-        """Process its messages, or its end, if any."""
+    def receive(self) -> None:
+        """Receive and process one message, or the end of the fork server, if any."""
         try:
-            packet, descriptors, _, _ = socket.recv_fds(self._control, LARGEST, 1)
+            packet, descriptors, _, _ = socket.recv_fds(self._control, MAX_PACKET_BYTES, 1)
         except BlockingIOError:
             return
         except OSError:
             packet = b""
         if not packet:
-            self._lost()
+            self._on_end()
             return
-        said: Forked | Ended = decoded(packet, Forked | Ended)
-        if isinstance(said, Forked):
-            child = self._asked[said.number]
-            child.forked(said.pid, *descriptors)
+        message: ChildStart | ChildEnd = decoded(packet, ChildStart | ChildEnd)
+        if isinstance(message, ChildStart):
+            child = self._requested[message.number]
+            child.forked(message.pid, *descriptors)
             if child.name in MATHEMATICS:
-                self.tells_within = TELLS_WITHIN
+                self.report_timeout = END_REPORT_TIMEOUT_S
         else:
-            self._asked.pop(said.number).ended(said.code)
+            self._requested.pop(message.number).ended(message.code)
 
-    def speaks(self) -> bool:
-        """Wait for its next message; return False if none comes, and then do not wait again."""
-        heard = bool(select.select([self], [], [], self.tells_within)[0])
-        self.tells_within = self.tells_within if heard else 0.0
+    def wait_for_message(self) -> bool:
+        """Wait for the next message; return False on a time-out, after which later calls do not wait."""
+        heard = bool(select.select([self], [], [], self.report_timeout)[0])
+        self.report_timeout = self.report_timeout if heard else 0.0
         return heard
 
-    def how(self) -> str:
-        """Return how it ended, for people."""
-        return how_ended(self._process.wait(), self._hung_for)
+    def describe_end(self) -> str:
+        """Return the manner of the fork server's end, for people."""
+        return describe_exit(self._process.wait(), self._hung_for)
 
     def kill(self) -> None:
-        """Kill it: the loop, if there is one, stops the robot and ends."""
+        """Kill the fork server; the loop, if there is one, stops the robot and ends."""
         self._process.kill()
 
     def kill_hung(self, silent: float) -> None:
-        """Kill it because it has not answered for `silent` seconds."""
+        """Kill the fork server after `silent` seconds without an answer."""
         self._hung_for = silent
         self.kill()
 
     def close(self) -> None:
-        """End it: it has nothing to keep."""
+        """Kill the fork server, which has no state to save."""
         self.kill()
         self._process.wait()
         self._control.close()
 
-    def _lost(self) -> None:
+    def _on_end(self) -> None:
         self.gone = True
-        for child in self._asked.values():
+        for child in self._requested.values():
             child.orphaned()
 
 
 class ChildProcess:
-    """Child of the fork server, with the interface of Popen; and a pipe for its messages, whose end is its end."""
+    """Child of the fork server, with the interface of Popen and a pipe for its messages."""
 
     def __init__(self, parent: ForkServerLink, name: str, record: str | None, *, again: bool = False) -> None:
         self.name = name
         self._parent = parent
         self._pidfd: int | None = None
         self._killed = False
-        """Whether it has been killed."""
         self.pid: int | None = None
-        """None before it has been forked."""
+        """Process id; None before the fork."""
         self.returncode: int | None = None
-        """None before its end; as Popen has it."""
+        """Exit code as in Popen; None before the end."""
         self.began = time.monotonic()
         self.compiling: list[str] = []
-        self.happened: list[Event] = []
-        self.measured: list[dict[str, Any]] = []
-        self._begun_line = b""
-        self.ready_with: dict[str, Any] | None = None
+        self.events: list[Event] = []
+        self.measurements: list[dict[str, Any]] = []
+        self._partial_line = b""
+        self.ready_message: dict[str, Any] | None = None
         self._hung_for = 0.0
         self.pipe, write = os.pipe()
         os.set_blocking(self.pipe, False)
@@ -162,38 +173,38 @@ class ChildProcess:
         os.close(write)
 
     def forked(self, pid: int, pidfd: int) -> None:
-        """Record that it has been forked."""
+        """Record the start of the process."""
         self.pid, self._pidfd = pid, pidfd
         if self._killed:
             self.send_signal(signal.SIGKILL)
 
     def ended(self, code: int) -> None:
-        """Record that it has ended."""
+        """Record the end of the process."""
         self.returncode = code
         if self._pidfd is not None:
             os.close(self._pidfd)
             self._pidfd = None
 
     def orphaned(self) -> None:
-        """Record that its parent has ended before it, so that nobody reports its end."""
+        """Record that the fork server has ended, so that the end of this child will not be reported."""
         if self.pid is None and self.returncode is None:
-            self.ended(UNTOLD)
+            self.ended(EXIT_CODE_UNKNOWN)
 
     def send_signal(self, number: int) -> None:
-        """Send a signal."""
+        """Send a signal, unless the child has ended or is not forked yet."""
         if self._pidfd is not None:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
 
     def kill(self) -> None:
-        """Kill it; one that has not been forked yet counts as ended, and is killed when it is."""
+        """Kill the child; one that is not forked yet counts as ended, and is killed as soon as it is forked."""
         self.send_signal(signal.SIGKILL)
         self._killed = True
         if self.pid is None:
             self.returncode = 0
 
     def wait(self, deadline: float) -> bool:
-        """Wait for its end until a time of the monotonic clock; return False if it has not ended by then."""
+        """Wait for the end until a time of the monotonic clock; return False on a time-out."""
         while self.returncode is None:
             watched = [] if self._parent.gone else [self._parent.fileno()]
             watched += [] if self._pidfd is None else [self._pidfd]
@@ -201,49 +212,55 @@ class ChildProcess:
             if not ready:
                 return False
             if self._parent.fileno() in ready:
-                self._parent.hear()
-            elif self._parent.gone or not self._parent.speaks():
-                self.ended(UNTOLD)  # it has ended, and its parent does not say how
+                self._parent.receive()
+            elif self._parent.gone or not self._parent.wait_for_message():
+                self.ended(EXIT_CODE_UNKNOWN)  # the pidfd is readable, and the fork server does not report
         return True
 
-    def listen(self) -> bool:
+    def read_messages(self) -> bool:
         """Read the child's messages; return False once it has ended."""
         try:
             content = os.read(self.pipe, 65_536)
         except BlockingIOError:
             return False
-        *lines, self._begun_line = (self._begun_line + content).split(b"\n")
+        *lines, self._partial_line = (self._partial_line + content).split(b"\n")
         for line in lines:
-            said = msgspec.json.decode(line)
-            if COMPILING in said:
-                self.compiling.append(said[COMPILING])
-            elif HAPPENED in said:
-                self.happened.append(converted(said[HAPPENED], Event))
-            elif MEASURED in said:
-                self.measured.append(said[MEASURED])
+            message = msgspec.json.decode(line)
+            if COMPILING in message:
+                self.compiling.append(message[COMPILING])
+            elif HAPPENED in message:
+                self.events.append(converted(message[HAPPENED], Event))
+            elif MEASURED in message:
+                self.measurements.append(message[MEASURED])
             else:
-                self.ready_with = said
+                self.ready_message = message
         return bool(content)
 
     def kill_hung(self, silent: float) -> None:
-        """Kill it after `silent` seconds without a sign of life; SIGTERM would wait, if it is stopped."""
+        """Kill the child after `silent` seconds without a sign of life; a stopped process would not act on SIGTERM."""
         self._hung_for = silent
         self.kill()
 
     @property
-    def how(self) -> str:
-        """Manner of its end, for people."""
+    def end_description(self) -> str:
+        """Manner of the child's end, for people."""
         code = self.returncode
-        return how_ended(code, self._hung_for) if code else "another process sent it SIGTERM"
+        return describe_exit(code, self._hung_for) if code else "another process sent it SIGTERM"
 
 
-def how_ended(code: int, hung_for: float) -> str:
-    """Return how a process ended, for people.
+def describe_exit(code: int, hung_for: float) -> str:
+    """Return the manner of a process's end, for people.
 
-    `code` is its exit code, as in Popen; `hung_for` the time without a sign of life for which it was killed, or 0 [s].
+    Parameters
+    ----------
+    code : int
+        Exit code as in Popen.
+    hung_for : float
+        Time without a sign of life after which it was killed [s]; 0 if it was not killed for that.
+
     """
     if hung_for and code == -signal.SIGKILL:
         return f"no sign of life for {hung_for:g} s, so it was killed"
-    if code == UNTOLD:
-        return "its parent does not say how"
+    if code == EXIT_CODE_UNKNOWN:
+        return "exit code unknown"
     return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

@@ -1,4 +1,4 @@
-"""The gateway's process: Zenoh on one side, the loop on the other. It checks and translates; it decides nothing."""
+"""Gateway process between Zenoh and the loop: it checks and translates messages, and decides nothing."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from trirail.processes.monitoring import Meter
 from trirail.processes.order import Order
 from trirail.processes.poses import Poses
 from trirail.processes.publications import Publications, StateMaker, info
-from trirail.processes.realtime import bound_heap, give_back
+from trirail.processes.realtime import bound_heap, release_startup_memory
 from trirail.processes.replies import Refusals, Replies
 from trirail.processes.requests import CommandReader, Looks, Requests
 from trirail.processes.session_guard import Guard
 from trirail.processes.trajectory_parts import TrajectoryParts
-from trirail.processes.zenoh_links import Crowding, RouterLinks
+from trirail.processes.zenoh_links import LinkMonitor, RouterLinks
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.goals import Goal, PathGoal, TrajectoryGoal
 from trirail.wire.links import LinkClosed, PacketLink
@@ -44,8 +44,8 @@ from trirail.wire.packets import (
     Announcement,
     Answer,
     Checked,
-    Confirmed,
-    Happened,
+    CommandDone,
+    EventReport,
     Kind,
     Refused,
     Status,
@@ -61,15 +61,15 @@ from trirail.wire.vocabulary import Mode, NoContent
 
 SWITCH_EVERY = 0.0005
 """Interval after which a thread yields the interpreter: Zenoh's threads need it to hand a message over [s]."""
-AT_ONCE = 256
-"""Messages from Zenoh that are read before the loop is read again."""
+MESSAGES_PER_TURN = 256
+"""Messages from Zenoh handled between two reads of the loop's messages."""
 NOT_CHECKED = "not a goal to check"
 SUMMARY_EVERY = 1.0
 """Interval between two summaries [s]."""
 
 
 class Gateway:
-    """Link between Zenoh and the loop: passes requests on, answers them, and publishes the loop's messages."""
+    """Gateway: forwards clients' requests to the loop, answers them, and publishes the loop's messages."""
 
     def __init__(
         self,
@@ -79,12 +79,12 @@ class Gateway:
         session: zenoh.Session,
         guard: Guard,
         log: Callable[[Event], None] = lambda _: None,
-        measured: Callable[[msgspec.Struct], None] = lambda _: None,
-        hurrying: Callable[[], AbstractContextManager[None]] = nullcontext,
+        report_measurements: Callable[[msgspec.Struct], None] = lambda _: None,
+        urgent_section: Callable[[], AbstractContextManager[None]] = nullcontext,
         *,
         again: bool = False,
     ) -> None:
-        """`again`: whether the service has had a gateway before this one."""
+        """Connect the gateway's parts; `again` is whether the service has had a gateway before this one."""
         self._log = log
         self._robot = config.robot.name
         self._link = link
@@ -95,9 +95,9 @@ class Gateway:
         self._welcomed = False
         """Whether the loop has answered, so that clients can be served."""
         self._states = StateMaker(config)
-        self._meter = Meter(measured) if config.telemetry.metrics_port else None
+        self._meter = Meter(report_measurements) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
-        self._state_due = self._summary_due = self._heard = 0.0
+        self._state_due = self._summary_due = self._records_at = 0.0
         self._replies = Replies(self._robot)
         self._refusals = Refusals(link, self._replies)
         keys = {kind: len(route.names) for kind, route in ROUTES.items()}
@@ -107,12 +107,12 @@ class Gateway:
         )
         self._looks = Looks(self._announce)
         self._parts = TrajectoryParts(self._refusals.refuse)
-        self._requests = Requests(config, link, guard, self._replies, self._loop_death, hurrying)
+        self._requests = Requests(config, link, guard, self._replies, self._loop_death, urgent_section)
         self._commands = CommandReader(self._requests, self._replies, self._states, self._inbox, self._refusals.refuse)
         connect = config.zenoh.connect
         self._routers = RouterLinks(connect, partial(guard.linked, session), guard.why_not_linked, self._announce)
         known = {*guard.users, config.zenoh.router or ""}
-        self._crowding = Crowding(
+        self._link_monitor = LinkMonitor(
             partial(guard.links, session),
             guard.disconnect,
             known,
@@ -125,7 +125,7 @@ class Gateway:
         self._publications = Publications(session, self._robot)
 
     def serve(self, ready: Callable[[], None]) -> None:
-        """Serve until `end` is called or the loop has gone; call `ready` once the loop has sent its welcome."""
+        """Serve until `end` is called or the loop disconnects; call `ready` once the loop has sent its welcome."""
         door = self._guard.stop_door(self._inbox.stop_at_door)
         poll = select.poll()
         poll.register(self._link.fileno(), select.POLLIN)
@@ -134,26 +134,26 @@ class Gateway:
             while not self._ending:
                 self._beat()
                 poll.poll(math.ceil(min(BEAT_EVERY, self._inbox.due()) * 1e3))
-                for incoming in self._inbox.next_messages(AT_ONCE):
+                for incoming in self._inbox.next_messages(MESSAGES_PER_TURN):
                     self._beat()
                     self._handle(incoming)
                 while (packet := self._link.receive()) is not None:
                     self._beat()
-                    self._loop_death.heard()
-                    self._hear(packet, ready)
-                self._requests.send_goals()  # those for which there was no room
+                    self._loop_death.record_activity()
+                    self._handle_packet(packet, ready)
+                self._requests.send_goals()  # goals that did not fit into the socket before
                 self._poses.settle()
                 self._poses.poll()
                 self._routers.poll()
-                self._crowding.poll()
-                self._requests.give_up_late()
+                self._link_monitor.poll()
+                self._requests.expire()
                 self._parts.poll()
                 self._summarize()
-                self._refusals.tell_of_overruns()
+                self._refusals.announce_unkept()
                 self._heap.poll()
         except LinkClosed:
-            self._hear_the_rest(ready)
-            self._tell_of_its_end()
+            self._handle_last_packets(ready)
+            self._announce_loop_death()
         finally:
             with contextlib.suppress(LinkClosed):
                 self._poses.close()
@@ -165,17 +165,22 @@ class Gateway:
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings about how the service is run, one line each."""
-        return (*self._guard.warnings(), *self._poses.warnings(), *self._routers.warnings(), *self._crowding.warnings())
+        return (
+            *self._guard.warnings(),
+            *self._poses.warnings(),
+            *self._routers.warnings(),
+            *self._link_monitor.warnings(),
+        )
 
     def end(self) -> None:
-        """End soon; safe from a signal handler."""
+        """Make `serve` return; safe from a signal handler."""
         self._ending = True
         self._inbox.wake()
 
     # ------------------------------------------------------------------ Zenoh to loop
 
     def _handle(self, incoming: Incoming) -> None:
-        """Handle a message; any error in it is answered and announced to everyone, since a put has no answer."""
+        """Handle a message; an error is answered, and announced to everyone since a put has no answer."""
         try:
             route = ROUTES[incoming.kind]
             if (reply := route.handle(self, route.read(incoming, self._robot))) is not None:
@@ -206,7 +211,7 @@ class Gateway:
     def _goal(self, message: RoutedMessage) -> None:
         incoming, (user,), sent = message
         if not isinstance(sent, TrajectoryGoal):
-            self._requests.goal(incoming, user, self._poses.of_name(sent))
+            self._requests.goal(incoming, user, self._poses.resolve_name(sent))
         elif (whole := self._parts.add(incoming, user, sent)) is not None:
             parts, goal = whole
             try:
@@ -217,7 +222,7 @@ class Gateway:
     def _check_goal(self, message: RoutedMessage) -> None:
         incoming, (user,), sent = message
         if not isinstance(sent, TrajectoryGoal):
-            self._requests.check(incoming, user, self._poses.of_name(sent))
+            self._requests.check(incoming, user, self._poses.resolve_name(sent))
         elif sent.part is None:
             self._requests.check(incoming, user, packed(sent))
         else:
@@ -230,7 +235,7 @@ class Gateway:
 
     # ------------------------------------------------------------------ loop to Zenoh
 
-    def _hear(self, packet: bytes, ready: Callable[[], None]) -> None:
+    def _handle_packet(self, packet: bytes, ready: Callable[[], None]) -> None:
         content = memoryview(packet)[1:]
         try:
             if packet[0] == Kind.RECORDS:
@@ -240,9 +245,9 @@ class Gateway:
             self._on_answer(answer)
         except LinkClosed:
             raise
-        except Exception as error:  # noqa: BLE001 - it would come again after every restart
+        except Exception as error:  # noqa: BLE001 - a restarted gateway would receive the same message again
             self._refusals.warn_everyone(
-                quoted(f"the gateway could not read what the loop said, please report it: {error!r}")
+                quoted(f"the gateway could not read a message of the loop, please report it: {error!r}")
             )
             return
         if isinstance(answer, Welcome):
@@ -255,13 +260,13 @@ class Gateway:
     def _on_answer(self, answer: Answer) -> None:
         self._loop_death.follow(answer)
         match answer:
-            case Happened(event):
-                self._happened(event)
+            case EventReport(event):
+                self._handle_event(event)
             case Status() | Welcome():
                 self._states.update(answer)
             case Accepted(ticket, reply) | Checked(ticket, reply):
                 self._requests.answer(ticket, reply)
-            case Confirmed(ticket, name, mode, cycle):
+            case CommandDone(ticket, name, mode, cycle):
                 self._commands.confirmed(ticket)
                 self._requests.answer(ticket, CommandReply(name, mode, cycle))
             case Refused(ticket, code, text, slider, value, limit):
@@ -276,21 +281,21 @@ class Gateway:
         self._poses.measure(rows[-1])
         if self._meter is not None:
             self._meter.records(rows)
-            self._meter.publish(self._states.newest, self._crowding.use, self._crowding.warnings())
-        now = self._heard = time.monotonic()
+            self._meter.publish(self._states.newest, self._link_monitor.use, self._link_monitor.warnings())
+        now = self._records_at = time.monotonic()
         if now >= self._state_due:
             self._state_due = max(self._state_due + self._state_every, now)
             self._publications.state(self._states.newest(self.warnings()))
 
     def _summarize(self) -> None:
-        """Publish the summary if it is due, also while the loop is silent: it then shows since when."""
+        """Publish the summary if it is due, also while the loop is silent: it shows the age of the state."""
         now = time.monotonic()
         if now >= self._summary_due and self._states.cycle:
             self._summary_due = now + SUMMARY_EVERY
-            self._publications.summary(summary_of(self._states.newest(), now - self._heard, self._info.version))
+            self._publications.summary(summary_of(self._states.newest(), now - self._records_at, self._info.version))
 
-    def _happened(self, event: Event) -> None:
-        """Publish and log an event; a new lease withdraws the waiting goals of everyone but its holder."""
+    def _handle_event(self, event: Event) -> None:
+        """Publish and log an event; a new lease withdraws the waiting goals of all users except its holder."""
         if event.kind == "lease":
             self._requests.backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
@@ -298,47 +303,47 @@ class Gateway:
         if self._meter is not None:
             self._meter.event(event)
 
-    def _hear_the_rest(self, ready: Callable[[], None]) -> None:
-        """Process the loop's last messages: they may include its farewell."""
+    def _handle_last_packets(self, ready: Callable[[], None]) -> None:
+        """Handle the loop's last messages, which may include its farewell."""
         with contextlib.suppress(LinkClosed):
             while (packet := self._link.receive()) is not None:
-                self._loop_death.heard()
+                self._loop_death.record_activity()
                 with contextlib.suppress(LinkClosed):  # the loop receives nothing any more
-                    self._hear(packet, ready)
+                    self._handle_packet(packet, ready)
 
-    def _tell_of_its_end(self) -> None:
-        """Announce the death of the loop in its place, if it has died."""
+    def _announce_loop_death(self) -> None:
+        """Announce the end of the loop, unless the loop has said farewell."""
         for event in self._loop_death.events(self._states.cycle):
-            self._happened(event)
+            self._handle_event(event)
         if (reason := self._loop_death.reason) and self._states.cycle:
             state = msgspec.structs.replace(self._states.newest(), mode=Mode.FAULT, goal=None, faults=(reason.text,))
             self._publications.state(state)
 
 
 class RoutedMessage(NamedTuple):
-    """A message whose key and content have been read."""
+    """Message with its key and content decoded."""
 
     incoming: Incoming
     names: Sequence[str]
-    """The names in its key."""
+    """Names in its key."""
     content: Any
-    """A value of its route's type."""
+    """Content, of the route's type."""
 
 
 class Route(NamedTuple):
-    """Key on which clients ask, with the handler of its messages and the type of their content."""
+    """Key that clients query, with the handler of its messages and the type of their content."""
 
     names: tuple[str, ...]
-    """Names that follow in the key, a user's first; if there are none, the key of a message is not checked."""
+    """Names in the key, the user's first; if there are none, the key of a message is not checked."""
     handle: Callable[[Gateway, RoutedMessage], msgspec.Struct | None]
-    """Returns the reply; None if it is sent later."""
+    """Handler that returns the reply; None for a reply that is sent later."""
     content: Any = None
-    """Type of the content; None if the content has no meaning, or depends on a name."""
+    """Type of the content; None for content that is ignored or depends on a name."""
     expected: str = ""
-    """Beginning of the refusal of other content."""
+    """Beginning of the refusal of any other content."""
 
     def read(self, incoming: Incoming, robot: str) -> RoutedMessage:
-        """Read a message's key and content. Raises RefusedError."""
+        """Decode a message's key and content. Raises RefusedError for invalid ones."""
         prefix = zenoh_session.key(robot, incoming.kind)
         names = boundary.names(incoming.key, prefix, self.names) if self.names else ()
         content = incoming.content(self.content, self.expected) if self.content is not None else None
@@ -356,7 +361,7 @@ ROUTES: dict[str, Route] = {
     "forget": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "forget takes no content"),
     "alignment": Route(("user",), Gateway._forward_look, AlignmentLook, "not a look of an alignment"),
 }
-"""Every key that clients query."""
+"""Route of every key that clients query."""
 
 
 def main(
@@ -365,25 +370,36 @@ def main(
     beat: Callable[[], None],
     ready: Callable[[object], None],
     log: Callable[[Event], None],
-    measured: Callable[[msgspec.Struct], None],
-    hurrying: Callable[[], AbstractContextManager[None]],
+    report_measurements: Callable[[msgspec.Struct], None],
+    urgent_section: Callable[[], AbstractContextManager[None]],
 ) -> int:
-    """Run the gateway's process.
+    """Run the gateway process; return its exit code.
 
-    `ready` is called once it can be reached, `log` with each event, `measured` each second if there are metrics;
-    packets sent to the loop `hurrying` are handled in the cycle in which they arrive.
+    Parameters
+    ----------
+    ready
+        Called once clients can reach the gateway, with its warnings.
+    log
+        Called with each event.
+    report_measurements
+        Called each second if the configuration enables metrics.
+    urgent_section
+        Context in which packets sent to the loop are handled in the cycle of their arrival.
+
     """
     sys.setswitchinterval(SWITCH_EVERY)
     bound_heap()
     config = order.config
     guard = Guard(config, order.admission)
     with guard.open() as session:
-        gateway = Gateway(config, link, beat, session, guard, log, measured, hurrying, again=order.again)
+        gateway = Gateway(
+            config, link, beat, session, guard, log, report_measurements, urgent_section, again=order.again
+        )
         signal.signal(signal.SIGTERM, lambda _signal, _frame: gateway.end())
 
         def is_ready() -> None:
             ready({"warnings": gateway.warnings()})
-            give_back()
+            release_startup_memory()
 
         gateway.serve(is_ready)
     return 0

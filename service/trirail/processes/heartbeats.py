@@ -1,12 +1,11 @@
-"""Heartbeats between the service's processes, and urgent requests: counters in shared memory; and detection of hangs.
+"""Heartbeats and urgent requests between the service's processes, as counters in shared memory, and detection of hangs.
 
-A beat and a check cost 0.1 µs, and nothing can wait: no packet queues behind another one, and a process that is frozen
-fills no buffer. A process beats in the thread that does its work, so that a hung one does not.
+A beat and a check cost 0.1 µs and never wait: unlike packets, counters do not queue, and a frozen process fills no
+buffer. A process beats in the thread that does its work, so that a hung process stops beating.
 
-A process that hangs is distinguished from one that a busy machine keeps waiting: killing that one would help nobody.
-Silence is the time in which a process could have given a sign of life: the processor time of its main thread, and the
-turns in which it wanted none, as when it is stopped or waits in vain. While it waits for a processor or for a disk,
-nothing counts.
+A hung process is distinguished from one that a busy machine keeps waiting: killing the latter would only add load.
+Silence therefore counts only the time in which a process could have beaten: the processor time of its main thread, and
+the checks that found it stopped or asleep. Time spent waiting for a processor or a disk does not count.
 """
 
 from __future__ import annotations
@@ -20,30 +19,30 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 PROCESSES = ("loop", "gateway", "planner", "recorder")
-"""Processes that beat; simulated drives do so on their bus, to the loop."""
-HASTE = len(PROCESSES)
+"""Processes that beat in shared memory; simulated drives send heartbeats on their bus instead."""
+URGENT_INDEX = len(PROCESSES)
 """Index of the counter of urgent requests."""
 BEAT_EVERY = 0.05
-"""Longest interval between two beats of a process, also while it waits for work [s]."""
+"""Longest interval between two beats of a process, also while it is idle [s]."""
 
 
 class Heartbeats:
-    """Shared counters; 0 before the first beat of a process and after its last, when none may be expected."""
+    """Shared counters, one per process; a counter is 0 while no beat is expected of its process."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
-        """Memory file, inherited by the processes that beat and check."""
+        """Descriptor of the shared memory, inherited by all processes."""
         self._close: Callable[[], object] | None = None
         self._counts = memoryview(mmap.mmap(descriptor, mmap.PAGESIZE)).cast("Q")
 
     @property
     def counts(self) -> memoryview[int]:
-        """All counters, in the order of PROCESSES."""
+        """All counters, in the order of PROCESSES, then that of urgent requests."""
         return self._counts
 
     @classmethod
     def create(cls) -> Heartbeats:
-        """Return counters without a beat. The descriptor is closed with them."""
+        """Create counters, all 0; their descriptor is closed when the object is collected."""
         descriptor = os.memfd_create("trirail-heartbeats")
         os.ftruncate(descriptor, mmap.PAGESIZE)
         created = cls(descriptor)
@@ -51,38 +50,36 @@ class Heartbeats:
         return created
 
     def close(self) -> None:
-        """Close the descriptor of counters that were created here; the counters themselves stay."""
+        """Close the descriptor if this process has created the counters; the counters stay usable."""
         if self._close is not None:
             self._close()
 
-    def of(self, process: str) -> Heart:
-        """Return the counter of one of PROCESSES."""
+    def heart(self, process: str) -> Heart:
+        """Return the counter of a process of PROCESSES."""
         return Heart(self._counts, PROCESSES.index(process))
 
     @contextmanager
-    def hurrying(self) -> Iterator[None]:
-        """Have the loop handle packets sent meanwhile in the cycle of their arrival: a stop must not wait for the next.
-
-        It counts before and after: whenever the loop checks, it finds a count that it has not seen, or the packet.
-        """
-        self._counts[HASTE] += 1
+    def urgent_section(self) -> Iterator[None]:
+        """Mark packets sent inside the context as urgent: the loop handles them in the cycle of their arrival."""
+        # Count before and after the packet: whenever the loop checks, it finds a new count or the packet itself.
+        self._counts[URGENT_INDEX] += 1
         yield
-        self._counts[HASTE] += 1
+        self._counts[URGENT_INDEX] += 1
 
 
 class Heart:
-    """The counter of one process."""
+    """Heartbeat counter of one process."""
 
     def __init__(self, counts: memoryview[int], place: int) -> None:
         self._counts = counts
         self._place = place
 
     def beat(self) -> None:
-        """Give a sign of life."""
+        """Count a beat."""
         self._counts[self._place] += 1
 
     def rest(self) -> None:
-        """Report that no beat is expected until the next one."""
+        """Reset the counter: no beat is expected until the next one."""
         self._counts[self._place] = 0
 
     @property
@@ -91,24 +88,25 @@ class Heart:
         return self._counts[self._place]
 
 
-class Haste:
-    """The loop's check for urgent requests."""
+class UrgentFlag:
+    """Detector of urgent requests, for the loop."""
 
     def __init__(self, heartbeats: Heartbeats) -> None:
         self._counts = heartbeats.counts
         self.seen = 0
         """Count at the last check."""
 
-    def hurried(self) -> bool:
+    def was_raised(self) -> bool:
         """Return whether there has been an urgent request since the last call."""
-        before, self.seen = self.seen, self._counts[HASTE]
+        before, self.seen = self.seen, self._counts[URGENT_INDEX]
         return self.seen != before
 
 
 class Watch:
-    """Watch on the heart of another process, checked once in each turn of the one that watches.
+    """Time-out on the heartbeat of another process.
 
-    Silence is counted in these turns and not by the clock: while the whole machine is stopped, nobody is silent.
+    The time-out counts the watcher's own checks, not wall time, so that a stalled machine does not look like a frozen
+    process. `patience` is the number of checks without a beat that is tolerated.
     """
 
     def __init__(self, heart: Heart, patience: int) -> None:
@@ -116,28 +114,28 @@ class Watch:
         self.patience = patience
         self.seen = 0
         """Count at the last check."""
-        self.turns = 0
-        """Turns for which that has stayed the same."""
+        self.silent_turns = 0
+        """Number of checks since the count has changed."""
 
     def silent(self) -> bool:
-        """Check, in every turn; return whether there has been no beat for more turns than `patience`."""
+        """Check the heartbeat; return whether it has been missing for more than `patience` checks."""
         count = self._heart.count
         if count == self.seen and count:
-            self.turns += 1
+            self.silent_turns += 1
         else:
-            self.seen, self.turns = count, 0
-        return self.turns > self.patience
+            self.seen, self.silent_turns = count, 0
+        return self.silent_turns > self.patience
 
     @property
-    def heard(self) -> bool:
+    def has_beat(self) -> bool:
         """Whether the last check found a beat."""
-        return self.seen > 0 and self.turns == 0
+        return self.seen > 0 and self.silent_turns == 0
 
 
 READY, ON_DISK = "R", "D"
-"""States of proc(5): running or runnable, and waiting for a disk, where no signal reaches it."""
+"""Thread states of proc(5): running or runnable, and uninterruptible sleep."""
 _STATE, _UTIME, _STIME = 0, 11, 12
-"""Fields of /proc/PID/stat behind the name, which is in parentheses and may hold some."""
+"""Fields of /proc/PID/stat, counted after the name in parentheses, which may contain spaces and parentheses."""
 _TICK: Final = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
@@ -145,28 +143,41 @@ class Effort(NamedTuple):
     """State of a thread in the kernel."""
 
     state: str
-    """Letter of proc(5)."""
+    """State letter of proc(5)."""
     used: float
-    """Processor time since it began [s]."""
+    """Processor time since the thread began [s]."""
 
     @property
     def kept_waiting(self) -> bool:
-        """Whether it runs, or would if the machine had a processor or a disk for it."""
+        """Whether the thread runs, or waits for a processor or a disk."""
         return self.state in (READY, ON_DISK)
 
 
 def effort(pid: int) -> Effort | None:
     """Return the kernel's state of a process's main thread; None if there is none."""
     try:
-        said = Path(f"/proc/{pid}/task/{pid}/stat").read_bytes()
+        stat_line = Path(f"/proc/{pid}/task/{pid}/stat").read_bytes()
     except OSError:  # it has just ended, or there is no such file system
         return None
-    fields = said[said.rindex(b")") + 1 :].split()
+    fields = stat_line[stat_line.rindex(b")") + 1 :].split()
     return Effort(fields[_STATE].decode(), (int(fields[_UTIME]) + int(fields[_STIME])) * _TICK)
 
 
 class HangWatch:
-    """Watch on the heart of another process, checked once in each of the watcher's turns."""
+    """Detector of a hung process, by its heartbeat and its processor time.
+
+    Parameters
+    ----------
+    heart
+        Heartbeat of the process.
+    patience
+        Longest silence [s].
+    turn
+        Interval between two checks [s].
+    effort
+        Function that returns the kernel's state of a process, by process id.
+
+    """
 
     def __init__(
         self, heart: Heart, patience: float, turn: float, effort: Callable[[int], Effort | None] = effort
@@ -176,19 +187,19 @@ class HangWatch:
         self._turn = turn
         self._effort = effort
         self._seen = 0
-        self._could = 0.0
+        self._silent_s = 0.0
         self._used: float | None = None
 
     def hangs(self, pid: int) -> bool:
-        """Check, in every turn; return whether it could have given a sign of life for longer than the patience [s]."""
+        """Check the process; return whether it has been silent for longer than the patience."""
         count = self._heart.count
         if count != self._seen or not count:
-            self._seen, self._could, self._used = count, 0.0, None
+            self._seen, self._silent_s, self._used = count, 0.0, None
             return False
         now = self._effort(pid)
         if now is None or not now.kept_waiting:
-            self._could += self._turn
+            self._silent_s += self._turn
         elif self._used is not None:
-            self._could += now.used - self._used
+            self._silent_s += now.used - self._used
         self._used = now.used if now is not None else None
-        return self._could > self._patience + self._turn / 2.0
+        return self._silent_s > self._patience + self._turn / 2.0

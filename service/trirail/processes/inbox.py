@@ -1,4 +1,4 @@
-"""Messages that Zenoh hands to the gateway: kept by user until they are read, bounded in number and in bytes."""
+"""Inbox for messages from Zenoh: queued by user until they are read, bounded in number and in bytes."""
 
 from __future__ import annotations
 
@@ -23,24 +23,31 @@ from trirail.wire.sizes import MAX_BESIDE, MAX_MESSAGE, MAX_NAME, MAX_UNREAD, MA
 from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest
 from trirail.wire.text import is_id
 
-UNREAD = 8192
-"""Most unread messages; more are refused, commands at twice as many: a flood of goals must not keep a stop
-out."""
-UNREAD_OF_ONE = 2048
+MAX_MESSAGES = 8192
+"""Most unread messages; further ones are refused. Twice as many for commands, so that goals cannot keep a stop out."""
+MAX_MESSAGES_OF_USER = 2048
 """Most unread messages of one user; twice as many for commands."""
-TOO_MUCH = "too many messages at once: send fewer"
-ALIKE = 32
-"""Most stops of one user that are read as one, if they are consecutive and request the same."""
+TOO_MUCH = "too many unread messages: send fewer"
+MAX_MERGED_STOPS = 32
+"""Most consecutive equal stops of one user that are merged into one."""
 
 
 class Inbox:
-    """Inbox of the gateway's keys. `refuse` is given each message that is not kept, and the reason.
+    """Inbox of the gateway's keys.
 
-    `keys` has the kinds of queries, with the number of names that follow each in its key.
+    Users take turns, each at a limited rate, so that a flood delays only its sender. Stops are recognised by their key
+    and read before all other messages. Messages are numbered: a stop's number shows which goals were sent before it,
+    and a goal sent after a stop is never read before that stop.
 
-    Users take turns, each at a limited rate, so that a flood delays only its sender. Stops come before all else, known
-    by their key alone: a stop's number shows which goals were sent before it, and no goal that was sent after it is
-    read before it. `clock` gives seconds.
+    Parameters
+    ----------
+    keys
+        Kinds of queries, each with the number of names in its key.
+    refuse
+        Called with each message that is not kept, and the error.
+    clock
+        Monotonic clock [s].
+
     """
 
     def __init__(
@@ -59,18 +66,18 @@ class Inbox:
         self._budget = Budget(MAX_UNREAD, MAX_UNREAD_OF_ONE)
         self._lock = threading.Lock()
         self._stops: FairQueue[list[Incoming]] = FairQueue()
-        """Stops, each with the equal ones behind it."""
+        """Stops, each with the equal ones merged into it."""
         self._newest: dict[str, list[Incoming]] = {}
-        """Stops that wait and are their user's last message of all, with the equal ones behind them."""
+        """Waiting stops that are the newest message of their user, with the equal ones merged into them."""
         self._others: FairQueue[Incoming] = FairQueue()
         self._stops_pace, self._others_pace = Pace(), Pace()
-        """Separate: a user's many stops do not delay the user's other messages, or vice versa."""
+        """Separate rates, so that a user's stops and other messages do not delay each other."""
         self._number = 0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         weakref.finalize(self, os.close, self._wake)
 
     def fileno(self) -> int:
-        """Return the descriptor for select: readable while messages wait, or after `wake`."""
+        """Return the descriptor to pass to select: readable while messages wait, or after `wake`."""
         return self._wake
 
     def wake(self) -> None:
@@ -78,9 +85,9 @@ class Inbox:
         os.eventfd_write(self._wake, 1)
 
     def declare(self) -> None:
-        """Receive from now on."""
+        """Declare the keys, and so begin to receive."""
 
-        # Called as messages arrive, by one thread: they are numbered in that order.
+        # Not `indirect`: Zenoh calls back as messages arrive, so that they are numbered in the order of arrival.
         def declare(kind: str, names: int) -> zenoh.Queryable[None]:
             on_query = zenoh.handlers.Callback(partial(self._on_query, kind), indirect=False)
             return self._session.declare_queryable(key(kind, *"*" * names), on_query)
@@ -94,7 +101,7 @@ class Inbox:
         ]
 
     def next_messages(self, at_most: int) -> Iterator[Incoming]:
-        """Yield the messages that may be read now, users in turn, stops first; if more wait, it stays readable."""
+        """Yield at most `at_most` messages that may be read now, stops first, users in turn."""
         for _ in range(at_most):
             with self._lock:
                 incoming = self._next(self._clock())
@@ -107,12 +114,12 @@ class Inbox:
                     os.eventfd_read(self._wake)
 
     def due(self) -> float:
-        """Return the time until a waiting message may be read; infinite if none waits [s]."""
+        """Return the time until a waiting message may be read [s]; infinite if none waits."""
         with self._lock:
             return self._due(self._clock())
 
     def earlier(self, number: int) -> bool:
-        """Return whether an earlier message than that number waits to be read."""
+        """Return whether a message with a lower number waits to be read."""
         with self._lock:
             return any(self._others.first(user).number < number for user in self._others.users)
 
@@ -131,7 +138,7 @@ class Inbox:
         return None
 
     def _readable(self) -> Iterator[str]:
-        """Yield users whose next message need not wait for an earlier stop, in the order of their turns."""
+        """Yield users in the order of their turns, except those whose next message is a goal behind a stop."""
         stop = min((self._stops.first(user)[0].number for user in self._stops.users), default=math.inf)
         for user in self._others.users:
             incoming = self._others.first(user)
@@ -144,7 +151,7 @@ class Inbox:
         return min((*stops, *others), default=math.inf)
 
     def stop_at_door(self, request: StopRequest, answer: Answer) -> None:
-        """Keep a request from the door for stops; safe from any thread."""
+        """Enqueue a request from the door for stops; safe from any thread."""
         content = request.content.encode()
         stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns(), at_door=answer)
         self._keep(_named(stop._replace(held=len(content) + OVERHEAD), request.id))
@@ -162,12 +169,12 @@ class Inbox:
         self._keep(incoming)
 
     def _keep_nothing(self, large: Incoming) -> None:
-        """Answer a message that is too large immediately, to free its memory; a stop among them still takes effect."""
+        """Refuse a message that is too large immediately, to free its memory; a stop still takes effect."""
         error = ErrorReply(RefusalCode.TOO_LARGE, boundary.too_large(large.size))
         if _stops(large):
             name = large.key.rpartition("/")[2]
             if self._has_kept(large.unanswered()):
-                error = ErrorReply(error.code, f"{error.message}; the robot is told to {name} all the same")
+                error = ErrorReply(error.code, f"{error.message}; {name} takes effect nevertheless")
             else:
                 error = ErrorReply(RefusalCode.BUSY, TOO_MUCH)
         self._refuse(large, error)
@@ -180,7 +187,7 @@ class Inbox:
             self._refuse(incoming._replace(payload=b""), ErrorReply(RefusalCode.BUSY, TOO_MUCH))
 
     def _has_kept(self, incoming: Incoming) -> bool:
-        """Keep a message if there is room for it, and return whether there is."""
+        """Enqueue a message; return False if there is no room for it."""
         user, room = incoming.user, 2 if incoming.kind == "cmd" else 1
         hold = self._budget.hold(user, incoming.held, room)
         if hold is None:
@@ -190,8 +197,8 @@ class Inbox:
             incoming = incoming._replace(number=self._number, hold=hold)
             fits = self._joins(incoming)
             if not fits:
-                unread, own = len(self._stops) + len(self._others), self._stops.of(user) + self._others.of(user)
-                fits = unread < room * UNREAD and own < room * UNREAD_OF_ONE
+                unread, own = len(self._stops) + len(self._others), self._stops.count(user) + self._others.count(user)
+                fits = unread < room * MAX_MESSAGES and own < room * MAX_MESSAGES_OF_USER
                 if fits:
                     self._put(incoming)
         if fits:
@@ -199,9 +206,14 @@ class Inbox:
         return fits
 
     def _joins(self, incoming: Incoming) -> bool:
-        """Return whether a message joins the user's previous one: a waiting stop with the same request."""
+        """Merge a stop into an equal, waiting one if that is the user's previous message; return whether it was."""
         stops = self._newest.get(incoming.user)
-        if not _stops(incoming) or stops is None or len(stops) >= ALIKE or _asked(stops[0]) != _asked(incoming):
+        if (
+            not _stops(incoming)
+            or stops is None
+            or len(stops) >= MAX_MERGED_STOPS
+            or _request_of(stops[0]) != _request_of(incoming)
+        ):
             return False
         stops.append(incoming._replace(payload=stops[0].payload))
         return True
@@ -221,12 +233,12 @@ def _stops(incoming: Incoming) -> bool:
 
 
 def _named(stop: Incoming, name: str) -> Incoming:
-    """Return a stop with its id, if that is one; a stop with more content than the door takes has no copy there."""
+    """Return a stop with its id, if valid; a stop too large for the door cannot have a copy there, and gets none."""
     return stop._replace(id=name) if is_id(name) and stop.size <= MAX_LINE else stop
 
 
-def _asked(stop: Incoming) -> tuple[object, ...]:
-    """Return a stop's request, to compare it; one too large to be kept is equal to no other."""
+def _request_of(stop: Incoming) -> tuple[object, ...]:
+    """Return the request of a stop for comparison; a stop whose payload was not kept equals no other."""
     known = stop.size == len(stop.payload)
     return stop.key, stop.payload, stop.encoding, None if known else stop.arrived_ns
 
@@ -234,7 +246,7 @@ def _asked(stop: Incoming) -> tuple[object, ...]:
 def _incoming(
     kind: str, key: str, payload: zenoh.ZBytes | None, encoding: str, query: zenoh.Query | None, beside: int = 0
 ) -> Incoming:
-    """Return a message; `beside` is the size of its query without the payload [bytes]."""
+    """Return a received message; `beside` is the size of its query without the payload [bytes]."""
     size = len(payload) if payload is not None else 0
     content = payload.to_bytes() if payload is not None and size <= MAX_MESSAGE else b""
     held = len(content) + OVERHEAD + (size + beside if query is not None else 0)
@@ -242,5 +254,5 @@ def _incoming(
 
 
 def _wait(pace: Pace, user: str, now: float) -> float:
-    """Return the wait until a user's next message; one that names no user is a query, and waits for its turn alone."""
+    """Return the time until a user's next message may be read [s]; messages without a user are not limited."""
     return pace.wait(user, now) if user else 0.0

@@ -1,6 +1,6 @@
-"""Messages that wait in the gateway before they are decoded, and goals. Users take turns.
+"""Queues in the gateway: messages not decoded yet, and goals not sent to the loop yet; users take turns.
 
-The loop has only a few goals at a time: those not given to it yet can be withdrawn.
+The gateway sends the loop only a few goals at a time, so that it can withdraw the others itself.
 """
 
 from __future__ import annotations
@@ -22,59 +22,62 @@ from trirail.wire.sizes import MAX_UNREAD
 
 
 class Incoming(NamedTuple):
-    """A query or a put, as Zenoh handed it over, or a request at the door for stops."""
+    """Query or put as received from Zenoh, or a request at the door for stops."""
 
     kind: str
-    """Its key in trirail.processes.gateway.ROUTES."""
+    """Kind, a key of trirail.processes.gateway.ROUTES."""
     key: str
-    """Key expression that was sent: it may have wildcards."""
+    """Key expression of the message; it may have wildcards."""
     size: int
     """Size of the payload [bytes]."""
     payload: bytes
     """Empty if it is too large to be decoded."""
     encoding: str
     query: zenoh.Query | None
-    """None for a put, which has no answer, and for a request at the door."""
+    """Query to answer; None for a put and for a request at the door."""
     arrived_ns: int
-    """Arrival time on the monotonic clock: it may have waited since, behind its user's others."""
+    """Arrival time on the monotonic clock [ns]."""
     number: int = 0
-    """Sequence number, in the order of arrival."""
+    """Sequence number in the order of arrival."""
     id: str = ""
-    """Id of a stop: the same in every copy of it, "" if it has none."""
+    """Id of a stop, the same in all of its copies; "" for none."""
     at_door: Callable[[Any], None] | None = None
     """Receiver of the answer to a request at the door."""
     held: int = 0
-    """Memory that it holds in Zenoh and in this process: payload, key, parameters and attachment [bytes]."""
+    """Memory that the message holds in Zenoh and in this process: payload, key, parameters and attachment [bytes]."""
     hold: Reservation | None = None
     """Reservation of that memory; None for a message that is not kept."""
     alike: tuple[Incoming, ...] = ()
-    """Stops of the same user, kind and content that came behind it before it was read: one is carried out for all."""
+    """Equal stops of the same user, merged into this one: it is carried out once for all of them."""
 
     @property
     def user(self) -> str:
-        """User that its key names; "" for a message that names none or any, such as a query for a role."""
+        """User named by the key; "" for none, and for a query about a role, whose key names any user."""
         return self.key.split("/")[3] if self.kind != "role" and self.key.count("/") > 2 else ""
 
     def content(self, kind: Any, what: str) -> Any:
-        """Return its payload as a message of that kind, a type or union. Raises RefusedError, beginning with `what`."""
+        """Return the payload decoded as a type or union `kind`.
+
+        Raises RefusedError, with a message that begins with `what`.
+        """
         boundary.check_size(self.size)
         return boundary.decode(self.payload, kind, what, self.encoding)
 
     def unanswered(self) -> Incoming:
-        """Return it as a message without an answer."""
+        """Return a copy of the message to which no answer is sent."""
         return self._replace(query=None, at_door=None, alike=(), held=len(self.payload) + OVERHEAD)
 
 
 BURST = 400
-"""Messages of one user that are read without a pause."""
+"""Messages of one user that may be read in a burst."""
 RATE = 200.0
-"""Messages of one user that are read a second beyond that: ten times those of a stream of goals or a held jog."""
-_FORGOTTEN = 1000
-"""Number of users from which those with a full bucket are forgotten."""
+"""Messages of one user that may be read per second after a burst: ten times the rate of a stream of goals or a jog."""
+_MAX_BUCKETS = 1000
+"""Number of users above which full buckets are forgotten."""
 
 
 class Pace:
-    """Token bucket for each user, in the form of the generic cell rate algorithm: one time instead of a count."""
+    """Token bucket for each user, as in the generic cell rate algorithm: it keeps a time instead of a count."""
 
     def __init__(self, burst: int = BURST, rate: float = RATE) -> None:
         self._burst, self._rate = burst, rate
@@ -87,9 +90,9 @@ class Pace:
         return max(0.0, self._full_at.get(user, -math.inf) - now - (self._burst - 0.5) / self._rate)
 
     def count(self, user: str, now: float) -> None:
-        """Count a message of a user that has been read."""
+        """Take a token from the bucket of a user whose message has been read."""
         self._full_at[user] = max(self._full_at.get(user, now), now) + 1.0 / self._rate
-        if len(self._full_at) > _FORGOTTEN:
+        if len(self._full_at) > _MAX_BUCKETS:
             self._full_at = {user: full for user, full in self._full_at.items() if full > now}
 
 
@@ -97,71 +100,71 @@ T = TypeVar("T")
 
 
 class FairQueue(Generic[T]):
-    """Round-robin queue: a user served goes behind the others; a new one begins behind them."""
+    """Round-robin queue: a served user moves behind the others, and a new user joins behind them."""
 
     def __init__(self) -> None:
-        self._of: dict[str, deque[T]] = {}  # the users in the order of their turns, none without anything
+        self._queues: dict[str, deque[T]] = {}  # in the order of the users' turns, without empty queues
         self._length = 0
 
     def __len__(self) -> int:
         return self._length
 
     def __iter__(self) -> Iterator[T]:
-        for waiting in self._of.values():
+        for waiting in self._queues.values():
             yield from waiting
 
     @property
     def users(self) -> KeysView[str]:
-        """Users with items in it, in the order of their turns; not to be iterated while it changes."""
-        return self._of.keys()
+        """Users with items, in the order of their turns: a view that must not be iterated while the queue changes."""
+        return self._queues.keys()
 
-    def of(self, user: str) -> int:
+    def count(self, user: str) -> int:
         """Return the number of a user's items."""
-        return len(self._of.get(user, ()))
+        return len(self._queues.get(user, ()))
 
     def put(self, user: str, item: T) -> None:
         """Put an item behind the user's own."""
-        self._of.setdefault(user, deque()).append(item)
+        self._queues.setdefault(user, deque()).append(item)
         self._length += 1
 
     def first(self, user: str) -> T:
-        """Return the user's first item; KeyError if there is none."""
-        return self._of[user][0]
+        """Return the user's first item. Raises KeyError if there is none."""
+        return self._queues[user][0]
 
     def pop(self, user: str) -> T:
-        """Remove the first item of a user, and put the user behind the others; KeyError if there is none."""
-        waiting = self._of.pop(user)
+        """Remove and return the first item of a user, and move the user behind the others. Raises KeyError."""
+        waiting = self._queues.pop(user)
         item = waiting.popleft()
         self._length -= 1
         if waiting:
-            self._of[user] = waiting
+            self._queues[user] = waiting
         return item
 
     def change(self, make: Callable[[T], T]) -> None:
         """Replace each item."""
-        self._of = {user: deque(map(make, waiting)) for user, waiting in self._of.items()}
+        self._queues = {user: deque(map(make, waiting)) for user, waiting in self._queues.items()}
 
 
 GOALS = 5_000
-"""Most goals that wait for those before them; more are refused."""
+"""Most waiting goals; further ones are refused."""
 GOALS_OF_ONE = 1_250
 """Most waiting goals of one user, so that others always have room."""
 GOAL_PATIENCE = 8.0
-"""Longest wait of a goal for those before it; then it does not begin any more: its sender gives up soon [s]."""
+"""Longest wait of a goal for those before it, after which it is withdrawn: its sender gives up soon after [s]."""
 
 
 class WaitingGoal(NamedTuple):
-    """A goal, and the message that it came in, without its payload."""
+    """Goal, and the message that contained it, without the payload."""
 
     incoming: Incoming
     request: GoalRequest
 
 
 class Backlog:
-    """Goals by user, each user's in the order of arrival, bounded in number and in bytes; users take turns.
+    """Queue of goals, bounded in number and in bytes: each user's in the order of arrival, users in turn.
 
-    Each goal leaves it exactly once, by `drop_first`: a withdrawn one keeps its place, and the loop reports its end in
-    its turn.
+    Each goal leaves the queue exactly once, by `drop_first`. A withdrawn goal keeps its place, so that the loop reports
+    its end in the right order.
     """
 
     def __init__(self) -> None:
@@ -169,26 +172,26 @@ class Backlog:
         self._bytes = 0
         self._stop = 0, ""
         self._stopped: dict[str, tuple[int, str]] = {}
-        """Stops by id of goals that may be unread: the message before which they apply, and why; the newest last."""
+        """Stops of single goals, by goal id, the newest last: the number of the stop's message, and the reason."""
 
     def __iter__(self) -> Iterator[WaitingGoal]:
         return iter(self._goals)
 
     @property
     def users(self) -> list[str]:
-        """Users with goals in it, in the order of their turns."""
+        """Users with waiting goals, in the order of their turns."""
         return list(self._goals.users)
 
     def check_room(self, user: str, size: int) -> None:
-        """Raise RefusedError if there is no room for one more goal of that size."""
-        own = self._goals.of(user)
+        """Raise RefusedError if there is no room for another goal of this size [bytes]."""
+        own = self._goals.count(user)
         if own >= GOALS_OF_ONE:
             raise RefusedError(RefusalCode.BUSY, f"{own} goals of {user} are waiting already: send fewer")
         if len(self._goals) >= GOALS or self._bytes + size > MAX_UNREAD:
             raise RefusedError(RefusalCode.BUSY, f"{len(self._goals)} goals are waiting already: send fewer")
 
     def add(self, incoming: Incoming, request: GoalRequest) -> None:
-        """Put a goal behind the user's others; withdrawn if it arrived before the robot was stopped."""
+        """Enqueue a goal behind the user's others, withdrawn if it arrived before a stop that applies to it."""
         for before, reason in (self._stop, self._stopped.get(request.id, (0, ""))):
             if incoming.number < before:
                 request = structs.replace(request, withdrawn=reason)
@@ -196,7 +199,7 @@ class Backlog:
         self._bytes += incoming.size
 
     def first(self, user: str) -> WaitingGoal:
-        """Return the next goal of a user; one that has waited too long is withdrawn. KeyError if there is none."""
+        """Return the next goal of a user, withdrawn if it has waited too long. Raises KeyError if there is none."""
         incoming, request = self._goals.first(user)
         if request.withdrawn is None and time.monotonic_ns() - request.received_ns > GOAL_PATIENCE * 1e9:
             waited = f"it has waited longer than {GOAL_PATIENCE:g} s"
@@ -205,26 +208,26 @@ class Backlog:
         return WaitingGoal(incoming, request)
 
     def drop_first(self, user: str) -> None:
-        """Remove the user's first goal: the loop has it."""
+        """Remove the user's first goal, which has been sent to the loop."""
         self._bytes -= self._goals.pop(user).incoming.size
 
     def withdraw(self, goal_id: str, reason: str) -> bool:
-        """Withdraw the goal with an id; return whether there is one."""
-        found = any(goal.request.id == goal_id for goal in self._goals)
-        if found:
+        """Withdraw the goal with this id; return whether it was waiting."""
+        is_waiting = any(goal.request.id == goal_id for goal in self._goals)
+        if is_waiting:
             self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.request.id == goal_id else goal)
-        return found
+        return is_waiting
 
     def withdraw_coming(self, goal_id: str, reason: str, before: int) -> None:
-        """Withdraw the goal with an id if it is read later, and arrived before a message."""
+        """Withdraw the goal with this id if it is read later, and arrived before the message numbered `before`."""
         self._stopped.pop(goal_id, None)
         self._stopped[goal_id] = before, reason
         if len(self._stopped) > GOALS:
             del self._stopped[next(iter(self._stopped))]
 
     def withdraw_all(self, reason: str, before: int) -> None:
-        """Withdraw every goal that arrived before a message, including those read later."""
-        if before >= self._stop[0]:  # one that came earlier may be read later
+        """Withdraw every goal that arrived before the message numbered `before`, including those read later."""
+        if before >= self._stop[0]:  # stops may be read in another order than they arrived
             self._stop = before, reason
         self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < before else goal)
 
@@ -234,6 +237,6 @@ class Backlog:
 
 
 def _withdrawn(goal: WaitingGoal, reason: str) -> WaitingGoal:
-    """Return a goal as withdrawn; the first reason stays."""
+    """Return a goal as withdrawn; the first reason is kept."""
     request = goal.request
     return goal if request.withdrawn else goal._replace(request=structs.replace(request, withdrawn=reason))

@@ -1,4 +1,4 @@
-"""The control loop: the only process with deadlines. It waits for nothing but its next tick."""
+"""Control loop: the only process with deadlines; it waits for nothing except its next tick."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from trirail_drivers.driver.cyclic import Lender
 from trirail_drivers.interface import NAMES, DriveFault, DriveGroup, Feedback
 
 from trirail.config import Config
-from trirail.control.control import Control, Given
+from trirail.control.control import Control, TimedInput
 from trirail.control.modes import ModeEvent
-from trirail.processes.clock import SPARE_NS, Doors, Overruns, Tick, Ticker
-from trirail.processes.heartbeats import Haste, Heartbeats, Watch
+from trirail.processes.clock import SPARE_NS, Overruns, PollSet, Tick, Ticker
+from trirail.processes.heartbeats import Heartbeats, UrgentFlag, Watch
 from trirail.processes.ports import URGENT_REQUESTS_A_CYCLE, GatewayLink, PlannerLink, Ports
 from trirail.processes.quiet import Reached
 from trirail.processes.quiet_cycles import QuietCycles
@@ -28,18 +28,18 @@ from trirail.wire.packets import (
 from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import Mode
 
-DECIDING_NS = 300_000
-"""Time before the next tick below which requests already read wait until its setpoints have been sent [ns]."""
-SAYING_NS = 150_000
-"""The same for messages about decisions [ns]."""
-LEAST_PATIENCE = 3
-"""Fewest cycles for which the gateway may be silent, at any rate of the loop."""
-SHUTDOWN = 3.0
-"""Longest controlled stop before the drives are left to their own quick stop [s]."""
+DECISION_BUDGET_NS = 300_000
+"""Time that handling requests needs before the next tick [ns]; with less, they wait until its setpoints are sent."""
+REPORT_BUDGET_NS = 150_000
+"""The same for sending events and answers [ns]."""
+MIN_GATEWAY_TIMEOUT_CYCLES = 3
+"""Shortest time-out of the gateway, in cycles."""
+MAX_SHUTDOWN_S = 3.0
+"""Longest controlled stop at the end of the service, after which the drives stop by themselves [s]."""
 
 
 class Loop:
-    """Control loop: connects control, drives, ticks and the neighbours; every cycle is `cycle`."""
+    """Control loop: connects the control, the drives, the ticks and the neighbours."""
 
     def __init__(
         self,
@@ -53,14 +53,22 @@ class Loop:
         quiet: bool = True,
         now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`quiet`: the compiled call runs the cycles without events; else Python runs all.
+        """Connect the loop's parts.
 
-        `now`: the clock of the ticks [ns].
+        Parameters
+        ----------
+        lacking
+            Rights that the loop lacks, for its welcome.
+        quiet
+            Whether the compiled call runs the cycles without events; otherwise Python runs every cycle.
+        now
+            Clock of the ticks [ns].
+
         """
         self._now = now
         self._drives = drives
-        patience = max(LEAST_PATIENCE, round(config.watchdogs.gateway_timeout * config.loop.rate_hz))
-        watch = Watch(heartbeats.of("gateway"), patience)
+        patience = max(MIN_GATEWAY_TIMEOUT_CYCLES, round(config.watchdogs.gateway_timeout * config.loop.rate_hz))
+        watch = Watch(heartbeats.heart("gateway"), patience)
         self._gateway = GatewayLink(ports.gateway, watch, config.watchdogs.gateway_timeout)
         self._planner = PlannerLink(ports.planner)
         self._period = config.period
@@ -69,20 +77,20 @@ class Loop:
         self.control = Control(config, drives, self._planner)
         self._reports = Reports(config, self.control, drives, ports.gateway, ports.recorder, capture, lacking)
         self.ending = False
-        """Set from outside to make the loop stop the robot, disable the drives and return."""
+        """Flag to set from outside: the loop then stops the robot, disables the drives and returns."""
         self._ending_since: int | None = None
         self._overruns = Overruns(config.watchdogs.max_overruns)
-        self._heart = heartbeats.of("loop")
-        self._haste = Haste(heartbeats)
-        self._doors = Doors(ports)
+        self._heart = heartbeats.heart("loop")
+        self._urgent_flag = UrgentFlag(heartbeats)
+        self._poll_set = PollSet(ports)
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
         """Whether no further call is served before the next tick."""
-        self._unsaid = False
-        """Whether messages about decisions wait for lack of time."""
+        self._reports_postponed = False
+        """Whether events and answers wait, for lack of time before a tick."""
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
-            beside = self._reports, heartbeats, ports.gateway, self._doors, watch, self._haste
+            beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
             self._quiet = QuietCycles(self.control, drives, *beside)
         self._fault: DriveFault | None = None
         self._unready: tuple[str, ...] = ()
@@ -90,17 +98,17 @@ class Loop:
         self._parts_ns: MutableSequence[int] = [0] * len(Part) if self._quiet is None else self._quiet.parts_ns
 
     def run(self, ticker: Ticker) -> None:
-        """Run cycles until `ending` is set and the robot is at rest without power."""
+        """Run cycles until `ending` is set and the robot is at rest and unpowered."""
         self.begin()
-        while not self._over():
+        while not self._has_ended():
             self.turn(ticker)
-        self._say()
+        self._send_reports()
         self._flush()
 
     def begin(self) -> None:
-        """Accept the peers that are there already, and read the drives, before the first cycle."""
+        """Accept waiting peers and read the drives, before the first cycle."""
         self._planner.accept()
-        self._reports.accept_peers()  # so that a recorder that is there has every cycle from the first
+        self._reports.accept_peers()  # before the first cycle, so that a connected recorder receives every cycle
         self._drives.sync()
         self.control.start(self._drives.read())
 
@@ -110,9 +118,9 @@ class Loop:
         return self._quiet.cycles if self._quiet is not None else 0
 
     def turn(self, ticker: Ticker) -> None:
-        """Run the cycles without events, or one with an event; then decide what comes next.
+        """Run the cycles without events by the compiled call, or one cycle with an event; then handle requests.
 
-        If a neighbour calls during the wait for the next tick, only decide: once before each tick.
+        If a neighbour calls during the wait for a tick, only serve that call: at most once before each tick.
         """
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._gateway.frozen or not self._planner.idle
@@ -120,22 +128,22 @@ class Loop:
             newest = quiet.run(ticker, self._overruns, listens=not self._listened, once=self._postponed)
         elif quiet is not None:
             quiet.leave()
-        if newest is None and not self._listened and ticker.listen(self._doors):
-            self._hear(ticker)
+        if newest is None and not self._listened and ticker.listen(self._poll_set):
+            self._serve_call(ticker)
         elif newest is None:
             self.cycle(ticker.wait())
         elif newest.reached is Reached.WAITED:
             self.cycle(ticker.tick())
         elif newest.reached is Reached.SYNCED:
             self._marked_ns = newest.marked_ns
-            self._go_on(Tick(newest.deadline_ns, newest.lateness_ns, newest.missed))
+            self._continue_after_sync(Tick(newest.deadline_ns, newest.lateness_ns, newest.missed))
         elif newest.reached in (Reached.OBSERVED, Reached.SOLVED):
             self._marked_ns = newest.marked_ns
-            code = newest.found if newest.reached is Reached.SOLVED else None
+            code = newest.code if newest.reached is Reached.SOLVED else None
             self.control.execute(self.control.measured.feedback, self._mark, behind=newest.behind, code=code)
             self._end(Tick(newest.deadline_ns, newest.lateness_ns, newest.missed))
         elif newest.reached is Reached.CALLED:
-            self._hear(ticker)
+            self._serve_call(ticker)
         elif quiet is not None:
             self._listened = self._never_listens
             if newest.called or self._postponed or self._reports.full:
@@ -143,16 +151,16 @@ class Loop:
                 quiet.add(Part.DECIDE)
 
     def cycle(self, tick: Tick) -> None:
-        """Run one cycle. Nothing in it waits, and no failure in it leaves the robot moving."""
+        """Run one cycle. Nothing in it waits, and any failure in it stops the robot."""
         self._marked_ns = time.perf_counter_ns()
         self._drives.sync()
         self._mark(Part.SYNC)
-        self._go_on(tick)
+        self._continue_after_sync(tick)
 
-    def _go_on(self, tick: Tick) -> None:
-        """Run a cycle from its SYNC on: the setpoints leave before any decision that can wait."""
+    def _continue_after_sync(self, tick: Tick) -> None:
+        """Run the rest of a cycle after its SYNC: setpoints are sent before any decision that can wait."""
         now_ns = tick.deadline_ns + tick.lateness_ns
-        if self._haste.hurried() or self._gateway.ended:
+        if self._urgent_flag.was_raised() or self._gateway.ended:
             self._gateway.read(URGENT_REQUESTS_A_CYCLE)
             self._handle_urgent(self._gateway.requests(), now_ns)
         feedback = self._drives.read()
@@ -163,7 +171,7 @@ class Loop:
         self._end(tick)
 
     def _end(self, tick: Tick) -> None:
-        """Record a cycle whose setpoints have left, and decide by its results and by requests."""
+        """Record a cycle whose setpoints have been sent, then handle its results and requests."""
         self._listened = self._never_listens
         self._reports.record(tick, self._overruns.all, self._parts_ns)
         self._mark(Part.RECORD)
@@ -172,69 +180,77 @@ class Loop:
         self._decide(tick.deadline_ns + self._period_ns)
         self._mark(Part.DECIDE)
 
-    def _handle_urgent(self, given: Iterable[Request | Disturbance], now_ns: int) -> None:
-        """Apply stops and disturbances in this very cycle."""
-        for what in given:
-            self._reports.note(now_ns, what, urgent=True)
-            self.control.handle(what, now_ns)
+    def _handle_urgent(self, inputs: Iterable[Request | Disturbance], now_ns: int) -> None:
+        """Apply stops and disturbances in the present cycle."""
+        for each in inputs:
+            self._reports.note(now_ns, each, urgent=True)
+            self.control.handle(each, now_ns)
 
     @property
     def _postponed(self) -> bool:
-        """Whether there was no time left for all the work behind the newest setpoints."""
-        return self._unsaid or self._gateway.postponed
+        """Whether work was postponed until after the newest setpoints, for lack of time."""
+        return self._reports_postponed or self._gateway.postponed
 
     def _decide(self, next_ns: int, called: bool = True) -> None:
-        """Decide what happens at the next tick, which is due at `next_ns`, if a neighbour has `called`.
+        """Handle requests and send reports before the next tick.
 
-        Requests and messages without enough time before that tick wait until its setpoints have been sent, once.
+        Work without enough time before that tick is postponed, once, until its setpoints have been sent.
+
+        Parameters
+        ----------
+        next_ns
+            Deadline of the next tick [ns].
+        called
+            Whether a neighbour has called.
+
         """
         waited = self._gateway.postponed
         if called or waited:
             self._gateway.read()
-            in_time = waited or next_ns - self._now() >= DECIDING_NS
+            in_time = waited or next_ns - self._now() >= DECISION_BUDGET_NS
             self.control.decide(self._noted(next_ns, self._gateway.requests() if in_time else ()))
-        if self._unsaid or ((called or waited) and next_ns - self._now() >= SAYING_NS):
-            self._say()
+        if self._reports_postponed or ((called or waited) and next_ns - self._now() >= REPORT_BUDGET_NS):
+            self._send_reports()
         elif called or waited:
-            self._unsaid = True
+            self._reports_postponed = True
             self._reports.postpone()
         if self._reports.full:
             self._flush()
 
-    def _say(self) -> None:
-        """Send events and answers, and receive from the recorder."""
-        self._unsaid = False
+    def _send_reports(self) -> None:
+        """Send events and answers, and receive the recorder's messages."""
+        self._reports_postponed = False
         self._reports.listen()
         self._reports.pass_on()
 
-    def _hear(self, ticker: Ticker) -> None:
-        """Decide by requests that arrive in the wait for the next tick: they take effect then, not a cycle later."""
+    def _serve_call(self, ticker: Ticker) -> None:
+        """Handle requests that arrive during the wait for the next tick, so that they take effect at that tick."""
         self._listened = True
         self._gateway.read()
-        if given := list(self._noted(ticker.deadline_ns + self._period_ns, self._gateway.requests(), waiting=True)):
-            self.control.decide(given)
-        self._say()
+        if inputs := list(self._noted(ticker.deadline_ns + self._period_ns, self._gateway.requests(), waiting=True)):
+            self.control.decide(inputs)
+        self._send_reports()
 
-    def _noted(self, now_ns: int, requests: Iterable[Request], *, waiting: bool = False) -> Iterator[Given]:
-        """Yield requests and the planner's answers, and keep them for the recorder."""
+    def _noted(self, now_ns: int, requests: Iterable[Request], *, waiting: bool = False) -> Iterator[TimedInput]:
+        """Yield requests and the planner's answers, noting each for the recorder."""
         for what in itertools.chain(requests, self._planner.answers()):
             self._reports.note(now_ns, what, waiting=waiting)
             yield what, now_ns
 
     def _mark(self, part: Part) -> None:
-        """Record how long a part of the cycle took, at its end; 0 if a simulated time was ahead."""
+        """Record the duration of a part of the cycle, at its end; 0 if a simulated clock was ahead."""
         now = time.perf_counter_ns()
         self._parts_ns[part] = min(max(0, now - self._marked_ns), MAX_PART_NS)
         self._marked_ns = now
 
     def _watch(self, tick: Tick, feedback: Feedback) -> Iterator[Disturbance]:
-        """Count the ticks missed; yield the disturbances: late ticks, a lost gateway, a request to end."""
+        """Check for disturbances: yield late ticks, a lost gateway and a request to end; note changes of the drives."""
         fault = feedback.fault
         unready = tuple(name for name, each in zip(NAMES, feedback.unready, strict=True) if each is not None)
         if fault is not self._fault or unready != self._unready:
             self._fault, self._unready = fault, unready
-            said = DrivesFault(fault.message if fault else None, unready)
-            self._reports.note(tick.deadline_ns + tick.lateness_ns, said)
+            drives_fault = DrivesFault(fault.message if fault else None, unready)
+            self._reports.note(tick.deadline_ns + tick.lateness_ns, drives_fault)
             self._reports.report_protections()
         if in_a_row := self._overruns.too_many(tick.missed):
             words = f"{in_a_row} ticks missed in a row: the machine is too busy"
@@ -247,15 +263,15 @@ class Loop:
             end = coded("the service is ending: controlled stop, drives disabled", EventCode.SHUTDOWN)
             yield Disturbance(ModeEvent.SHUTDOWN.name, end.text, **end.fields)
 
-    def _over(self) -> bool:
+    def _has_ended(self) -> bool:
         if self._ending_since is None:
             return False
         control = self.control
         stands = control.state.mode in (Mode.DISABLED, Mode.FAULT) and not control.measured.powered
-        return stands or (control.cycles - self._ending_since) * self._period > SHUTDOWN
+        return stands or (control.cycles - self._ending_since) * self._period > MAX_SHUTDOWN_S
 
     def _flush(self) -> None:
-        """Give a sign of life, flush the batch, and accept new peers."""
+        """Count a heartbeat, send the batch of records, and accept new peers."""
         self._heart.beat()
         self._planner.accept()
         self._reports.flush()

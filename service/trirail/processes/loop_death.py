@@ -1,6 +1,6 @@
-"""Events after the death of the loop: it numbers the events, and nobody else can report how goals ended.
+"""Events that report the death of the loop, which normally issues all events.
 
-Gateway and recorder receive the same from the loop, so each derives them by itself, and both report the same.
+Gateway and recorder receive the same messages from the loop, so that each derives the same missing events by itself.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from collections.abc import Callable
 
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import REMEMBERED_IDS, Event, FaultDetail, Notice
-from trirail.wire.packets import Answer, ControlInput, Farewell, GoalRequest, Happened, Status
+from trirail.wire.packets import Answer, ControlInput, EventReport, Farewell, GoalRequest, Status
 from trirail.wire.vocabulary import FaultCause, Mode
 
 FROZEN, CYCLES = 0.5, 3
-"""Silence before the loop's end that means it was frozen [s, cycles]: it sends records every 20 ms or cycle."""
+"""Silence before the loop's end that shows it was frozen [s, cycles]; it sends records every 20 ms, or every cycle."""
 
 
 class LoopDeath:
-    """Follower of the loop's messages; `events` returns those missing when it has gone."""
+    """Observer of the loop's messages, which derives the events that are missing when the loop has died."""
 
     def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._period = period
@@ -30,30 +30,30 @@ class LoopDeath:
         self._farewell = False
         self._greeted = False
 
-    def heard(self) -> None:
-        """Record that the loop has sent something."""
+    def record_activity(self) -> None:
+        """Record that a message of the loop has arrived."""
         self._heard = self._clock()
         self._greeted = True
 
-    def follow(self, said: Answer | GoalRequest) -> None:
-        """Process a message of the loop, or a goal that it is given."""
-        match said:
+    def follow(self, message: Answer | GoalRequest) -> None:
+        """Follow a message from the loop, or a goal sent to it."""
+        match message:
             case ControlInput(given=GoalRequest() as request) | (GoalRequest() as request):
-                self._begun(request.id, request.user)
+                self._record_begin(request.id, request.user)
             case Status(goal=str(goal_id)):
-                self._begun(goal_id, None)
-            case Happened(event):
+                self._record_begin(goal_id, None)
+            case EventReport(event):
                 self._seq = event.seq
                 if event.outcome is not None and event.id is not None:
-                    self._over(event.id)
+                    self._record_end(event.id)
             case Farewell():
                 self._farewell = True
 
-    def _begun(self, goal_id: str, user: str | None) -> None:
-        if goal_id not in self._ended:  # a used id is refused, and has its own ending
+    def _record_begin(self, goal_id: str, user: str | None) -> None:
+        if goal_id not in self._ended:  # the loop refuses an id that is in use, and reports that itself
             self._open.setdefault(goal_id, user)
 
-    def _over(self, goal_id: str) -> None:
+    def _record_end(self, goal_id: str) -> None:
         self._open.pop(goal_id, None)
         self._ended[goal_id] = None
         if len(self._ended) > REMEMBERED_IDS:
@@ -61,7 +61,7 @@ class LoopDeath:
 
     @property
     def reason(self) -> EventText | None:
-        """Cause of the loop's end, for people; None if it has ended as it should, or has never turned."""
+        """Cause of the loop's end, for people; None if the loop has said farewell, or has never run."""
         if self._farewell or not self._greeted:
             return None
         frozen = self._clock() - self._heard > max(FROZEN, CYCLES * self._period)
@@ -70,7 +70,7 @@ class LoopDeath:
         return coded(f"the loop {how}: the drives stop by their own watchdogs", code)
 
     def events(self, cycle: int) -> list[Event]:
-        """Return the loop's missing events of its end in that cycle, the last known; none if it has sent them."""
+        """Return the events of the loop's death, in the last known cycle; none if the loop ended normally."""
         reason = self.reason
         if reason is None:
             return []

@@ -1,7 +1,7 @@
-"""The loop's process: rehearses, connects the drives, acquires its rights, and runs the loop until it must end.
+"""Loop process: rehearses, connects the drives, acquires real-time rights, and runs the loop until it must end.
 
-All that must happen without delay, stop, quick stop, a fault, a lost gateway, the end, runs once on simulated drives of
-the configured kind, before the first cycle on the real ones: the pages for it are then in memory, and locked there.
+Everything that must happen without delay (stop, quick stop, fault, lost gateway, end) runs once on simulated drives of
+the configured kind before the first cycle on the real ones, so that its memory pages are loaded and locked.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.vocabulary import Command, Mode
 
 PLANNER_WITHIN = 120.0
-"""Longest time for the planner to come up: the very first start compiles the kinematics [s]."""
+"""Longest time for the planner to come up [s]: the first start compiles the kinematics."""
 STEP_WITHIN = 500
-"""Most cycles of a step. A robot whose limits make it slower starts without the steps that would follow."""
+"""Most cycles of a step; the rehearsal of a robot that is too slow for that ends at this step."""
 IN_MOTION = 20
-"""Cycles of a jog before it is ended."""
+"""Cycles of a jog before it is stopped."""
 SLOW = 0.1
-"""Share of the platform's velocity along x at which it jogs."""
+"""Velocity of a jog along x, as a share of the limit."""
 
 
 class _UnfinishedError(Exception):
-    """A step has taken longer than STEP_WITHIN."""
+    """Step that has taken longer than STEP_WITHIN."""
 
 
 class _RehearsedTime:
-    """Monotonic clock, replaced by the cycles' own time while they run: a busy machine delays nothing."""
+    """Monotonic clock that advances by whole cycles during the rehearsal, so that a busy machine causes no delays."""
 
     def __init__(self) -> None:
         self._now: float | None = None
@@ -67,12 +67,12 @@ class _RehearsedTime:
         self._now = self() + seconds
 
     def release(self) -> None:
-        """Follow the monotonic clock again: a wait for a deadline would otherwise never end."""
+        """Follow the monotonic clock again, so that waits for a deadline end."""
         self._offset, self._now = self() - time.monotonic(), None
 
 
 class _Rehearsal:
-    """Rehearsal of the loop at full speed, which also plays gateway, planner and drives."""
+    """Rehearsal of the loop without waiting for ticks; it simulates gateway, planner and drives."""
 
     def __init__(self, config: Config, folder: Path) -> None:
         self._config = config
@@ -85,9 +85,9 @@ class _Rehearsal:
         gateway, recorder, planner = listening
         self._ports = Ports(Port(gateway), Port(recorder), Port(planner))
         self._heartbeats = Heartbeats.create()
-        # Python runs each cycle, since its part needs the rehearsal: compiled code has its pages from the first one on.
+        # Python runs each cycle, since its code needs the rehearsal: compiled code has its pages after its first cycle.
         self._loop = Loop(config, self._drives, self._ports, self._heartbeats, quiet=False, now=lambda: self._now_ns)
-        self._asked = links.connect(folder / "planner")
+        self._planner_link = links.connect(folder / "planner")
         self._planner = MotionPlanner(config)
         self._gateway: PacketLink | None = None
         self._now_ns = round(self._clock() * 1e9)
@@ -103,63 +103,63 @@ class _Rehearsal:
             self._clock.release()
             self._drives.close()
             self._hang_up()
-            self._asked.close()
+            self._planner_link.close()
             self._heartbeats.close()
             for port in self._ports:
                 port.close()
 
     def _pass(self, deadline_ns: int) -> None:
-        """Let a period pass, with the work of the other processes."""
+        """Advance the clock by one period, and do the work of the other processes."""
         self._clock.advance(self._config.period)
         self._now_ns = deadline_ns
-        while (packet := self._asked.receive()) is not None:
-            self._asked.send(encode(self._planner.plan(decode_plan_request(packet))))
+        while (packet := self._planner_link.receive()) is not None:
+            self._planner_link.send(encode(self._planner.plan(decode_plan_request(packet))))
         next(self._steps)
 
     def _script(self) -> Iterator[None]:
         yield from self._jog()
-        self._order(Command.STOP)
-        yield from self._until(lambda: self._mode is Mode.HOLDING)
+        self._send_command(Command.STOP)
+        yield from self._wait_until(lambda: self._mode is Mode.HOLDING)
         yield from self._jog()
-        self._order(Command.QUICK_STOP)
-        yield from self._until(lambda: self._mode is Mode.FAULT)
+        self._send_command(Command.QUICK_STOP)
+        yield from self._wait_until(lambda: self._mode is Mode.FAULT)
         yield from self._reset()
         yield from self._jog()
         self._bus.faults.add("A fault 2310")
-        yield from self._until(lambda: self._mode is Mode.FAULT)
+        yield from self._wait_until(lambda: self._mode is Mode.FAULT)
         yield from self._reset()
         yield from self._jog()
         self._hang_up()
-        yield from self._until(lambda: self._mode is Mode.HOLDING)
+        yield from self._wait_until(lambda: self._mode is Mode.HOLDING)
         self._loop.ending = True
-        yield from self._until(lambda: False)  # the loop returns before
+        yield from self._wait_until(lambda: False)  # the loop returns first
 
     def _reset(self) -> Iterator[None]:
-        """Leave the fault once the robot is at rest."""
-        yield from self._until(lambda: not self._loop.control.measured.powered)
-        self._order(Command.RESET)
-        yield from self._until(lambda: self._mode is Mode.DISABLED)
+        """Reset the fault once the drives are unpowered."""
+        yield from self._wait_until(lambda: not self._loop.control.measured.powered)
+        self._send_command(Command.RESET)
+        yield from self._wait_until(lambda: self._mode is Mode.DISABLED)
 
     def _jog(self) -> Iterator[None]:
-        """Bring the robot into motion, with power and a gateway."""
+        """Jog the robot, after connecting a gateway and enabling the drives if needed."""
         if self._gateway is None:
             self._gateway = links.connect(self._folder / "gateway")
-            yield from self._until(lambda: self._ports.gateway.connected)
+            yield from self._wait_until(lambda: self._ports.gateway.connected)
         if self._mode is not Mode.HOLDING:
-            self._order(Command.ENABLE)
-            yield from self._until(lambda: self._mode is Mode.HOLDING)
+            self._send_command(Command.ENABLE)
+            yield from self._wait_until(lambda: self._mode is Mode.HOLDING)
         velocity = VelocityGoal(SLOW * self._config.limits.platform.velocity[0], 0.0, 0.0, timeout=10.0)
         self._tickets += 1
         self._send(GoalRequest(self._tickets, "", f"{self._tickets}", velocity, self._now_ns))
-        yield from self._until(lambda: self._mode is Mode.MOVING)
+        yield from self._wait_until(lambda: self._mode is Mode.MOVING)
         yield from itertools.repeat(None, IN_MOTION)
 
     @property
     def _mode(self) -> Mode:
         return self._loop.control.state.mode
 
-    def _until(self, condition: Callable[[], bool]) -> Iterator[None]:
-        """Let cycles pass until a condition holds. Raises _UnfinishedError."""
+    def _wait_until(self, condition: Callable[[], bool]) -> Iterator[None]:
+        """Run cycles until a condition holds. Raises _UnfinishedError."""
         for _ in range(STEP_WITHIN):
             yield
             if self._gateway is not None:
@@ -169,9 +169,9 @@ class _Rehearsal:
                 return
         raise _UnfinishedError(f"the robot was still {self._mode.value} after {STEP_WITHIN} cycles")
 
-    def _order(self, name: Command) -> None:
+    def _send_command(self, name: Command) -> None:
         self._tickets += 1
-        with self._heartbeats.hurrying() if name.stops else nullcontext():
+        with self._heartbeats.urgent_section() if name.stops else nullcontext():
             self._send(CommandRequest(self._tickets, "", name))
 
     def _send(self, request: Request) -> None:
@@ -185,7 +185,7 @@ class _Rehearsal:
 
 
 def rehearse(config: Config) -> tuple[str, ...]:
-    """Rehearse all that must happen without delay; return why that was not possible, if it was not."""
+    """Rehearse stops, faults and the end; return the reason if the rehearsal failed, else nothing."""
     each = {name: structs.replace(drive, homing=None) for name, drive in zip(NAMES, config.drives.each, strict=True)}
     config = structs.replace(config, drives=structs.replace(config.drives, **each))
     with files.temporary_folder() as folder:
@@ -203,18 +203,24 @@ def main(
     heartbeats: Heartbeats,
     ready: Callable[[object], None],
 ) -> int:
-    """Run the loop's process; `ready` is called once it turns, with the rights that the loop lacks.
+    """Run the loop process; return its exit code.
 
-    `bus` waits for the drives' bus and returns it.
+    Parameters
+    ----------
+    bus
+        Function that waits for the drives' bus and returns its [can] section.
+    ready
+        Called just before the first cycle, with the rights that the loop lacks.
+
     """
     drives: DriveGroup | None = None
-    ended_as_told = False
+    ended_normally = False
     try:
         warm_up()
         unrehearsed = rehearse(config)
         ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
-        # Simulated drives that have died come back with the service's next start only: there is nothing to wait for.
+        # Simulated drives that have died return only with the next start of the service, so do not wait for them.
         awaits = config.can.interface != "simulated"
         drives = connect(bus(), config.drives, capture=capture, awaits=awaits, io=config.drive_io)
         drives.configure(config.period, config.limits.slider.fastest, awaits=True)
@@ -227,13 +233,13 @@ def main(
         signal.signal(signal.SIGTERM, end)
         ready({"lacking": lacking, "bus_load": drives.bus_load})
         loop.run(Ticker(round(config.period * 1e9)))
-        ended_as_told = True
+        ended_normally = True
     finally:
-        heartbeats.of("loop").rest()  # the drives may take their time to stop
+        heartbeats.heart("loop").rest()  # closing the drives may take longer than the watchdog allows
         if drives is not None:
             drives.close()
         for port in (ports.gateway, ports.recorder):
-            if ended_as_told:
+            if ended_normally:
                 port.send(message(Farewell()))
         for port in ports:
             port.close()

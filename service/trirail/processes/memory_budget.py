@@ -1,4 +1,4 @@
-"""Bytes that messages hold in the gateway's memory, counted until each is released, and the heap that they leave."""
+"""Budget for the memory held by messages in the gateway, and trimming of the heap after a burst."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OVERHEAD: Final = 1024
 
 
 class Reservation:
-    """Bytes of a budget, taken for as long as this object lives: every copy of a message carries the same one."""
+    """Reserved bytes of a budget, released when the object is collected; copies of a message share it."""
 
     __slots__ = ("_release",)
 
@@ -29,18 +29,18 @@ class Reservation:
 
 
 class Budget:
-    """Budget of bytes that may be held at a time, of all users and of each one."""
+    """Budget of bytes held at a time, in total and per user."""
 
     def __init__(self, total: int, of_one: int) -> None:
         self._total, self._of_one = total, of_one
         self._held: Counter[str] = Counter()
         self._all = 0
-        # Reentrant: a thread that takes some may release others meanwhile.
+        # Reentrant: garbage collection may release a reservation in a thread that holds the lock.
         self._lock = threading.RLock()
 
     @property
     def held(self) -> int:
-        """Bytes held now, of all users."""
+        """Bytes held now, in total."""
         return self._all
 
     def hold(self, user: str, size: int, room: int = 1) -> Reservation | None:
@@ -71,7 +71,7 @@ TRIM_ABOVE: Final = 8_000_000
 
 
 class HeapTrim:
-    """Trimmer of the heap after a burst of messages: malloc keeps the free memory otherwise."""
+    """Periodic trimming of the heap after a burst of messages; malloc would keep the free memory."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class HeapTrim:
         self._due = clock()
 
     def poll(self) -> None:
-        """Trim the heap if it has grown, at intervals."""
+        """Trim the heap if it has grown since the last check."""
         now = self._clock()
         if now < self._due:
             return

@@ -1,8 +1,8 @@
-"""/metrics for Prometheus and /healthz for monitoring of the service, over HTTP, in threads of the supervisor.
+"""HTTP server for /metrics (Prometheus) and /healthz, in threads of the supervisor.
 
-In the supervisor, since it outlives the others and sees their heartbeats: it reports a dead or frozen gateway, loop,
-planner or recorder all the same. Their measurements have arrived on their pipes, so that a scrape asks no process.
-Plain HTTP on the loopback; beyond it TLS, for users that have a role, as with `zenoh.listen`.
+The supervisor outlives the other processes and sees their heartbeats, so that it can report dead and frozen ones. They
+send it their measurements, so that a scrape disturbs no process. The server uses plain HTTP on the loopback; on other
+addresses it uses TLS, for users with a role, as with `zenoh.listen`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from trirail_drivers.interface import NAMES
 
 from trirail.config import Config, metrics_url
 from trirail.errors import ServiceError
-from trirail.processes.monitoring import Health, Histogram, Running, ServiceMeasured
-from trirail.processes.zenoh_links import InUse
+from trirail.processes.monitoring import Health, Histogram, Running, ServiceMeasurements
+from trirail.processes.zenoh_links import ResourceUse
 from trirail.telemetry.provenance import software
 from trirail.wire import tls
 from trirail.wire.credentials import Credentials, with_role
@@ -45,7 +45,7 @@ TICKS: Final = os.sysconf("SC_CLK_TCK")
 
 
 class ServiceMetrics(Collector):
-    """All metrics of a service."""
+    """Collector of all metrics of a service."""
 
     def __init__(self, robot: str, version: str, health: Health) -> None:
         self._robot = robot
@@ -64,17 +64,17 @@ class ServiceMetrics(Collector):
             yield from _digital(service)
             yield from _use(service.use)
         if (recorder := self._health.recorder) is not None:
-            words = "Batches that are missing, by where they should be."
+            words = "Batches of records missing in the recording or in the live view."
             lost = {"file": recorder.lost, "live": recorder.skipped}
             yield _counter("recorder_lost_batches", words, ["sink"], lost)
-            words = "Cycles that are in no recording, since the recorder was too slow for them."
+            words = "Cycles missing in the recording because the recorder was too slow."
             yield _counter("recorder_missing_cycles", words, value=recorder.absent)
 
     def _processes(self) -> Iterator[Metric]:
-        words = "Whether a process does its work, as /healthz says it."
+        words = "Whether a process is healthy, as on /healthz."
         healthy = {name: float(not trouble) for name, trouble in self._health.troubles().items()}
         yield _gauge("process_healthy", words, ["process"], healthy)
-        restarts = _counter("process_restarts", "How often a process was started again.", ["process"])
+        restarts = _counter("process_restarts", "Restarts of a process.", ["process"])
         memory = _gauge("process_resident_memory_bytes", "Memory of a process.", ["process"])
         busy = _counter("process_cpu_seconds", "Processor time of a process since its start.", ["process"])
         processes = {"supervisor": Running(os.getpid(), ready=True, restarts=0), **self._health.processes}
@@ -84,22 +84,24 @@ class ServiceMetrics(Collector):
                 memory.add_metric([name], used[0])
                 busy.add_metric([name], used[1])
         yield from (restarts, memory, busy)
-        words = "How old the metrics are that a process measures."
+        words = "Age of a process's measurements."
         yield _gauge("measurement_age_seconds", words, ["process"], self._health.ages())
 
 
-def _loop(service: ServiceMeasured) -> Iterator[Metric]:
+def _loop(service: ServiceMeasurements) -> Iterator[Metric]:
     modes = {name: float(name == service.mode) for name in MODES}
     yield _gauge("mode", "1 for the mode that the robot is in, 0 for the others.", ["mode"], modes)
     yield _counter("loop_cycles", "SYNCs sent since the start.", value=service.cycles)
     yield _counter("loop_missed_ticks", "Ticks missed since the start.", value=service.overruns)
-    yield _histogram("loop_lateness_seconds", "How much after its deadline a cycle began.", service.lateness)
-    yield _histogram("loop_cycle_seconds", "How long a cycle worked.", service.cycle)
+    yield _histogram("loop_lateness_seconds", "Delay of a cycle after its deadline.", service.lateness)
+    yield _histogram("loop_cycle_seconds", "Duration of a cycle's work.", service.cycle)
 
 
-def _goals(service: ServiceMeasured) -> Iterator[Metric]:
+def _goals(service: ServiceMeasurements) -> Iterator[Metric]:
     yield _counter("goals", "Goals that have ended, by outcome.", ["outcome"], service.goals)
-    yield _histogram("goal_settle_seconds", "From the end of a goal's path until it was in position.", service.settle)
+    yield _histogram(
+        "goal_settle_seconds", "Time from the end of a goal's path until the robot was in position.", service.settle
+    )
     faults = _counter("faults", "Faults, by cause, drive and the drive's own code.", ["cause", "drive", "code"])
     for count in service.faults:
         code = f"0x{count.fault.code:04X}" if count.fault.code else ""
@@ -107,7 +109,7 @@ def _goals(service: ServiceMeasured) -> Iterator[Metric]:
     yield faults
 
 
-def _can(service: ServiceMeasured) -> Iterator[Metric]:
+def _can(service: ServiceMeasurements) -> Iterator[Metric]:
     load = {"measured": service.bus_load_measured, "worst": service.bus_load}
     yield _gauge("can_load_ratio", "Share of the bus in use; 1 is full.", ["kind"], load)
     frames = {
@@ -119,22 +121,22 @@ def _can(service: ServiceMeasured) -> Iterator[Metric]:
     yield _counter("can_troubled_frames", words, ["drive", "kind"], frames)
 
 
-def _digital(service: ServiceMeasured) -> Iterator[Metric]:
+def _digital(service: ServiceMeasurements) -> Iterator[Metric]:
     yield _gauge("output", "Value of a digital output.", ["name"], service.outputs)
     yield _gauge("input", "Value of a digital input.", ["name"], service.inputs)
 
 
-def _use(use: InUse) -> Iterator[Metric]:
+def _use(use: ResourceUse) -> Iterator[Metric]:
     used = {"sessions": use.sessions, "descriptors": use.descriptors}
     most = {"sessions": use.sessions_most, "descriptors": use.descriptors_most}
-    yield _gauge("gateway_used", "What is in use of what the gateway has so many of.", ["what"], used)
+    yield _gauge("gateway_used", "Sessions and file descriptors of the gateway in use.", ["what"], used)
     words = "Connections to endpoints with TLS that have opened no session; a new session waits for them."
     yield _gauge("gateway_unopened_connections", words, [], {(): use.unopened})
-    yield _gauge("gateway_most", "How many of it there are.", ["what"], most)
+    yield _gauge("gateway_most", "Limit of the gateway's sessions and file descriptors.", ["what"], most)
 
 
 def _gauge(name: str, words: str, labels: list[str], values: Values = NONE_YET) -> GaugeMetricFamily:
-    """Return a metric with a value for each of its labels' values."""
+    """Return a gauge with a value for each value of its labels."""
     made = GaugeMetricFamily(f"{PREFIX}_{name}", words, labels=labels)
     for each, value in values.items():
         made.add_metric([each] if isinstance(each, str) else each, value)
@@ -151,7 +153,7 @@ def _counter(
 
 
 def _histogram(name: str, words: str, values: Histogram) -> HistogramMetricFamily:
-    """Return a histogram as Prometheus expects it: each bucket counts those below it as well."""
+    """Return a histogram with cumulative buckets, as Prometheus expects."""
     buckets: list[tuple[str, float]] = []
     so_far = 0
     for bound, count in zip((*values.bounds, float("inf")), values.counts, strict=True):
@@ -161,7 +163,7 @@ def _histogram(name: str, words: str, values: Histogram) -> HistogramMetricFamil
 
 
 def _used(pid: int) -> tuple[float, float] | None:
-    """Return memory [bytes] and processor time [s] of a process, None if it has just ended; proc(5)."""
+    """Return memory [bytes] and processor time [s] of a process, from proc(5); None if it has just ended."""
     try:
         pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
@@ -170,16 +172,16 @@ def _used(pid: int) -> tuple[float, float] | None:
     return int(pages) * PAGE, (int(fields[11]) + int(fields[12])) / TICKS
 
 
-PATIENCE: Final = 2.0
+REQUEST_TIMEOUT_S: Final = 2.0
 """Longest time for a connection to send a request [s]."""
-AT_ONCE: Final = 16
-"""Most connections served at a time; more are closed."""
+MAX_CONNECTIONS: Final = 16
+"""Most connections served at a time; further ones are closed."""
 
 _Start = Callable[..., Any]
 
 
 class MetricsServer:
-    """HTTP server, while the context lasts. Raises ServiceError if the port is taken or a certificate is invalid."""
+    """HTTP server that runs inside its context. Raises ServiceError for a used port or an invalid certificate."""
 
     def __init__(self, config: Config, health: Health) -> None:
         telemetry = config.telemetry
@@ -215,15 +217,15 @@ class MetricsServer:
                 "set telemetry.metrics_port to a free port, or to 0 for no metrics"
             ) from error
         if self._tls is not None:
-            # start_http_server of prometheus_client does the handshake in the thread that accepts: one silent
-            # connection would keep all others out. Nor does it give the name in the certificate.
+            # Not start_http_server of prometheus_client: it does the handshake in the accepting thread, where one
+            # silent connection blocks all others, and it does not pass on the name in the certificate.
             server.socket = self._tls.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
         return server
 
     def _answer(self, environ: Mapping[str, Any], start: _Start) -> Iterable[bytes]:
         """Answer a request, as a WSGI application."""
         if self._tls is not None and environ[USER] not in self._users:
-            return _say(start, HTTPStatus.FORBIDDEN, {"error": f"{environ[USER] or 'nobody'} has no role"})
+            return _respond(start, HTTPStatus.FORBIDDEN, {"error": f"{environ[USER] or 'nobody'} has no role"})
         match environ["PATH_INFO"]:
             case "/metrics":
                 return self._metrics(environ, start)  # type: ignore[no-any-return]
@@ -234,8 +236,8 @@ class MetricsServer:
                 processes = {name: trouble or "ok" for name, trouble in troubles.items()}
                 service = self._health.service
                 warnings = service.warnings if service is not None else ()
-                return _say(start, status, {"ok": fit, "processes": processes, "warnings": warnings})
-        return _say(start, HTTPStatus.NOT_FOUND, {"error": "there are /metrics and /healthz"})
+                return _respond(start, status, {"ok": fit, "processes": processes, "warnings": warnings})
+        return _respond(start, HTTPStatus.NOT_FOUND, {"error": "there are /metrics and /healthz"})
 
 
 USER: Final = "trirail.user"
@@ -243,20 +245,20 @@ USER: Final = "trirail.user"
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = PATIENCE
-    places = threading.BoundedSemaphore(AT_ONCE)
+    timeout = REQUEST_TIMEOUT_S
+    slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
 
     def handle(self) -> None:
-        if not self.places.acquire(blocking=False):
+        if not self.slots.acquire(blocking=False):
             return  # the connection is closed
         try:
             if isinstance(self.connection, ssl.SSLSocket):
                 self.connection.do_handshake()
             super().handle()
         except OSError:
-            pass  # the peer has gone: no one is left to answer
+            pass  # the peer has disconnected
         finally:
-            self.places.release()
+            self.slots.release()
 
     def get_environ(self) -> dict[str, Any]:
         shown = tls.peer(self.connection) if isinstance(self.connection, ssl.SSLSocket) else ""
@@ -268,7 +270,7 @@ class _Handler(WSGIRequestHandler):
 
 class _Server(ThreadingWSGIServer):
     def server_bind(self) -> None:
-        # Not that of http.server, which asks the network for the name of the address.
+        # Not HTTPServer.server_bind, which looks the host name up in the network.
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
         self.setup_environ()
@@ -278,6 +280,6 @@ class _ServerIPv6(_Server):
     address_family = socket.AF_INET6
 
 
-def _say(start: _Start, status: HTTPStatus, content: object) -> Iterable[bytes]:
+def _respond(start: _Start, status: HTTPStatus, content: object) -> Iterable[bytes]:
     start(f"{status.value} {status.phrase}", [("Content-Type", "application/json"), ("Cache-Control", "no-store")])
     return [msgspec.json.encode(content) + b"\n"]

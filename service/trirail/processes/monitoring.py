@@ -1,8 +1,7 @@
-"""Measurements of gateway and recorder, and the health of each process: the supervisor keeps them for monitoring.
+"""Measurements of gateway and recorder, and the health of all processes, kept by the supervisor for monitoring.
 
-Measurements are totals since the loop began, sent once a second. The supervisor checks all processes once in each of
-its turns; requests are answered in threads of their own, so that they also show a supervisor that is held up itself,
-by its output for one.
+Measurements are totals since the loop began, sent once a second. The supervisor checks all processes periodically.
+Other threads answer the requests of monitoring, so that they can also report a supervisor that is blocked itself.
 """
 
 from __future__ import annotations
@@ -16,19 +15,19 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from trirail.processes.heartbeats import PROCESSES, Heartbeats, Watch
-from trirail.processes.zenoh_links import InUse
+from trirail.processes.zenoh_links import ResourceUse
 from trirail.wire.decoding import converted, prepare
 from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 
-TOLD_EVERY: Final = 1.0
-"""Interval between two messages of measurements [s]."""
+MEASUREMENT_PERIOD_S: Final = 1.0
+"""Interval between two measurements [s]."""
 CYCLE_BOUNDS: Final = (1e-6, 2e-6, 5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
 """Bounds of the histograms of lateness and cycle [s]."""
 SETTLE_BOUNDS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Bounds of the histogram of settle times [s]."""
-KINDS_OF_FAULT: Final = 20
-"""Most faults that are distinguished, by cause, drive and code; further ones count as one."""
+MAX_FAULT_KINDS: Final = 20
+"""Most faults distinguished by cause, drive and code; all others count as OTHER."""
 OTHER: Final = FaultDetail("other")
 
 
@@ -38,13 +37,13 @@ class Histogram(Struct):
     bounds: tuple[float, ...]
     """Upper bounds, rising."""
     counts: list[int]
-    """Number of values at most each bound and above the one before; the last is of those above all bounds."""
+    """Number of values up to each bound and above the previous one; the last counts those above all bounds."""
     total: float = 0.0
     """Sum of all values."""
 
     @classmethod
-    def of(cls, bounds: tuple[float, ...]) -> Histogram:
-        """Return an empty histogram."""
+    def empty(cls, bounds: tuple[float, ...]) -> Histogram:
+        """Return a histogram without values."""
         return cls(bounds, [0] * (len(bounds) + 1))
 
     def add(self, values: NDArray[np.float64]) -> None:
@@ -62,13 +61,13 @@ class FaultCount(Struct, frozen=True):
     times: int
 
 
-class ServiceMeasured(Struct, frozen=True):
+class ServiceMeasurements(Struct, frozen=True):
     """Measurements of the gateway."""
 
     mode: str
     """A trirail.wire.vocabulary.Mode."""
     cycles: int
-    """This and the three below: see trirail.wire.state.LoopState."""
+    """Fields `cycles` to `bus_load_measured` are as in trirail.wire.state.LoopState."""
     overruns: int
     bus_load: float
     bus_load_measured: float
@@ -83,7 +82,7 @@ class ServiceMeasured(Struct, frozen=True):
     goals: dict[str, int]
     """Number of ended goals, by outcome."""
     faults: tuple[FaultCount, ...]
-    use: InUse
+    use: ResourceUse
     """Use of limited resources."""
     warnings: tuple[str, ...]
     """Warnings of resources nearly used up."""
@@ -93,26 +92,26 @@ class ServiceMeasured(Struct, frozen=True):
     """Value of each input of the configuration."""
 
 
-class RecorderMeasured(Struct, frozen=True):
-    """Measurements of the recorder: its gaps, since it was started."""
+class RecorderMeasurements(Struct, frozen=True):
+    """Measurements of the recorder: data missing since its start."""
 
     lost: int
-    """Batches that the disk did not take."""
+    """Batches not written to the disk."""
     skipped: int
-    """Batches that the live view was too slow for."""
+    """Batches dropped because the live view was too slow."""
     absent: int
-    """Cycles that the recorder itself was too slow for."""
+    """Cycles dropped because the recorder was too slow."""
 
 
 class Meter:
-    """Counts of the gateway's traffic; a restarted gateway counts cycles from 0, and receives the past events."""
+    """Counter of the gateway's measurements; after a restart, cycles count from 0 and past events arrive again."""
 
-    def __init__(self, tell: Callable[[Struct], None], clock: Callable[[], float] = time.monotonic) -> None:
-        self._tell = tell
+    def __init__(self, send: Callable[[Struct], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._send = send
         self._clock = clock
         self._due = clock()
-        self._lateness, self._cycle = Histogram.of(CYCLE_BOUNDS), Histogram.of(CYCLE_BOUNDS)
-        self._settle = Histogram.of(SETTLE_BOUNDS)
+        self._lateness, self._cycle = Histogram.empty(CYCLE_BOUNDS), Histogram.empty(CYCLE_BOUNDS)
+        self._settle = Histogram.empty(SETTLE_BOUNDS)
         self._goals: dict[str, int] = {}
         self._faults: dict[FaultDetail, int] = {}
 
@@ -129,20 +128,20 @@ class Meter:
                 self._settle.add(np.array([event.settle]))
         if event.kind == "fault":
             fault = event.fault or OTHER
-            if fault not in self._faults and len(self._faults) >= KINDS_OF_FAULT:
+            if fault not in self._faults and len(self._faults) >= MAX_FAULT_KINDS:
                 fault = OTHER
             self._faults[fault] = self._faults.get(fault, 0) + 1
 
-    def publish(self, newest: Callable[[], State], use: InUse, warnings: tuple[str, ...]) -> None:
+    def publish(self, newest: Callable[[], State], use: ResourceUse, warnings: tuple[str, ...]) -> None:
         """Send all measurements if they are due."""
         now = self._clock()
         if now < self._due:
             return
-        self._due = now + TOLD_EVERY
+        self._due = now + MEASUREMENT_PERIOD_S
         state = newest()
         loop = state.loop
-        self._tell(
-            ServiceMeasured(
+        self._send(
+            ServiceMeasurements(
                 mode=state.mode,
                 cycles=loop.cycles,
                 overruns=loop.overruns,
@@ -162,23 +161,23 @@ class Meter:
         )
 
 
-MEASURED_BY: Final = {"gateway": ServiceMeasured, "recorder": RecorderMeasured}
+MEASURED_BY: Final = {"gateway": ServiceMeasurements, "recorder": RecorderMeasurements}
 """Type of each process's measurements."""
 prepare(*MEASURED_BY.values())
 
-SILENT: Final = 3.0
-"""Silence after which a process is reported as frozen [s]; most have been killed for it by then."""
-LEAST_CYCLES: Final = 3
-"""Fewest cycles within which the loop must give a sign of life, however long they are."""
+MAX_SILENCE_S: Final = 3.0
+"""Silence after which a process is reported as frozen [s]; the supervisor has killed most hung processes before."""
+MIN_SILENT_CYCLES: Final = 3
+"""Shortest time-out of the loop's heartbeat, in cycles."""
 
 
 class Running(NamedTuple):
-    """State of a process, from the supervisor's side."""
+    """State of a process, as seen by the supervisor."""
 
     pid: int | None
-    """Process id; None without a process."""
+    """Process id; None if it is not running."""
     ready: bool
-    """Whether it has reported that it is up."""
+    """Whether it has sent its ready message."""
     restarts: int
     """Number of restarts."""
 
@@ -187,50 +186,50 @@ NOT_RUNNING: Final = Running(None, ready=False, restarts=0)
 
 
 class Health:
-    """Newest check of every process, and the newest measurements; any thread may ask."""
+    """Result of the newest check of every process, and the newest measurements; any thread may read them."""
 
     def __init__(
         self, heartbeats: Heartbeats, period: float, turn: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._clock = clock
-        self._looked = clock()
+        self._checked_at = clock()
         self._ending = False
-        silent = dict.fromkeys(PROCESSES, SILENT) | {"loop": max(SILENT, LEAST_CYCLES * period)}
-        self._watches = {name: Watch(heartbeats.of(name), round(silent[name] / turn)) for name in PROCESSES}
+        silent = dict.fromkeys(PROCESSES, MAX_SILENCE_S) | {"loop": max(MAX_SILENCE_S, MIN_SILENT_CYCLES * period)}
+        self._watches = {name: Watch(heartbeats.heart(name), round(silent[name] / turn)) for name in PROCESSES}
         self.processes: Mapping[str, Running] = dict.fromkeys(PROCESSES, NOT_RUNNING)
-        """State of each at the newest check."""
+        """State of each process at the newest check."""
         self._troubles: Mapping[str, str] = dict.fromkeys(PROCESSES, "starting")
-        self._told: dict[str, float] = {}
-        self.service: ServiceMeasured | None = None
-        self.recorder: RecorderMeasured | None = None
+        self._stored_at: dict[str, float] = {}
+        self.service: ServiceMeasurements | None = None
+        self.recorder: RecorderMeasurements | None = None
 
     def poll(self, processes: Mapping[str, Running]) -> None:
-        """Check all processes, in every turn of the supervisor."""
+        """Check all processes; to be called in every turn of the supervisor."""
         self._troubles = {name: self._trouble(name, running) for name, running in processes.items()}
         self.processes = processes
-        self._looked = self._clock()
+        self._checked_at = self._clock()
 
     def end(self, processes: Mapping[str, Running]) -> None:
-        """Check for the last time: the service is ending."""
+        """Check for the last time, and report the service as ending from now on."""
         self.poll(processes)
         self._ending = True
 
     def store(self, process: str, content: Mapping[str, Any]) -> None:
-        """Keep a process's measurements."""
+        """Store a process's measurements."""
         measured = converted(content, MEASURED_BY[process])
-        if isinstance(measured, ServiceMeasured):
+        if isinstance(measured, ServiceMeasurements):
             self.service = measured
         else:
             self.recorder = measured
-        self._told[process] = self._clock()
+        self._stored_at[process] = self._clock()
 
     def ages(self) -> dict[str, float]:
         """Return the age of the measurements, by process [s]."""
-        return {name: self._clock() - told for name, told in self._told.copy().items()}
+        return {name: self._clock() - stored_at for name, stored_at in self._stored_at.copy().items()}
 
     def troubles(self) -> dict[str, str]:
-        """Return the trouble of each process, "" for none; the supervisor is one of them."""
-        held_up = self._clock() - self._looked > SILENT
+        """Return the problem of each process, including the supervisor; "" for none."""
+        held_up = self._clock() - self._checked_at > MAX_SILENCE_S
         supervisor = "the service is ending" if self._ending else "no sign of life" if held_up else ""
         return {**self._troubles, "supervisor": supervisor}
 

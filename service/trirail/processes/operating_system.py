@@ -20,29 +20,28 @@ from trirail.processes.heartbeats import Heart
 
 
 def python(*arguments: str) -> list[str]:
-    """Return the command that runs this interpreter, with nothing of the current folder on its path.
+    """Return the command that runs this interpreter without the current folder on its path.
 
-    Otherwise, with `-m` and `-c`, Python would import a file `msgspec.py` from there, whatever its origin.
+    With `-m` and `-c`, Python would otherwise import a file such as `msgspec.py` from the current folder.
     """
     return [sys.executable, "-P", *arguments]
 
 
 ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Environment in which numpy's libraries start no threads: a fork carries none over, and the service's matrices
-are small."""
+"""Environment in which numpy's libraries start no threads: a fork would lose them, and the matrices are small."""
 TITLE = "trirail: "
 """Prefix of the names of the service's processes in `ps` and the like."""
 
 
 def processes(service: int) -> dict[str, int]:
     """Return the process ids of a service's processes by name; `service` is the supervisor's."""
-    found = {"supervisor": service}
+    pids = {"supervisor": service}
     for pid in [grandchild for parent in _children(service) for grandchild in (parent, *_children(parent))]:
         with contextlib.suppress(OSError):
             called = Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").decode()
             if called.startswith(TITLE):
-                found[called.removeprefix(TITLE)] = pid
-    return found
+                pids[called.removeprefix(TITLE)] = pid
+    return pids
 
 
 def child(service: int, name: str) -> int:
@@ -65,10 +64,10 @@ def _children(process: int) -> list[int]:
 
 
 class Signals:
-    """Source for select of SIGTERM, SIGINT and, unless it is ignored, as under nohup, SIGHUP.
+    """Source of SIGTERM, SIGINT and SIGHUP for select; SIGHUP stays ignored under nohup.
 
-    The kernel may hand a signal to any thread, but only the main thread runs Python's handlers, and nothing wakes that
-    from a lock if another one was interrupted.
+    The kernel may deliver a signal to any thread, but only the main thread runs Python's handlers, and a signal in
+    another thread does not wake it from a lock. A socket pair does.
     """
 
     def __enter__(self) -> Signals:
@@ -82,7 +81,7 @@ class Signals:
         return self
 
     def first(self) -> signal.Signals:
-        """Return the signal that came first; wait for one."""
+        """Wait for a signal, and return the first that has arrived."""
         return signal.Signals(self.reader.recv(1)[0])
 
     def __exit__(self, *_: object) -> None:
@@ -94,9 +93,9 @@ class Signals:
 
 
 SEND_WITHIN = 0.3
-"""Longest wait for a systemd that does not read [s]."""
+"""Longest wait for systemd to accept a notification [s]."""
 FEEDS = 4
-"""Number of feeds within the watchdog's time: systemd advises at least two."""
+"""Notifications within the watchdog's time-out; systemd recommends at least two."""
 
 
 def notify(state: str) -> None:
@@ -111,7 +110,7 @@ def notify(state: str) -> None:
 
 
 class Watchdog:
-    """Feeds of systemd's watchdog while all hearts have beaten since the last one; else systemd ends the service."""
+    """Client of systemd's watchdog: notifies it as long as all hearts beat; otherwise systemd ends the service."""
 
     def __init__(
         self,
@@ -126,7 +125,7 @@ class Watchdog:
         self._fed = [0] * len(hearts)
 
     def feed(self) -> None:
-        """Feed it if due."""
+        """Notify systemd if it is time and all hearts have beaten since the last notification."""
         now = self._clock()
         counts = [heart.count for heart in self._hearts]
         beating = all(count and count != before for count, before in zip(counts, self._fed, strict=True))
@@ -136,6 +135,6 @@ class Watchdog:
 
 
 def _microseconds(environment: Mapping[str, str]) -> int:
-    """Return the watchdog's time [µs]; 0 if there is none, or not for this process."""
+    """Return the time-out of systemd's watchdog [µs]; 0 if there is none for this process."""
     wanted, process = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", str(os.getpid()))
     return int(wanted) if wanted.isdecimal() and process == str(os.getpid()) else 0

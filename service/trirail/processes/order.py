@@ -9,12 +9,12 @@ from trirail.wire.credentials import Admission
 
 
 class Order(msgspec.Struct, frozen=True):
-    """Order to a child process: all that it needs of files, as the service found them at its start."""
+    """Order to a child process, with the content of all files that it needs, read when the service started."""
 
     config: Config
     record: str | None
-    """Recording file to write; None for one named by the time."""
+    """Recording file to write; None for a file named by the time."""
     admission: Admission | None = None
-    """Credentials and roles of a service with certificates."""
+    """Credentials and roles, for a service with certificates."""
     again: bool = False
-    """Whether the service has had this process before."""
+    """Whether this is a restart of the process."""

@@ -1,4 +1,4 @@
-"""Ports for the processes beside the loop, and the loop's sides of gateway and planner."""
+"""Ports of the loop for the other processes, and the loop's links to gateway and planner."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trirail.wire.plan_packets import PlanAnswer, PlanRequest, decode_plan_answe
 
 
 class Ports(NamedTuple):
-    """One port for each of them."""
+    """Ports on which the other processes connect to the loop."""
 
     gateway: Port
     recorder: Port
@@ -23,16 +23,16 @@ class Ports(NamedTuple):
 
 
 REQUESTS_A_CYCLE = 4
-"""Requests that are handled in one cycle: at 1 kHz more than the gateway sends on average."""
+"""Most requests handled in one cycle: at 1 kHz more than the gateway sends on average."""
 URGENT_REQUESTS_A_CYCLE = 128
-"""Requests that are handled in a cycle with an urgent stop: more than the gateway has under way at a time, so that
-a stop waits for none of those sent before it, and none of these begins after it."""
+"""Most requests handled in a cycle with an urgent stop: more than the gateway can have under way, so that the stop
+does not wait for earlier requests, and none of them begins after it."""
 ANSWERS_A_CYCLE = 2
-"""Packets of the planner that are handled in one cycle: it has one request at a time."""
+"""Most packets of the planner handled in one cycle; it has one request at a time."""
 
 
 class GatewayLink:
-    """Requests of the gateway, and whether it is alive."""
+    """Link to the gateway: receives its requests, and detects its loss."""
 
     def __init__(self, port: Port, watch: Watch, timeout: float) -> None:
         self._port = port
@@ -40,23 +40,23 @@ class GatewayLink:
         self._timeout = timeout
         self._in_hand: list[Request] = []
         self.frozen = False
-        """Whether it gives no sign of life."""
+        """Whether its heartbeat is missing."""
 
     @property
     def ended(self) -> bool:
-        """Whether it has gone, and receiving or sending has not found that yet."""
+        """Whether it has disconnected, before a receive or send has noticed."""
         return self._port.ended
 
     @property
     def postponed(self) -> bool:
-        """Whether requests have been read and not handled."""
+        """Whether requests have been read but not handled."""
         return bool(self._in_hand)
 
     def read(self, limit: int = REQUESTS_A_CYCLE) -> None:
-        """Read its packets, `limit` requests at most: no more than a cycle has time for.
+        """Read at most `limit` requests: no more than a cycle has time for.
 
-        Nothing is read from a frozen gateway until it serves again. One that sends an unreadable packet is
-        disconnected, and started again.
+        Nothing is read from a frozen gateway until its heartbeat returns. A gateway that sends an invalid packet is
+        disconnected; the supervisor then restarts it.
         """
         for _ in range(0 if self.frozen else limit):
             packet = self._port.receive()
@@ -73,9 +73,9 @@ class GatewayLink:
             yield self._in_hand.pop(0)
 
     def lost(self) -> EventText | None:
-        """Return how it has been lost in this cycle, to be called once in each; None if it has not.
+        """Check the gateway, once per cycle; return the message of a loss in this cycle, else None.
 
-        Its requests that were read and not handled are dropped: nobody is there to stop their effects.
+        Requests that were read but not handled are dropped: no client could stop their effects.
         """
         if self._port.clear_lost():
             self.frozen = False
@@ -86,13 +86,13 @@ class GatewayLink:
                 self.frozen = True
                 words = f"the gateway is frozen, no sign of life for {self._timeout:g} s: controlled stop"
                 return coded(words, EventCode.GATEWAY_FROZEN, timeout=self._timeout)
-        elif self._watch.heard:
+        elif self._watch.has_beat:
             self.frozen = False
         return None
 
 
 class PlannerLink:
-    """Requests of the control to the planner: trirail.control.plan_requests.PlannerPort."""
+    """Link to the planner: implements trirail.control.plan_requests.PlannerPort."""
 
     def __init__(self, port: Port) -> None:
         self._port = port
@@ -101,20 +101,20 @@ class PlannerLink:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to report that the planner does not report itself."""
+        """Whether no failure to send a request waits to be reported."""
         return self._unsent is None
 
     def request_plan(self, request: PlanRequest) -> None:
         """Send a request; a failure is reported in the next cycle."""
         if not self._port.connected:
-            self._unsent = "the planner is not there, it is being started again"
+            self._unsent = "the planner is not running, it is being restarted"
         elif not self._port.send(encode(request)):
-            self._unsent = "the planner cannot be asked, it takes no more"
+            self._unsent = "the planner accepts no request, its queue is full"
         else:
             self._awaited = request.number
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
-        """Yield the answers for the control; answers without a request are ignored."""
+        """Yield the planner's answers and losses for the control; ignore answers without a request."""
         if self._unsent is not None:
             unsent, self._unsent = self._unsent, None
             yield PlannerLost(unsent)
@@ -129,7 +129,7 @@ class PlannerLink:
             except msgspec.DecodeError as error:  # a planner that sends such packets is started again
                 self._port.hang_up()
                 self._awaited = None
-                yield PlannerLost(f"the planner has said something unreadable, {error}")
+                yield PlannerLost(f"the planner has sent an invalid packet, {error}")
                 return
             if answer.number == self._awaited:
                 self._awaited = None

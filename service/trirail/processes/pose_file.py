@@ -1,4 +1,4 @@
-"""The file of taught poses, in the service's state directory: intact after a power cut at any time."""
+"""File of taught poses in the service's state directory, written so that a power cut at any time leaves it intact."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NAME = "poses.json"
 
 
 class TaughtPose(NamedTuple):
-    """A taught pose; in the file an array."""
+    """Taught pose; stored as an array in the file."""
 
     x: Coordinate
     """[m]."""
@@ -31,7 +31,7 @@ class TaughtPose(NamedTuple):
     phi: Coordinate
     """[rad]."""
     geometry: str = ""
-    """Checksum of the [geometry] with which it was taught; "" where an earlier version did not note it."""
+    """Checksum of the [geometry] in force when it was taught; "" in files of earlier versions."""
 
     @property
     def pose(self) -> Coordinates:
@@ -40,12 +40,12 @@ class TaughtPose(NamedTuple):
 
 
 Taught = dict[PoseName, TaughtPose]
-"""Taught poses by their names."""
+"""Taught poses by name."""
 prepare(Taught)
 
 
 def state_directory(robot: str) -> Path:
-    """Return the directory of a robot's lasting data: below systemd's directory for the service, else the user's."""
+    """Return the directory of a robot's persistent data: in systemd's state directory, if set, else in the user's."""
     of_unit = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if of_unit:
         return Path(of_unit) / robot
@@ -54,23 +54,23 @@ def state_directory(robot: str) -> Path:
 
 
 class PoseFile:
-    """Access to the file. Reading and changing raise ServiceError, with the file and the remedy."""
+    """File of taught poses; `read` and `change` raise ServiceError with the path and the remedy."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
 
     def read(self) -> Taught:
-        """Return the taught poses; none if there is no file yet."""
+        """Return the taught poses; none if there is no file."""
         try:
             return decoded(files.text(self.path), Taught) if self.path.exists() else {}
         except (FileError, OSError) as error:
-            raise ServiceError(f"{error}; it has the taught poses") from error
+            raise ServiceError(f"{error}; this file holds the taught poses") from error
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             problem = str(error).replace("`", "")
-            raise ServiceError(f"{self.path}: {problem}; mend it, or move it away and teach the poses anew") from error
+            raise ServiceError(f"{self.path}: {problem}; mend it, or move it away and teach the poses again") from error
 
     def set_aside(self) -> Path:
-        """Rename it, never over another file, and return its new name. Raises OSError."""
+        """Rename the file without replacing another one; return the new path. Raises OSError."""
         with _alone_in(self.path.parent):
             names = (self.path.with_name(f"{NAME}.broken{number or ''}") for number in itertools.count())
             aside = next(name for name in names if not os.path.lexists(name))
@@ -79,14 +79,21 @@ class PoseFile:
 
     @property
     def gone(self) -> bool:
-        """Whether it has been deleted or moved away: its folder is made with it, and it stays without a pose in it."""
+        """Whether the file was deleted or moved away: its folder exists, and removing the last pose keeps the file."""
         return self.path.parent.is_dir() and not self.path.exists()
 
     def change(self, name: str, pose: TaughtPose | None, known: Taught | None = None) -> None:
-        """Save a pose under a name, or remove it for None; return once that is on the disk, however long it takes.
+        """Save a pose under a name, or remove the name; return once the change is on the disk.
 
-        Poses that another service of the same robot has written meanwhile stay; if the file has gone, it starts from
-        `known`.
+        Poses written meanwhile by another service of the same robot are kept.
+
+        Parameters
+        ----------
+        pose
+            Pose to save; None to remove the name.
+        known
+            Poses to write as well if the file has been deleted.
+
         """
         try:
             files.make_folder(self.path.parent)

@@ -1,7 +1,7 @@
-"""Named poses in the gateway: those of [poses], and the taught ones, which are kept.
+"""Named poses in the gateway: those of [poses] in the configuration, and taught ones, which are saved in a file.
 
-A disk may take longer than the loop waits for a sign of life: a thread of its own writes taught poses, which are
-answered, announced and known to goals once they are on the disk.
+A write to the disk may take longer than the gateway may be silent, so a thread of its own writes taught poses. They are
+confirmed, announced and usable in goals once they are on the disk.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from trirail.wire.state import NamedPose, NamedPoses
 from trirail.wire.text import check_new_pose
 from trirail.wire.vocabulary import MODES, Mode
 
-MOST = 1000
-"""Most poses that are kept."""
-UNDER_WAY = 32
-"""Most poses that are being taught or removed at a time; more are refused."""
-LOOK_EVERY = 2.0
-"""Interval of the checks that the file of taught poses is there [s]."""
-BELONGS = 1e-3
-"""Largest error of a measured pose's sliders [m]: beyond it the pose is of earlier cycles, and the present sliders
-do not close the loops."""
+MAX_TAUGHT_POSES = 1000
+"""Most taught poses."""
+MAX_CHANGES_UNDER_WAY = 32
+"""Most changes in progress; further ones are refused."""
+CHECK_PERIOD_S = 2.0
+"""Interval between two checks that the file of taught poses exists [s]."""
+MAX_CLOSURE_ERROR_M = 1e-3
+"""Largest error between the sliders of a measured pose and the measured sliders [m]. A larger error means that the
+present sliders do not close the loops, so that the pose is of an earlier cycle."""
 
 
 class _Change(NamedTuple):
-    """A pose to be taught, or to be removed."""
+    """Pose to teach, or to remove if `pose` is None."""
 
     incoming: Incoming
     user: str
@@ -51,11 +51,23 @@ class _Change(NamedTuple):
 
 
 class Poses:
-    """Handler of …/poses, …/teach and …/forget, which also replaces names in goals by their poses.
+    """Handler of …/poses, …/teach and …/forget, which also resolves the names in goals.
 
-    `reply` answers, `refuse` refuses, `announce` informs everyone, `wake` has `settle` called soon, from any thread.
-    Raises ServiceError if the taught poses cannot be read, but not in a gateway that is started `again`: the robot is
-    then served without, and the file is kept aside.
+    Parameters
+    ----------
+    reply, refuse, announce
+        Functions that answer a message, refuse it, and publish a notice.
+    wake
+        Function that makes the gateway call `settle` soon; safe from any thread.
+    again
+        Whether the gateway is restarted: it then serves the robot without taught poses if their file cannot be read,
+        and renames that file.
+
+    Raises
+    ------
+    ServiceError
+        If the taught poses cannot be read at the first start.
+
     """
 
     def __init__(
@@ -74,21 +86,21 @@ class Poses:
         self._configured = config.poses
         self._file = PoseFile(state_directory(config.robot.name))
         self._lacking = ""
-        """Reason why the taught poses are missing; empty if they are not."""
+        """Reason why the taught poses are missing; empty if they have been read."""
         self._taught = self._read(again=again)
         self._reply, self._refuse, self._announce, self._wake = reply, refuse, announce, wake
         self._to_measure: deque[_Change] = deque()
-        self._lacking_told = False
+        self._lacking_announced = False
         self._under_way = 0
         self._written: queue.SimpleQueue[tuple[_Change, ServiceError | None]] = queue.SimpleQueue()
         self._writer = ThreadPoolExecutor(1, "poses")
         self._clock = clock
-        self._next_look = clock()
+        self._next_check = clock()
         self._gone = ""
-        """Warning that the file of taught poses has gone, with its consequence; empty while it is there."""
+        """Warning that the file of taught poses has been deleted; empty while it exists."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings, one line each: a file that has gone, names that are now in the configuration."""
+        """Return warnings about taught poses, one line each."""
         both = sorted(self._taught.keys() & self._configured.keys())
         foreign = sorted(name for name in self._taught.keys() - both if self._is_foreign(self._taught[name]))
         other = (
@@ -102,15 +114,15 @@ class Poses:
         return pose.geometry not in ("", self._geometry_id)
 
     def poll(self) -> None:
-        """Check at intervals that the file of taught poses is still there; announce it if it is not."""
-        if self._clock() < self._next_look:
+        """Check periodically that the file of taught poses exists, and announce its loss."""
+        if self._clock() < self._next_check:
             return
-        self._next_look = self._clock() + LOOK_EVERY
-        if self._lacking and not self._lacking_told:
+        self._next_check = self._clock() + CHECK_PERIOD_S
+        if self._lacking and not self._lacking_announced:
             lacking = coded(self._lacking, EventCode.POSES_UNREADABLE, file=str(self._file.path))
             self._announce(Notice("service", "warning", lacking.text, **lacking.fields))
-            self._lacking_told = True
-        before, self._gone = self._gone, self._lost() if self._file.gone and not self._lacking else ""
+            self._lacking_announced = True
+        before, self._gone = self._gone, self._lost_warning() if self._file.gone and not self._lacking else ""
         if self._gone and not before:
             gone = coded(self._gone, EventCode.POSES_LOST, file=str(self._file.path))
             self._announce(Notice("service", "warning", gone.text, **gone.fields))
@@ -122,14 +134,14 @@ class Poses:
             if not again:
                 raise
             self._lacking = f"{error}; there are no taught poses now"
-            with contextlib.suppress(OSError):  # it stays where it is, and no change is taken
+            with contextlib.suppress(OSError):  # the file keeps its name, and changes are refused
                 self._lacking += f"; the file is kept as {self._file.set_aside()}"
             return {}
 
-    def _lost(self) -> str:
-        """Return the warning that the file has gone."""
+    def _lost_warning(self) -> str:
+        """Return the warning that the file has been deleted."""
         if not self._taught:
-            return f"{self._file.path} has gone: what was taught is lost, if anything was"
+            return f"{self._file.path} has gone: taught poses, if there were any, are lost"
         known = ", ".join(sorted(self._taught))
         return (
             f"{self._file.path} has gone: taught poses are known only until the service ends ({known}); "
@@ -145,8 +157,8 @@ class Poses:
     def _named(self, name: str, pose: TaughtPose) -> NamedPose:
         return NamedPose(name, *pose.pose, taught=True, other_geometry=self._is_foreign(pose))
 
-    def of_name(self, goal: Goal) -> Goal:
-        """Return the pose goal that a named one means; any other goal, and one with an unknown name, unchanged."""
+    def resolve_name(self, goal: Goal) -> Goal:
+        """Return the pose goal for a named goal; return other goals, and goals with an unknown name, unchanged."""
         if not isinstance(goal, NamedGoal):
             return goal
         taught = self._taught.get(goal.name)
@@ -154,8 +166,8 @@ class Poses:
         return goal if pose is None else pose_in_place_of(goal, *pose)
 
     def edit(self, incoming: Incoming, user: str, name: str) -> None:
-        """Handle a query on …/teach or …/forget. Raises RefusedError."""
-        if self._under_way >= UNDER_WAY:
+        """Handle a query on …/teach or …/forget. Raises RefusedError for an invalid one."""
+        if self._under_way >= MAX_CHANGES_UNDER_WAY:
             raise RefusedError(RefusalCode.BUSY, f"{self._under_way} poses are being taught already: send fewer")
         if incoming.kind == "forget":
             self._check_known(name)
@@ -166,13 +178,13 @@ class Poses:
             raise RefusedError(
                 RefusalCode.CONFIGURED_POSE, f"{name} is in [poses]: teach another name, or change it there"
             )
-        if len(self._taught) >= MOST and name not in self._taught:
-            raise RefusedError(RefusalCode.BUSY, f"{MOST} poses are kept already: remove one")
+        if len(self._taught) >= MAX_TAUGHT_POSES and name not in self._taught:
+            raise RefusedError(RefusalCode.BUSY, f"{MAX_TAUGHT_POSES} poses are kept already: remove one")
         self._under_way += 1
         self._to_measure.append(_Change(incoming, user, name, None))
 
     def measure(self, record: np.void) -> None:
-        """Measure the pose to be taught in a record: the newest that there is, and later than the request."""
+        """Take the measured pose of a record for each pose to teach; the record must be newer than the request."""
         while self._to_measure:
             wanted = self._to_measure.popleft()
             self._under_way -= 1
@@ -190,7 +202,7 @@ class Poses:
                 return
             self._under_way -= 1
             pose = change.pose or self._taught.get(change.name)
-            if failure is not None or pose is None:  # the latter if two have removed it at the same time
+            if failure is not None or pose is None:  # None if two clients have removed it at the same time
                 why = f"{change.name} is as it was: {failure or 'it has been removed already'}"
                 self._refuse(change.incoming, RefusedError(RefusalCode.FAILED, why))
                 continue
@@ -203,7 +215,7 @@ class Poses:
             self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))
 
     def close(self) -> None:
-        """Write and answer all pending changes; requests that wait for a record get an error."""
+        """Finish and answer all pending changes; answer an error to requests that wait for a record."""
         for wanted in self._to_measure:
             self._reply(wanted.incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
         self._to_measure.clear()
@@ -220,17 +232,17 @@ class Poses:
         raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r} was taught: there is {there_are}")
 
     def _measured(self, record: np.void) -> Coordinates:
-        """Return the measured pose. Raises RefusedError if the robot moves, or its pose is not known."""
+        """Return the measured pose. Raises RefusedError if the robot moves or its pose is unknown."""
         mode = MODES[record["mode"]]
         if mode is Mode.FAULT:
             raise RefusedError(RefusalCode.FAULT, "the robot is in fault: remove the cause, then send reset")
         if mode not in (Mode.DISABLED, Mode.HOLDING):
             raise RefusedError(RefusalCode.MOVING, f"the robot is {mode}: teach a pose when it stands")
         if not np.all(record["homed"]):
-            raise RefusedError(RefusalCode.NOT_HOMED, "it is not known where the sliders are: send home first")
+            raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
         x, y, phi = record["pose"].tolist()
         there = travels(self._geometry, (x, y, phi))[0]
-        if not np.abs(there - record["position"] + record["backlash"]).max() <= BELONGS:
+        if not np.abs(there - record["position"] + record["backlash"]).max() <= MAX_CLOSURE_ERROR_M:
             raise RefusedError(RefusalCode.SINGULAR, "the sliders are where they belong to no pose: move them")
         return x, y, phi
 
@@ -239,7 +251,7 @@ class Poses:
         self._writer.submit(self._keep, change)
 
     def _keep(self, change: _Change) -> None:
-        """Write a change, in the thread that does nothing else."""
+        """Write a change, in the writer's thread."""
         failure = None
         try:
             self._file.change(change.name, change.pose, dict(self._taught))

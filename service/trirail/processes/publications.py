@@ -1,4 +1,4 @@
-"""Publications and answers of the gateway for one robot: state, records, events with their past, and its info."""
+"""Publications of the gateway for one robot: state, summary, records, events with their history, and the info reply."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from trirail.wire.state import (
 from trirail.wire.vocabulary import MODES, Mode
 
 EVENTS_KEPT = 1000
-"""Number of events that a client receives if it asks for the past."""
-_PAST = RepliesConfig(
+"""Number of past events that a new client can request."""
+_HISTORY_REPLIES = RepliesConfig(
     priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.BLOCK, express=False
 )
 
 
 class Publications:
-    """Publishers on a robot's keys. State and records are dropped for a slow subscriber, events wait for it."""
+    """Publishers on a robot's keys. For a slow subscriber, state and records are dropped, and events wait."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         def dropping(name: str, encoding: str, priority: zenoh.Priority) -> zenoh.Publisher:
@@ -60,8 +60,8 @@ class Publications:
             session,
             zenoh_session.key(robot, "event"),
             encoding=boundary.JSON,
-            # The past goes out in one burst, whole, in a queue of its own: a slow subscriber delays nothing else.
-            cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_PAST),
+            # The history is sent as one burst in a queue of its own, so that a slow subscriber delays nothing else.
+            cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_HISTORY_REPLIES),
             sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             publisher_detection=True,
         )
@@ -79,7 +79,7 @@ class Publications:
         self._records.put(batch)
 
     def event(self, event: Event) -> None:
-        """Publish an event, for later subscribers as well."""
+        """Publish an event, and keep it for later subscribers."""
         self._event.put(msgspec.json.encode(event))
 
 
@@ -101,7 +101,10 @@ def wall_offset_ns() -> int:
 
 
 class StateMaker:
-    """Newest record, and timing of the last minute. `offset_ns` returns the wall clock minus the monotonic one."""
+    """Builder of states from the newest record and the loop's other messages, with timing statistics.
+
+    `offset_ns` returns the wall clock minus the monotonic one.
+    """
 
     def __init__(self, config: Config, offset_ns: Callable[[], int] = wall_offset_ns) -> None:
         self._period = config.period
@@ -109,8 +112,8 @@ class StateMaker:
         self._outputs = {name: (NAMES.index(each.drive), 1 << each.bit) for name, each in config.outputs.items()}
         self._inputs = {name: (NAMES.index(each.drive), 1 << each.bit) for name, each in config.inputs.items()}
         self._rate_hz = config.loop.rate_hz
-        self._lateness = _Recent(round(WINDOW / config.period))
-        self._cycle = _Recent(round(WINDOW / config.period))
+        self._lateness = _RecentValues(round(WINDOW / config.period))
+        self._cycle = _RecentValues(round(WINDOW / config.period))
         self._statistics = _NONE, _NONE
         self._statistics_due = 0
         self._newest: Any = None
@@ -120,7 +123,7 @@ class StateMaker:
         self._status = Status(None, 1.0, None)
 
     def update(self, news: Status | Welcome) -> None:
-        """Update from a message of the loop other than records."""
+        """Update from a status or a welcome of the loop."""
         if isinstance(news, Welcome):
             self._welcome = news
         else:
@@ -130,7 +133,7 @@ class StateMaker:
         """Update from a batch of records."""
         newest, before = rows[-1], self._newest
         if before is not None:
-            # Over a batch and not over a cycle: at 1 kHz a count of the encoder is a large step of velocity.
+            # Differences over a batch and not over a cycle: at 1 kHz one encoder count is a large step of velocity.
             span = (int(newest["cycle"]) - int(before["cycle"])) * self._period
             velocity = (newest["pose"] - before["pose"]) / span
             self._acceleration = (velocity - self._velocity) / span
@@ -147,16 +150,16 @@ class StateMaker:
 
     @property
     def lease(self) -> str | None:
-        """User that holds the lease."""
+        """Holder of the lease; None for nobody."""
         return self._status.lease
 
     @property
     def cycle(self) -> int:
-        """Cycle of the newest record; 0 for none."""
+        """Cycle of the newest record; 0 before the first."""
         return 0 if self._newest is None else int(self._newest["cycle"])
 
     def newest(self, warnings: tuple[str, ...] = ()) -> State:
-        """Return the state of the newest record, with warnings about how the service is run."""
+        """Return the state by the newest record, with these warnings."""
         row = self._newest
         lateness, cycle = self._statistics
         goal, target = self._status.goal, self._status.target
@@ -211,8 +214,8 @@ class StateMaker:
         )
 
 
-class _Recent:
-    """Most recent values [ns]."""
+class _RecentValues:
+    """Ring buffer of the most recent values [ns]."""
 
     def __init__(self, size: int) -> None:
         self._values = np.zeros(size, dtype=np.int64)
@@ -239,7 +242,7 @@ def _triple(values: NDArray[np.float64]) -> Triple:
 
 
 def info(config: Config) -> Info:
-    """Return the answer on …/info of a service with this configuration."""
+    """Return the reply on …/info for a configuration."""
     live = config.telemetry.live_port
     legs: list[dict[str, Any]] = []
     for name, leg in zip(NAMES, geometry(config.geometry).each, strict=True):

@@ -1,12 +1,12 @@
-"""Cycles without events, as one compiled call: it runs from cycle to cycle until Python is needed.
+"""Cycles without events ("quiet" cycles) as one compiled call, which runs from cycle to cycle until Python is needed.
 
-Wait, SYNC, received frames, `observe`, `command`, `hold` or `follow`, the last gate, setpoints, record. Nothing is
-decided here: if a decision must precede the setpoints, because a drive sends anything but its position, a request is
-urgent, a neighbour has gone, or the last gate refuses, the call ends at that stage, and Python continues from it. Work
-that can wait until the setpoints have left is left to Python behind them.
+A cycle consists of wait, SYNC, received frames, `observe`, then `command`, `hold` or `follow`, the last gate, setpoints
+and record. The call decides nothing. If a decision must precede the setpoints (a drive sends anything but its position,
+a request is urgent, a neighbour has disconnected, the last gate refuses), the call returns at that stage, and Python
+continues from there. Other work is left to Python after the setpoints have been sent.
 
-A wait that a signal interrupts continues to its deadline; Python's handlers run when the call has returned, which is at
-the end of a batch of records at the latest.
+A signal does not end a wait: Python's handlers run once the call has returned, at the end of a batch of records at the
+latest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trirail_drivers.driver.cyclic import MOST_FRAMES
 from trirail.control import cycle, outputs
 from trirail.kinematics.arrays import Array
 from trirail.kinematics.compiled import compiled
-from trirail.processes.clock import DOORS, SPARE_NS, called, now_ns, sleep, wait
+from trirail.processes.clock import POLLFDS, SPARE_NS, called, now_ns, sleep, wait
 from trirail.processes.cycle_frames import (
     AXES,
     EXPECTATIONS,
@@ -31,37 +31,37 @@ from trirail.processes.cycle_frames import (
     begin_cycle,
     end_read,
     needs_python,
+    process_frames,
     receive_frames,
     send_frames,
     send_outputs,
     set_frames,
-    take_frames,
 )
-from trirail.processes.heartbeats import HASTE
+from trirail.processes.heartbeats import URGENT_INDEX
 from trirail.wire.records import MAX_PART_NS, Part
 
-_GONE: Final = (0x008 | 0x010) << 16
-"""POLLERR and POLLHUP of poll.h, at the place of `revents`."""
+_PEER_GONE: Final = (0x008 | 0x010) << 16
+"""POLLERR and POLLHUP of poll.h, in the bits of `revents`."""
 
 
 class Reached(IntEnum):
-    """Stage that the newest cycle has reached."""
+    """Stage reached by the newest cycle."""
 
     WAITED = 0
-    """Its tick is there; frames may have been received."""
+    """The tick is due; frames may have been received."""
     SYNCED = 1
-    """Its SYNC has been sent, as far as the bus takes it, and frames may have been received."""
+    """The SYNC has been sent, as far as the bus accepts it; frames may have been received."""
     OBSERVED = 2
-    """A following error beyond its limit has been found."""
+    """A following error exceeds its limit."""
     SOLVED = 3
-    """The sliders have been solved; the last gate has refused that, it is late, a frame cannot hold a setpoint, or an
-    output must be set by SDO."""
+    """The sliders are solved, but the last gate has refused, the cycle is late, a setpoint does not fit into its frame,
+    or an output must be set by SDO."""
     WRITTEN = 4
-    """All is done, except for setpoints or outputs that the bus has not taken."""
+    """The cycle is complete, except for setpoints or outputs that the bus has not accepted."""
     DONE = 5
-    """All is done."""
+    """The cycle is complete."""
     CALLED = 6
-    """All is done, and a neighbour has called during the wait for the next tick."""
+    """The cycle is complete, and a neighbour has called during the wait for the next tick."""
 
 
 FOLLOW, HOLD, COMMAND = 0, 1, 2
@@ -74,11 +74,11 @@ STATE = np.dtype(
         ("injected_ns", "<i8"),  # the time, for tests; negative: the monotonic clock
         ("deadline_ns", "<i8"),  # of the newest tick
         ("lateness_ns", "<i8"),
-        ("synced", "<f8"),  # when its SYNC was sent [s]
-        ("marked_ns", "<i8"),  # when its newest part ended
+        ("synced", "<f8"),  # time at which its SYNC was sent [s]
+        ("marked_ns", "<i8"),  # time at which its newest part ended
         ("cycle", "<i8"),
         ("until", "<i8"),  # the last cycle that may be run
-        ("due", "<i8"),  # the cycle behind which a decision is due
+        ("due", "<i8"),  # the cycle after which a decision is due
         ("overruns", "<i8"),  # ticks that have been missed
         ("in_a_row", "<i8"),  # those before the newest, and their maximum
         ("allowed", "<i8"),
@@ -87,37 +87,37 @@ STATE = np.dtype(
         ("mode", "u1"),  # as in a record
         ("source", "u1"),  # FOLLOW, HOLD or COMMAND
         ("held", "u1"),  # as in trirail.control.cycle.follow
-        ("stands", "u1"),  # as in trirail.control.cycle.observe
+        ("at_rest", "u1"),  # as in trirail.control.cycle.observe
         ("in_sliders", "u1"),  # of the path
         ("behind", "<i8"),  # result of trirail.control.cycle.observe
-        ("found", "<i8"),  # result of trirail.control.cycle.command
+        ("code", "<i8"),  # result of trirail.control.cycle.command
         ("time", "<f8"),  # of the law [s], and the rate that it leads to
         ("target", "<f8"),
         ("course", "<f8", 3),  # trirail.motion.runs.GoalSpan
         ("fastest", "<f8"),  # as in trirail.control.cycle.observe
         ("limit", "<f8"),
         ("step", "<f8"),  # as in trirail.control.cycle.follow
-        ("settles", "u1"),  # whether a goal waits for the robot to be in position, and until which cycle
+        ("settles", "u1"),  # whether a goal waits for the robot to be in position, and the cycle of its time-out
         ("timeout", "<i8"),
-        ("haste", "<u8"),  # the count of urgent requests at the last check
+        ("urgent_seen", "<u8"),  # the count of urgent requests at the last check
         ("listens", "u1"),  # whether a call during the wait for the next tick is served immediately
-        ("called", "u1"),  # whether a decision is due behind the newest cycle
+        ("called", "u1"),  # whether a decision is due after the newest cycle
         ("gateway_seen", "<u8"),  # trirail.processes.heartbeats.Watch
         ("gateway_turns", "<i8"),
         ("gateway_patience", "<i8"),
         ("gateway_place", "<i8"),
         ("batched", "<i8"),  # records in the batch
         ("handled", "<i8"),  # frames that have been processed
-        ("arrived", "<i8"),  # frames that have been received; Python must check those behind
+        ("arrived", "<i8"),  # frames that have been received; Python must process those not handled
         ("error", "<i8"),  # of receiving frames: a number of errno.h
         ("sent", "<i8"),  # setpoints that the bus has accepted
-        ("logged", "<i8"),  # rows in the log of switches, and the cycle behind which they are reported
+        ("logged", "<i8"),  # rows in the log of switches, and the cycle after which they are reported
         ("report_due", "<i8"),
         ("report_after", "<i8"),
     ],
     align=True,
 )
-"""State from which the call continues, and its results."""
+"""State of the compiled call between cycles, and its results."""
 
 _STATE = from_dtype(STATE)[::1]
 
@@ -130,19 +130,19 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
 
 
 @compiled()
-def _wait(state: NDArray[np.void], moment: NDArray[np.int64], doors: NDArray[np.int32]) -> bool:
-    """Wait for the deadline; return whether a neighbour at a door must be served before it."""
+def _wait(state: NDArray[np.void], moment: NDArray[np.int64], pollfds: NDArray[np.int32]) -> bool:
+    """Wait for the deadline; return whether a neighbour's call must be served before it."""
     if state[0].injected_ns >= 0:
-        return bool(state[0].listens and called(doors))
+        return bool(state[0].listens and called(pollfds))
     if state[0].listens:
-        return bool(wait(state[0].deadline_ns, doors, moment))
+        return bool(wait(state[0].deadline_ns, pollfds, moment))
     sleep(state[0].deadline_ns, moment)
     return False
 
 
 @compiled()
 def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None:
-    """Record how long a part of the cycle took, at its end."""
+    """Record the duration of a part of the cycle, at its end."""
     now = _now_ns(state, moment)
     state[0].parts_ns[part] = min(now - state[0].marked_ns, MAX_PART_NS)
     state[0].marked_ns = now
@@ -160,9 +160,9 @@ def _receive(
     times: NDArray[np.void],
     t: float,
 ) -> bool:
-    """Process the frames that have arrived; return whether none of them holds anything new, and none is left."""
+    """Receive and process frames; return whether all of them were expected and none is left."""
     s.arrived, s.error = receive_frames(bus, arrivals, arrived, moment)
-    s.handled = take_frames(arrived, s.arrived, expected, axes, times, t)
+    s.handled = process_frames(arrived, s.arrived, expected, axes, times, t)
     return bool(s.error == 0 and s.handled == s.arrived and s.arrived < MOST_FRAMES)
 
 
@@ -170,9 +170,18 @@ def _receive(
     i8(
         *(_STATE, i8[::1], i8[::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
         *(FRAMES, u8[:, ::1], FRAMES, u8[:, ::1], FRAMES, u8[:, ::1]),
-        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], DOORS, u8[::1], FRAMES),
+        *(EXPECTATIONS, AXES, TIMINGS, f8[:, ::1], POLLFDS, u8[::1], FRAMES),
         *(cycle.LEGS, cycle.BOUND),
-        *(cycle.MOTION, cycle.SLIDERS, cycle.KEPT, f8[::1], cycle.FEEDBACKS, f8[:, ::1], types.b1[::1], f8[:, ::1]),
+        *(
+            cycle.MOTION,
+            cycle.SLIDERS,
+            cycle.BACKLASH_STATES,
+            f8[::1],
+            cycle.FEEDBACKS,
+            f8[:, ::1],
+            types.b1[::1],
+            f8[:, ::1],
+        ),
         *(cycle.MONITORED, cycle.RECORD, u1[::1]),
         *(cycle.KNOTS, cycle.PIECES, f8[:, ::1], cycle.KNOTS, cycle.PIECES, f8[::1]),
         *(outputs.OUTPUTS, outputs.PLAN, i8[::1], outputs.LOG),
@@ -197,7 +206,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     axes: NDArray[np.void],
     times: NDArray[np.void],
     history: Array,
-    doors: NDArray[np.int32],
+    pollfds: NDArray[np.int32],
     hearts: NDArray[np.uint64],
     batch: NDArray[np.uint8],
     legs: Array,
@@ -205,11 +214,11 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     motion: Array,
     sliders: Array,
     backlash: NDArray[np.void],
-    found: Array,
+    refused_values: Array,
     feedback: NDArray[np.void],
     written: Array,
     jumps: NDArray[np.bool],
-    room: Array,
+    scratch: Array,
     monitored: NDArray[np.void],
     record: NDArray[np.void],
     made: NDArray[np.uint8],
@@ -224,17 +233,34 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     words: NDArray[np.int64],
     log: NDArray[np.void],
 ) -> int:
-    """Run cycles; return the stage that the newest has reached: Reached.
+    """Run cycles; return the stage that the newest has reached, a Reached.
 
-    `moment` (2,) is room for a struct timespec, `bus` (3,) a BusAccess, `pins` and `switchings` the frames of the
-    drives' outputs, `doors` (n, 2) an array for poll, the gateway's first, `hearts` the counters of
-    trirail.processes.heartbeats, `batch` (n, SIZE) room for records, `made` (SIZE,) the bytes of `record`; `switches`,
-    `planned`, `words` and `log` are as in control.outputs.switch. All else as in control.cycle and cycle_frames.
+    Parameters not listed are as in control.cycle and cycle_frames.
+
+    Parameters
+    ----------
+    moment : (2,)
+        Room for a struct timespec.
+    bus : (3,)
+        A BusAccess.
+    pins, switchings
+        Frames of the drives' outputs, and their headers.
+    pollfds : (n, 2)
+        Array of struct pollfd, the gateway's first.
+    hearts
+        Counters of trirail.processes.heartbeats.
+    batch : (n, SIZE)
+        Room for records.
+    made : (SIZE,)
+        Bytes of `record`.
+    switches, planned, words, log
+        Tables of outputs, as in control.outputs.switch.
+
     """
     s, row = state[0], record[0]
     while s.cycle < s.until and s.batched < len(batch):
         s.deadline_ns += s.period_ns
-        if _wait(state, moment, doors):
+        if _wait(state, moment, pollfds):
             s.deadline_ns -= s.period_ns
             s.marked_ns, s.handled, s.arrived, s.error = _now_ns(state, moment), 0, 0, 0
             return Reached.CALLED
@@ -261,10 +287,10 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         begin_cycle(axes, history)
         _mark(state, moment, Part.SYNC)
 
-        somebody = called(doors)
+        called_now = called(pollfds)
         count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch checks it
         turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
-        if hearts[HASTE] != s.haste or doors[0, 1] & _GONE != 0 or turns > s.gateway_patience:
+        if hearts[URGENT_INDEX] != s.urgent_seen or pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
             return Reached.SYNCED
         t = _now_ns(state, moment) / 1e9
         if not (
@@ -282,8 +308,8 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             feedback[0].age[i] = axes[i].syncs - axes[i].sampled
         _mark(state, moment, Part.MODE)
         s.behind = cycle.observe(
-            *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.stands != 0),
-            *(jumps, room, monitored, record),
+            *(legs, feedback, written, backlash, s.period, s.fastest, s.limit, s.at_rest != 0),
+            *(jumps, scratch, monitored, record),
         )
         if s.behind:
             return Reached.OBSERVED
@@ -293,15 +319,15 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
             s.time += s.period
             code = cycle.command(
                 *(legs, bounds, knots, pieces, s.in_sliders != 0, tools, law_knots, law_pieces, s.time, s.target),
-                *(furthest, s.course[0], s.course[1], s.course[2], motion, sliders, backlash, found, record),
+                *(furthest, s.course[0], s.course[1], s.course[2], motion, sliders, backlash, refused_values, record),
             )
         elif s.source == HOLD:
-            code = cycle.hold(legs, bounds, motion, sliders, backlash, found, record)
+            code = cycle.hold(legs, bounds, motion, sliders, backlash, refused_values, record)
         else:
             code = 0
             cycle.follow(legs, feedback, jumps, s.held != 0, False, s.step, motion, sliders, backlash, record)
         in_position = s.settles and (monitored[0].inside >= monitored[0].dwell or s.cycle + 1 >= s.timeout)
-        s.called, s.found = in_position or somebody or code != s.found or s.cycle + 1 >= s.due, code
+        s.called, s.code = in_position or called_now or code != s.code or s.cycle + 1 >= s.due, code
         late = _now_ns(state, moment) / 1e9 - s.synced > s.period
         if code >> 2 != 0 or late or not set_frames(setpoints, axes, sliders[0]):
             return Reached.SOLVED

@@ -1,4 +1,4 @@
-"""Run of the cycles without events by the compiled call, as far as possible."""
+"""Python side of the compiled call that runs the cycles without events."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from trirail_drivers.driver.cyclic import Cyclic, Lender
 
-from trirail.control.control import Calm, Control
+from trirail.control.control import Control, SteadyState
 from trirail.motion.paths import Path, constant_law
 from trirail.motion.runs import Run
 from trirail.processes import quiet
-from trirail.processes.clock import Doors, Overruns, Ticker
-from trirail.processes.heartbeats import HASTE, PROCESSES, Haste, Heartbeats, Watch
+from trirail.processes.clock import Overruns, PollSet, Ticker
+from trirail.processes.heartbeats import PROCESSES, URGENT_INDEX, Heartbeats, UrgentFlag, Watch
 from trirail.processes.quiet import Reached
 from trirail.processes.reports import Reports
 from trirail.wire.links import Port
@@ -22,35 +22,35 @@ from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import MODES
 
 _NAMES = quiet.STATE.names or ()
-_MOST = 1 << 40
-"""Cycles per call: more than any batch has."""
-_NEVER = 1 << 62
-"""No cycle."""
-_UNMOVED = constant_law(1.0)
-_NOWHERE = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
+_MAX_CYCLES = 1 << 40
+"""Limit of cycles per call, larger than any batch."""
+_NO_CYCLE = 1 << 62
+"""Number of a cycle that is never reached."""
+_IDLE_LAW = constant_law(1.0)
+_EMPTY_PATH = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
 """Law and path for compiled code without a motion."""
 
 
-class Newest(NamedTuple):
-    """Newest cycle that the compiled call has begun."""
+class QuietResult(NamedTuple):
+    """Result of the compiled call: the newest cycle that it has begun."""
 
     reached: Reached
     deadline_ns: int
     lateness_ns: int
     missed: int
-    """Ticks skipped before it, not counted yet."""
+    """Ticks skipped before the cycle, not counted yet."""
     marked_ns: int
-    """Time at which its newest part ended."""
+    """Time at which its newest part ended [ns]."""
     called: bool
     """Whether a neighbour has called, or messages must be sent."""
     behind: int
-    """Result of trirail.control.cycle.observe, if the cycle has ended behind that."""
-    found: int
-    """Result of trirail.control.cycle.command, if the cycle has ended behind that."""
+    """Result of trirail.control.cycle.observe, if the cycle stopped there."""
+    code: int
+    """Result of trirail.control.cycle.command, if the cycle stopped there."""
 
 
 class QuietCycles:
-    """Data of the compiled call. `run` may be called between two cycles, while nothing is under way."""
+    """Caller of the compiled call, with the arrays that it works on; `run` may be called between two cycles."""
 
     def __init__(
         self,
@@ -59,66 +59,75 @@ class QuietCycles:
         reports: Reports,
         hearts: Heartbeats,
         gateway: Port,
-        doors: Doors,
+        poll_set: PollSet,
         watch: Watch,
-        haste: Haste,
+        urgent_flag: UrgentFlag,
     ) -> None:
         self.cycles = 0
-        """Number of cycles run."""
+        """Number of cycles run by the compiled call."""
         self._control = control
         self._drives = drives
         self._reports = reports
         self._gateway = gateway
         self._watch = watch
-        self._haste = haste
-        self._hearts = np.frombuffer(hearts.counts, np.uint64)[: HASTE + 1]
+        self._urgent_flag = urgent_flag
+        self._hearts = np.frombuffer(hearts.counts, np.uint64)[: URGENT_INDEX + 1]
         self._state = np.zeros(1, quiet.STATE)
         self._moment = np.zeros(2, np.int64)
-        self._doors = doors
+        self._poll_set = poll_set
         self._lent: Cyclic | None = None
         self._orders = 0
-        """Number of orders given to the drives before they lent it."""
+        """Number of orders sent to the drives before they lent their tables."""
         self._decided = False
-        """Whether anything has been decided since the newest cycle."""
-        self._calm: Calm | None = None
+        """Whether Python has handled anything since the newest cycle."""
+        self._steady: SteadyState | None = None
         self._tables: tuple[Any, ...] = ()
         self._motion: tuple[Any, ...] = ()
-        """Arguments of the compiled call: the same arrays until others are lent, or the motion changes."""
+        """Arguments of the compiled call, kept until the drives lend other tables or the motion changes."""
         self._nothing = np.zeros(1)
         measured, setpoints = control.measured, control.setpoints
         self._made = measured.record.view(np.uint8)
         state = self._state[0]
         self.parts_ns: MutableSequence[int] = state["parts_ns"]
-        """Durations of the newest cycle's parts, in the memory that compiled code writes."""
+        """Durations of the newest cycle's parts [ns], in the memory that compiled code writes."""
         state["period"], state["period_ns"] = control.period, round(control.period * 1e9)
         state["injected_ns"] = -1
         state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
-    def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> Newest | None:
-        """Run cycles until an event; return the newest, or None if none was begun.
+    def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> QuietResult | None:
+        """Run cycles until an event or the end of a batch; return the newest, or None if Python must run the cycle.
 
-        `listens`: a call during the wait for the first tick is served before it. `once`: one cycle, since messages
-        wait to be sent behind it. At the end of a batch the next call continues, if no message has come meanwhile.
+        Parameters
+        ----------
+        listens
+            Whether a call during the wait for the first tick is served before that tick.
+        once
+            Whether to run a single cycle, since messages wait to be sent after it.
+
         """
         control, state = self._control, self._state[0]
-        if not ((once or self._reports.idle) and self._gateway.no_peer_lost and self._goes_on()):
+        if not ((once or self._reports.idle) and self._gateway.no_peer_lost and self._tables_ready()):
             self.leave()
             return None
         watch = self._watch
-        state["injected_ns"], state["deadline_ns"] = ticker.come(), ticker.deadline_ns
+        state["injected_ns"], state["deadline_ns"] = ticker.sleep_if_injected(), ticker.deadline_ns
         state["overruns"], state["in_a_row"], state["allowed"] = overruns.all, overruns.in_a_row, overruns.allowed
-        state["until"] = control.cycles + (1 if once or state["injected_ns"] >= 0 else _MOST)
+        state["until"] = control.cycles + (1 if once or state["injected_ns"] >= 0 else _MAX_CYCLES)
         state["batched"] = self._reports.batched
-        state["gateway_seen"], state["gateway_turns"], state["haste"] = watch.seen, watch.turns, self._haste.seen
+        state["gateway_seen"], state["gateway_turns"], state["urgent_seen"] = (
+            watch.seen,
+            watch.silent_turns,
+            self._urgent_flag.seen,
+        )
         state["listens"] = listens
         state["report_after"] = control.outputs.report_after
         state["logged"], state["report_due"] = control.outputs.logged, control.outputs.report_due
-        self._doors.refresh()
+        self._poll_set.refresh()
         reached = Reached(quiet.run(*self._tables, *self._motion))
-        left = dict(zip(_NAMES, state.item(), strict=True))  # one by one, from the array, it would take longer
+        left = dict(zip(_NAMES, state.item(), strict=True))  # faster than reading field by field
         overruns.all, overruns.in_a_row = left["overruns"], left["in_a_row"]
-        watch.seen, watch.turns = left["gateway_seen"], left["gateway_turns"]
+        watch.seen, watch.silent_turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
         self.cycles += left["cycle"] - control.cycles
         control.outputs.update_log(left["logged"], left["report_due"])
@@ -128,11 +137,11 @@ class QuietCycles:
         if reached not in (Reached.DONE, Reached.CALLED):
             synced = left["synced"] if reached in (Reached.SYNCED, Reached.OBSERVED, Reached.SOLVED) else None
             self.leave(left["handled"], left["arrived"], synced=synced, error=max(left["error"], 0))
-        control.go_on(left["cycle"], left["time"], left["found"] if decides else None)
+        control.resume(left["cycle"], left["time"], left["code"] if decides else None)
         if reached is Reached.WRITTEN:
             self._drives.send_on(left["sent"])
         tick = left["deadline_ns"], left["lateness_ns"], left["missed"]
-        return Newest(reached, *tick, left["marked_ns"], called, left["behind"], left["found"])
+        return QuietResult(reached, *tick, left["marked_ns"], called, left["behind"], left["code"])
 
     def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
         """Return the lent tables to the drives, as in trirail_drivers.driver.cyclic.Lender.take_back."""
@@ -140,47 +149,47 @@ class QuietCycles:
             self._control.measured.feedback = self._drives.take_back(handled, arrived, synced=synced, error=error)
             self._lent = None
 
-    def _goes_on(self) -> bool:
-        """Return whether tables hold all the work: those that are lent, if nothing was decided since.
+    def _tables_ready(self) -> bool:
+        """Prepare the tables of the compiled call; return False if Python must run the next cycle.
 
-        They stay lent as long as decisions only concern how the robot moves.
+        Tables stay lent by the drives as long as decisions concern only the motion and not the drives.
         """
         if self._lent is not None and not self._decided:
             return True
-        self._calm, orders = self._control.calm(), self._control.modes.orders
-        if self._calm is None or self._calm.until <= self._control.cycles:
+        self._steady, orders = self._control.steady_state(), self._control.modes.orders
+        if self._steady is None or self._steady.until <= self._control.cycles:
             return False
         if orders != self._orders:
             self.leave()
         if self._lent is None:
             self._lent, self._orders = self._drives.lend(), orders
-            self._tables = self._gather(self._lent) if self._lent is not None else ()
+            self._tables = self._table_arguments(self._lent) if self._lent is not None else ()
         if self._lent is not None:
-            self._write_state(self._calm)
-            self._motion = self._follow(self._calm.run)
+            self._write_state(self._steady)
+            self._motion = self._motion_arguments(self._steady.run)
             self._decided = False
         return self._lent is not None
 
     def add(self, part: Part) -> None:
-        """Add the time since the newest cycle to a part of it; none if a simulated time is ahead."""
+        """Add the time since the newest cycle to a part of it; nothing if a simulated clock is ahead."""
         passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
         self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, MAX_PART_NS)
 
-    def _write_state(self, calm: Calm) -> None:
-        state, run = self._state[0], calm.run
-        state["source"] = quiet.FOLLOW if calm.follows else quiet.HOLD if run is None else quiet.COMMAND
+    def _write_state(self, steady: SteadyState) -> None:
+        state, run = self._state[0], steady.run
+        state["source"] = quiet.FOLLOW if steady.follows else quiet.HOLD if run is None else quiet.COMMAND
         state["cycle"], state["mode"] = self._control.cycles, MODES.index(self._control.state.mode)
-        state["held"], state["stands"], state["found"] = calm.held, calm.stands, calm.found
-        state["due"] = int(min(calm.until, _NEVER))
-        state["settles"] = calm.settles_by is not None
-        state["timeout"] = calm.settles_by or 0
+        state["held"], state["at_rest"], state["code"] = steady.held, steady.at_rest, steady.code
+        state["due"] = int(min(steady.until, _NO_CYCLE))
+        state["settles"] = steady.settles_by is not None
+        state["timeout"] = steady.settles_by or 0
         runs = self._control.schedule.runs
         state["time"] = runs[0].time if runs else 0.0
         if run is not None:
             state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.goal_span
 
-    def _gather(self, lent: Cyclic) -> tuple[Any, ...]:
-        """Return the compiled call's arguments that stay as long as the drives' tables are lent."""
+    def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
+        """Return the arguments of the compiled call that stay the same while the drives lend their tables."""
         measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
         return (
             *(self._state, self._moment, lent.bus),
@@ -188,15 +197,15 @@ class QuietCycles:
             *(lent.beats.frames, lent.beats.headers, lent.setpoints.frames, lent.end),
             *(lent.outputs.frames, lent.outputs.headers),
             *(lent.expected, lent.axes, lent.times, lent.history),
-            *(self._doors.room, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
-            *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.found),
-            *(measured.numbers, measured.written, measured.jumping, measured.room),
+            *(self._poll_set.pollfds, self._hearts, self._reports.batch, measured.legs, setpoints.bounds),
+            *(schedule.motion, setpoints.sliders, measured.backlash, setpoints.refused_values),
+            *(measured.numbers, measured.written, measured.jumping, measured.scratch),
             *(measured.settling.monitored, measured.record, self._made),
         )
 
-    def _follow(self, run: Run | None) -> tuple[Any, ...]:
-        """Return the compiled call's arguments for a motion."""
-        path, law = (run.path, run.law) if run is not None else (_NOWHERE, _UNMOVED)
+    def _motion_arguments(self, run: Run | None) -> tuple[Any, ...]:
+        """Return the arguments of the compiled call for a motion."""
+        path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
         furthest = run.furthest if run is not None else self._nothing
         outputs = self._control.outputs
         outputs.prepare(run, self._control.schedule.version)

@@ -1,6 +1,6 @@
-"""The loop's rights: real-time scheduling, locked memory, its own processor, no garbage collector in its way.
+"""Real-time rights of the loop: scheduling, locked memory, a processor of its own, no garbage collection.
 
-And for every process: release of memory that only its start needs.
+Functions for all processes release memory that is needed only at their start.
 """
 
 from __future__ import annotations
@@ -37,28 +37,23 @@ def return_free_memory() -> None:
 
 
 def bound_heap() -> None:
-    """Keep bursts of large blocks from fragmenting the heap; to be called before the first thread.
-
-    malloc raises its threshold for mapping a block to the largest that was freed, and has an arena for each of
-    Zenoh's threads, each of which keeps its greatest size: mallopt(3).
-    """
+    """Keep bursts of large blocks from fragmenting the heap; call before the first thread starts."""
+    # mallopt(3): by default malloc raises its threshold for mapping a block to the largest block that was freed, and
+    # each of Zenoh's threads gets an arena that keeps its greatest size.
     _libc.mallopt(_M_MMAP_THRESHOLD, 131_072)
     _libc.mallopt(_M_ARENA_MAX, 2)
 
 
-def give_back() -> None:
-    """Trim, and unmap the parts of libraries that their files have as well.
-
-    Loading a library touches most of it, LLVM's 68 MB for instance; the parts needed later come from the page
-    cache again.
-    """
+def release_startup_memory() -> None:
+    """Trim the heap, and drop the pages of libraries that can be read from their files again."""
+    # Loading a library touches most of it, LLVM's 68 MB for instance; pages needed later come from the page cache.
     trim()
     for start, end in _clean():
         _libc.madvise(start, end - start, _MADV_DONTNEED)
 
 
 def _clean() -> Iterator[tuple[int, int]]:
-    """Yield the addresses of each mapping of a library that is only read and has nothing of this process's own."""
+    """Yield the address range of each library mapping that is read-only and has no private pages."""
     path, rights, start, end = "", "", 0, 0
     for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
         first, *rest = line.split()
@@ -73,9 +68,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 
 PLANNER_BELOW = 10
-"""Difference by which the planner's priority is lower than the loop's."""
+"""Difference between the priorities of loop and planner."""
 DRIVES_BELOW = 5
-"""The same for simulated drives: a plan takes longer than a drive has for an answer."""
+"""Difference between the priorities of loop and simulated drives: drives must answer while the planner works."""
 
 
 def _call(name: str, *arguments: int) -> None:
@@ -85,12 +80,12 @@ def _call(name: str, *arguments: int) -> None:
 
 
 def die_with_parent(signal_number: int) -> None:
-    """Have the kernel send this process `signal_number` when its parent ends, however that ends."""
+    """Make the kernel send this process a signal when its parent ends."""
     _call("prctl", _PR_SET_PDEATHSIG, signal_number)
 
 
 def name_process(name: str) -> None:
-    """Give this process a name of its own for `ps` and the like: a forked one has its parent's."""
+    """Set the name of this process in `ps`; a forked process would keep its parent's."""
     setproctitle(title(name))
 
 
@@ -99,12 +94,13 @@ def _fifo(loop: LoopTable) -> None:
 
 
 def _lock_memory(_: LoopTable) -> None:
-    """Lock pages touched now or later: mlockall(2). All mapped pages would be five times as much."""
+    """Lock all pages in use, now and in future."""
+    # mlockall(2) with MCL_ONFAULT: all mapped pages would be five times as much memory as those in use.
     _call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
 
 
 def processor(loop: LoopTable) -> int:
-    """Return the processor that the loop stays on."""
+    """Return the number of the loop's processor."""
     return max(os.sched_getaffinity(0)) if loop.cpu is None else loop.cpu
 
 
@@ -130,7 +126,10 @@ _MEASURES: tuple[tuple[str, Callable[[LoopTable], None], str], ...] = (
 
 
 def stay_beside(loop: LoopTable, below: int) -> tuple[str, ...]:
-    """Keep off the loop's processor if there is another, and `below` its priority; return failures."""
+    """Move this process off the loop's processor, if there is another, and set its priority; return failures.
+
+    `below` is the difference between the priorities of the loop and of this process.
+    """
     trim()
     gc.freeze()
     if loop.realtime == "off":
@@ -147,9 +146,9 @@ def stay_beside(loop: LoopTable, below: int) -> tuple[str, ...]:
 
 
 def acquire(loop: LoopTable) -> tuple[str, ...]:
-    """Take every measure that the configuration asks for; return those that failed, each with its remedy.
+    """Acquire the real-time rights that the configuration requests; return those that failed, each with its remedy.
 
-    Raises ServiceError with `realtime = "enforce"` if one of them is missing.
+    Raises ServiceError if one fails with `realtime = "enforce"`.
     """
     _call("prctl", _PR_SET_TIMERSLACK, 1)  # 50 µs by default for tasks that are not real-time
     trim()

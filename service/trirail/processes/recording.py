@@ -1,4 +1,4 @@
-"""The recorder's process: passes the loop's packets to the recorder and to the black box."""
+"""Recorder process: passes the loop's packets to the recorder and to the black box."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import msgspec
 from trirail.config import Config
 from trirail.processes.heartbeats import Heart
 from trirail.processes.loop_death import LoopDeath
-from trirail.processes.monitoring import TOLD_EVERY, RecorderMeasured
-from trirail.processes.realtime import give_back
+from trirail.processes.monitoring import MEASUREMENT_PERIOD_S, RecorderMeasurements
+from trirail.processes.realtime import release_startup_memory
 from trirail.telemetry.blackbox import BlackBox
 from trirail.telemetry.readout import ReadoutState
 from trirail.telemetry.recorder import Recorder
@@ -29,9 +29,9 @@ from trirail.wire.packets import (
     Announcement,
     Answer,
     ControlInput,
-    Happened,
+    EventReport,
     Kind,
-    RecorderSaid,
+    RecorderMessage,
     Status,
     Unrecorded,
     Welcome,
@@ -41,13 +41,13 @@ from trirail.wire.packets import (
 from trirail.wire.records import last_cycle
 
 GATHER = 0.14
-"""Time for packets to gather before they are read: to wake for each costs more than its content [s].
+"""Pause in which packets accumulate before they are read [s]: waking up for each costs more than processing it.
 
-A killed recorder loses the packets not written: those of that time, and the loop's batch; less than 0.2 s.
+Killing the recorder loses less than 0.2 s of data: the packets of this pause, and the loop's batch.
 """
 
 NOT_FOR_OTHERS = 0o027
-"""Least umask of recordings: files are written by their owner, read by the group, and by nobody else."""
+"""Umask of recordings: the owner may write them, the group may read them."""
 
 
 class Intake:
@@ -57,11 +57,11 @@ class Intake:
         self._link = link
         self._ready = ready
         self._cycle = 0
-        self._told_unrecorded = ""
+        self._reported_unrecorded = ""
         self._loop_death = LoopDeath(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
-        sidecars = path is None  # the user has named a single file, and knows where it is
+        sidecars = path is None  # a user who names a single file expects no others beside it
         self.recorder = recorder = Recorder(config, directory, path=path, sidecars=sidecars, warn=self._warn)
         folder = recorder.path.parent
 
@@ -71,8 +71,8 @@ class Intake:
         self._box = BlackBox(config.loop.rate_hz, box, self._warn)
 
     def on_packet(self, packet: bytes) -> None:
-        """Process a packet."""
-        self._loop_death.heard()
+        """Process a packet of the loop."""
+        self._loop_death.record_activity()
         content = packet[1:]
         if packet[0] == Kind.RECORDS:
             self._cycle = last_cycle(content)
@@ -81,60 +81,60 @@ class Intake:
         elif packet[0] == Kind.FRAMES:
             self.recorder.frames(content)
         else:
-            self._hear(decode_answer(content))
+            self._handle_answer(decode_answer(content))
 
     def save(self) -> None:
-        """Write the packets processed; report to the loop when that begins to fail, and when it works again."""
+        """Write the processed packets; report to the loop when writing begins to fail, and when it works again."""
         self.recorder.save()
-        what, why = self.recorder.unrecorded  # its reason changes with every byte of the disk
-        if what != self._told_unrecorded and self._send(Unrecorded(what and f"{what}: {why}")):
-            self._told_unrecorded = what
+        what, why = self.recorder.unrecorded  # compare only `what`: the reason has the free space, which changes
+        if what != self._reported_unrecorded and self._send(Unrecorded(what and f"{what}: {why}")):
+            self._reported_unrecorded = what
 
     def loop_gone(self) -> None:
-        """Record the death of the loop in its place, if it has died."""
+        """Record the end of the loop, unless the loop has said farewell."""
         for event in self._loop_death.events(self._cycle):
-            self._hear(Happened(event))
+            self._handle_answer(EventReport(event))
 
     def close(self) -> None:
-        """Complete all files."""
+        """Complete and close all files."""
         self.recorder.close()
         self._box.close()
 
-    def _hear(self, said: Answer) -> None:
+    def _handle_answer(self, answer: Answer) -> None:
         recorder, box = self.recorder, self._box
-        self._loop_death.follow(said)
-        match said:
-            case Happened(event):
+        self._loop_death.follow(answer)
+        match answer:
+            case EventReport(event):
                 recorder.event(event)
                 box.event(event)
             case ControlInput():
-                recorder.control_input(said)
-                box.control_input(said)
+                recorder.control_input(answer)
+                box.control_input(answer)
             case Status():
-                standing = ReadoutState(said.goal, said.target, said.override, said.fault)
+                standing = ReadoutState(answer.goal, answer.target, answer.override, answer.fault)
                 recorder.update_state(standing)
                 box.latch("update_state", standing)
             case Welcome():
-                recorder.bus_load(said.bus_load)
-                box.latch("bus_load", said.bus_load)
+                recorder.bus_load(answer.bus_load)
+                box.latch("bus_load", answer.bus_load)
                 path = str(recorder.path)
                 self._announce("info", coded(f"recording to {path}", EventCode.RECORDING, file=path))
                 self._ready({"recording": str(recorder.path), "live": recorder.live_url})
 
     def _warn(self, text: EventText) -> None:
-        """Warn in the service's log, and announce it to everyone."""
-        with contextlib.suppress(OSError):  # the log may be on the disk that takes no more
+        """Write a warning to the service's log, and announce it to everyone."""
+        with contextlib.suppress(OSError):  # the log may be on the full disk
             print(f"trirail: recorder: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the log
         self._announce("warning", text)
 
     def _announce(self, level: Level, text: EventText) -> None:
-        """Have the loop announce a notice."""
+        """Make the loop announce a notice."""
         self._send(Announcement(Notice("service", level, text.text, **text.fields)))
 
-    def _send(self, said: RecorderSaid) -> bool:
-        """Send a packet to the loop; return False if that takes no more now, or has gone."""
+    def _send(self, packet: RecorderMessage) -> bool:
+        """Send a packet to the loop; return False if its queue is full, or it has disconnected."""
         with contextlib.suppress(LinkClosed):
-            return self._link.send(message(said))
+            return self._link.send(message(packet))
         return False
 
 
@@ -144,12 +144,15 @@ def main(
     link: PacketLink,
     heart: Heart,
     ready: Callable[[object], None],
-    measured: Callable[[msgspec.Struct], None],
+    report_measurements: Callable[[msgspec.Struct], None],
 ) -> int:
-    """Record until the loop has gone or SIGTERM; send `measured` the gaps, if there are metrics."""
+    """Run the recorder process until the loop disconnects, or SIGTERM; return its exit code.
+
+    `report_measurements` is called each second if the configuration enables metrics.
+    """
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
-    give_back()
+    release_startup_memory()
     ending = False
 
     def end(_signal: int, _frame: object) -> None:
@@ -159,7 +162,7 @@ def main(
     signal.signal(signal.SIGTERM, end)
     poll = select.poll()
     poll.register(link.fileno(), select.POLLIN)
-    told = -math.inf
+    sent_at = -math.inf
     try:
         while not ending:
             heart.beat()
@@ -169,12 +172,12 @@ def main(
                 intake.on_packet(packet)
                 heart.beat()
             intake.save()
-            if config.telemetry.metrics_port and time.monotonic() >= told + TOLD_EVERY:
-                told = time.monotonic()
-                measured(RecorderMeasured(*intake.recorder.missing))
+            if config.telemetry.metrics_port and time.monotonic() >= sent_at + MEASUREMENT_PERIOD_S:
+                sent_at = time.monotonic()
+                report_measurements(RecorderMeasurements(*intake.recorder.missing))
     except LinkClosed:
         intake.loop_gone()
     finally:
-        heart.rest()  # files take their time to be completed
+        heart.rest()  # completing the files may take longer than a heartbeat allows
         intake.close()
     return 0

@@ -1,8 +1,8 @@
-"""Answers to queries, sent by threads of their own, and refusals, which are announced to everyone at a limited rate.
+"""Replies to queries, sent by separate threads, and announcements of refusals at a limited rate.
 
-A client that takes no answer holds up no other. A stop is sent over Zenoh and to the door: it is carried out once,
-and each copy is answered alike. The slower copy may arrive when the robot moves again: it must not stop goals that
-were sent after the first was confirmed.
+A client that does not read its replies blocks no other client. A client sends each stop over Zenoh and to the door for
+stops; it is carried out once, and both copies get the same reply. The slower copy may arrive when the robot moves
+again, and must not stop goals that were sent after the first copy was confirmed.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from trirail.wire.packets import Announcement, message
 from trirail.wire.sizes import MAX_REFUSED
 from trirail.wire.text import is_name, quoted
 
-REMEMBERED = 60.0
-"""Time for which an answer is kept for a later copy; no client waits longer for one [s]."""
+REMEMBERED_S = 60.0
+"""Time for which the reply to a stop is kept for later copies [s]; no client waits longer."""
 COPIES_KEPT = 4096
-"""Most stops remembered at a time; beyond that the oldest are forgotten."""
+"""Most stops remembered; beyond that the oldest are forgotten."""
 
 _Id = tuple[str, str, bytes]
 
 
 class _Stop:
-    """State of one stop."""
+    """State of one stop, shared by its copies."""
 
     def __init__(self, came: float) -> None:
         self.came = came
@@ -45,14 +45,14 @@ class _Stop:
 
 
 class Copies:
-    """Stops that have arrived, by key, id and content. One without an id has no copies. `clock` gives seconds."""
+    """Registry of stops that have arrived, by key, id and content; a stop without an id has no copies."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._stops: dict[_Id, _Stop] = {}  # in the order in which they came
+        self._stops: dict[_Id, _Stop] = {}  # in the order of arrival
 
     def first(self, incoming: Incoming) -> bool:
-        """Return whether it is the first copy; a later one waits for the answer of the first, or has it `known`."""
+        """Register a stop; return False for a later copy, whose reply is `known` or will be that of the first."""
         if not incoming.id:
             return True
         if (stop := self._stops.get(_id(incoming))) is not None:
@@ -64,12 +64,12 @@ class Copies:
         return True
 
     def known(self, incoming: Incoming) -> msgspec.Struct | None:
-        """Return the answer to the first copy; None if there is none yet."""
+        """Return the reply to the first copy of a stop; None before it."""
         stop = self._stops.get(_id(incoming))
         return stop.answer if stop is not None else None
 
     def answered(self, incoming: Incoming, content: msgspec.Struct) -> list[Incoming]:
-        """Record an answer, and return the other copies that wait for it. A stop not carried out is not remembered."""
+        """Store the reply to a stop, and return the copies that wait for it; forget a stop that was not carried out."""
         stop = self._stops.get(_id(incoming))
         if stop is None or stop.answer is not None:
             return []
@@ -80,10 +80,10 @@ class Copies:
         return waiting
 
     def _forget(self) -> None:
-        """Forget stops whose copies have expired."""
+        """Forget stops that are too old, or too many."""
         while self._stops:
             name, oldest = next(iter(self._stops.items()))
-            if len(self._stops) < COPIES_KEPT and self._clock() - oldest.came < REMEMBERED:
+            if len(self._stops) < COPIES_KEPT and self._clock() - oldest.came < REMEMBERED_S:
                 return
             del self._stops[name]
 
@@ -93,22 +93,22 @@ def _id(stop: Incoming) -> _Id:
 
 
 THREADS = 32
-"""Number of askers that may take no answer and hold up no other."""
+"""Number of clients that can block on their replies without delaying others."""
 CLOSE_WITHIN = 2.0
-"""Longest time for the last answers [s]."""
+"""Longest time for sending the last replies [s]."""
 
 
 class Replies:
-    """Sender of answers, to each asker in order. None is dropped before the transport gives its asker up."""
+    """Sender of replies, in order for each asker; a reply is kept until the transport closes the asker's session."""
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
         self.copies = Copies()
         self._changed = threading.Condition()
-        # Not bounded: dropping a query notifies its asker, which may wait as long as an answer.
-        self._of: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
+        # Not bounded: dropping a query sends a final message to the asker, which may block as long as a reply.
+        self._queues: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
         self._idle: deque[str] = deque()
-        """Askers with answers of which none is being sent, in the order of their turns."""
+        """Askers with waiting replies, none of which is being sent, in the order of their turns."""
         self._closed = False
         self._threads = [threading.Thread(target=self._run, name="replies", daemon=True) for _ in range(THREADS)]
         for thread in self._threads:
@@ -116,45 +116,45 @@ class Replies:
 
     @property
     def waiting(self) -> int:
-        """Number of answers that wait for their turn."""
+        """Number of waiting replies."""
         with self._changed:
-            return sum(map(len, self._of.values()))
+            return sum(map(len, self._queues.values()))
 
     def send(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Answer a message alone; nothing for a put. Safe from any thread."""
+        """Enqueue the reply to a message, without its copies; safe from any thread. A put gets no reply."""
         if incoming.at_door is not None:
             incoming.at_door(content)
         if incoming.query is None:
             return
-        # The asker of a command is its user, not its name: a user that reads no answer to one reads none to others.
-        # Queries for a role, of whatever user, share one place.
+        # One asker per kind and user: a user who does not read one reply does not read the next ones either.
+        # Queries about a role share one asker for all users.
         asker = f"{incoming.kind}/{incoming.user}"
         with self._changed:
-            if asker not in self._of:
-                self._of[asker] = deque()
+            if asker not in self._queues:
+                self._queues[asker] = deque()
                 self._idle.append(asker)
                 self._changed.notify()
-            self._of[asker].append((incoming, content))
+            self._queues[asker].append((incoming, content))
 
     def send_now(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Answer a message alone, in this thread, which waits for as long as the asker takes no answer."""
+        """Send the reply to a message from this thread, blocking for as long as the asker does not read it."""
         if incoming.at_door is not None:
             incoming.at_door(content)
         if incoming.query is not None:
-            with contextlib.suppress(zenoh.ZError):  # the asker has gone
+            with contextlib.suppress(zenoh.ZError):  # the asker has disconnected
                 self._answer(incoming, incoming.query, content)
 
     def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Answer a message carried out or refused, all that were read as one with it, and the copies of each."""
+        """Answer a message, the equal ones merged into it, and the copies of each."""
         for each in (incoming, *incoming.alike):
             self.send(each, content)
             for copy in self.copies.answered(each, content):
                 self.send(copy, content)
 
-    def fresh(self, incoming: Incoming) -> Incoming | None:
-        """Return a stop, and those read as one with it, without copies: these get the answer of the first.
+    def without_copies(self, incoming: Incoming) -> Incoming | None:
+        """Return a stop without the copies merged into it; None if all of them are copies.
 
-        Its number is the newest. None if there are only copies.
+        Copies get the reply of the first copy. The number of the returned stop is the newest.
         """
         fresh = []
         for each in (incoming, *incoming.alike):
@@ -167,7 +167,7 @@ class Replies:
         return fresh[0]._replace(number=fresh[-1].number, alike=tuple(fresh[1:]))
 
     def close(self) -> None:
-        """Send the waiting answers, for a limited time."""
+        """Send the waiting replies, for at most CLOSE_WITHIN."""
         deadline = time.monotonic() + CLOSE_WITHIN
         with self._changed:
             self._closed = True
@@ -182,15 +182,15 @@ class Replies:
                 if not self._idle:
                     return
                 asker = self._idle.popleft()
-                incoming, content = self._of[asker].popleft()
+                incoming, content = self._queues[asker].popleft()
             self.send_now(incoming._replace(at_door=None), content)
-            del incoming, content  # a query ends with its last reference
+            del incoming, content  # dropping the last reference to the query completes it
             with self._changed:
-                if self._of[asker]:
+                if self._queues[asker]:
                     self._idle.append(asker)
                     self._changed.notify()
                 else:
-                    del self._of[asker]
+                    del self._queues[asker]
 
     def _answer(self, incoming: Incoming, query: zenoh.Query, content: msgspec.Struct) -> None:
         try:
@@ -198,7 +198,7 @@ class Replies:
         except RefusedError:
             encoding = boundary.JSON
         payload = boundary.encode(content, encoding)
-        with query:  # dropped afterwards: else the caller waits for more until its time-out
+        with query:  # complete the query: the asker would otherwise wait for more replies until its time-out
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:
@@ -208,54 +208,54 @@ class Replies:
 
 
 REFUSALS_PER_SECOND = 10
-"""Refusals of one user a second that are announced to everyone; the rest only get their error reply."""
+"""Refusals per second of one user that are announced to everyone; further ones only get their error reply."""
 REFUSALS_OF_ALL = 50
 """The same for all users."""
 
 
 class Refusals:
-    """Answers to rejected messages, which the loop also announces to everyone: a put has no answer."""
+    """Refusals: error replies, and announcements to everyone, since a put has no reply."""
 
     def __init__(self, link: PacketLink, replies: Replies) -> None:
         self._link = link
         self._replies = replies
-        self._told: Counter[str] = Counter()
-        self._told_since = 0.0
-        self._overruns: deque[tuple[str, ErrorReply]] = deque(maxlen=REFUSALS_OF_ALL)
+        self._announced: Counter[str] = Counter()
+        self._announced_since = 0.0
+        self._unkept: deque[tuple[str, ErrorReply]] = deque(maxlen=REFUSALS_OF_ALL)
         self._budget = Budget(MAX_REFUSED, MAX_REFUSED)
 
     def not_kept(self, incoming: Incoming, error: ErrorReply) -> None:
-        """Answer a message that the inbox does not keep; safe from any thread, announced by `tell_of_overruns`.
+        """Refuse a message that the inbox does not keep; safe from any thread. `announce_unkept` announces it later.
 
-        If such answers hold too much memory, the sender's own thread of Zenoh sends this one: then nothing more is
-        received of a sender that takes no answer, until the transport gives it up.
+        If such refusals hold too much memory, this one is sent from the calling thread of Zenoh, so that nothing more
+        is received from a sender that does not read its replies.
         """
-        self._overruns.append((incoming.user, error))
+        self._unkept.append((incoming.user, error))
         hold = self._budget.hold(incoming.user, incoming.held)
         if hold is None:
             self._replies.send_now(incoming, error)
         else:
             self._replies.send(incoming._replace(hold=hold), error)
 
-    def tell_of_overruns(self) -> None:
-        """Announce whose messages were not kept."""
-        while self._overruns:
-            user, why = self._overruns.popleft()
+    def announce_unkept(self) -> None:
+        """Announce the refusals of messages that were not kept."""
+        while self._unkept:
+            user, why = self._unkept.popleft()
             self.warn_everyone(why.message, user if is_name(user) else "", why.code)
 
     def refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
-        """Answer a rejected message, and announce it to everyone."""
+        """Refuse a message, and announce that to everyone."""
         text = quoted(str(refusal))
         self._replies.answer(incoming, ErrorReply(refusal.code, text))
         self.warn_everyone(text, incoming.user if is_name(incoming.user) else "", refusal.code)
 
     def warn_everyone(self, text: str, user: str = "", code: RefusalCode = RefusalCode.INTERNAL) -> None:
-        """Have the loop announce a refusal, at a limited rate."""
+        """Make the loop announce a refusal, at a limited rate."""
         now = time.monotonic()
-        if now - self._told_since >= 1.0:
-            self._told.clear()
-            self._told_since = now
-        if self._told[user] < REFUSALS_PER_SECOND and self._told.total() < REFUSALS_OF_ALL:
-            self._told[user] += 1
+        if now - self._announced_since >= 1.0:
+            self._announced.clear()
+            self._announced_since = now
+        if self._announced[user] < REFUSALS_PER_SECOND and self._announced.total() < REFUSALS_OF_ALL:
+            self._announced[user] += 1
             notice = Notice("refused", "warning", text, user=user, code=code, event_code=EventCode.REFUSED)
             self._link.send(message(Announcement(notice)))

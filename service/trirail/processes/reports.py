@@ -1,4 +1,4 @@
-"""Messages of the loop to the processes beside it, and messages of the recorder."""
+"""Messages of the loop to gateway and recorder, and the recorder's messages to the loop."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ ANSWERS_A_CYCLE = 8
 PROGRESS_EVERY = 0.1
 """Interval between two progress reports of drives that are being configured [s]."""
 INPUTS_KEPT = 8
-"""Most control inputs that wait for the next batch of records; the recorder has no use for them before it."""
+"""Most control inputs that wait for the next batch of records; the recorder does not need them before it."""
 EVENTS_KEPT = 1000
-"""Events kept for a new gateway: the previous one may have died with some that it had not published."""
+"""Events kept for a restarted gateway, since the previous one may not have published all of them."""
 
 
 class Reports:
-    """Reports of each cycle: records in batches, events, answers, and the status that records do not have.
+    """Reports of the loop: records in batches, events, answers, and the status that records do not contain.
 
-    Nothing in it waits: packets for a slow gateway are kept, those for a slow recorder are lost.
+    Nothing here waits: packets for a slow gateway are kept, those for a slow recorder are lost.
     """
 
     def __init__(
@@ -70,33 +70,43 @@ class Reports:
         self._bitrate = config.can.bitrate
         self._bus_load = 0.0
         self._bits = drives.traffic
-        self._weighed_at = self._progress_at = 0
+        self._bus_measured_at = self._progress_at = 0
         self._unready: UnreadyDrives = (None, None, None)
         self._events = 0
         self._kept: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._answers: deque[bytes] = deque()
-        self._told = 0
+        self._sent_events = 0
         self._inputs = 0
-        self._given: list[ControlInput] = []
+        self._unsent_inputs: list[ControlInput] = []
         self._postponed = 0, 0
-        """Number of waiting events that belong to an earlier cycle than those behind them, and that cycle."""
+        """Number of waiting events that belong to an earlier cycle than the following ones, and that cycle."""
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._made = control.measured.record.view(np.uint8).data
-        """The cycle's record, as the control makes it."""
+        """Bytes of the cycle's record, filled by the control."""
         self._batch = memoryview(bytearray(1 + self._batch_size * SIZE))
         self._batch[0] = Kind.RECORDS
         self.batched = 0
-        """Records in the batch."""
+        """Number of records in the batch."""
         self._recorded = False
         self._unrecorded = ""
 
-    def note(self, now_ns: int, given: GivenInput, *, urgent: bool = False, waiting: bool = False) -> None:
-        """Keep an input of the control for the recorder: one of the next cycle or, if `urgent`, of the one under way.
+    def note(self, now_ns: int, content: GivenInput, *, urgent: bool = False, waiting: bool = False) -> None:
+        """Keep an input of the control for the recorder.
 
-        `waiting` as in ControlInput.
+        Parameters
+        ----------
+        now_ns
+            Time at which the control has received it [ns].
+        urgent
+            Whether it applies to the present cycle; otherwise it applies to the next.
+        waiting
+            As in ControlInput.
+
         """
         self._inputs += 1
-        self._given.append(ControlInput(self._inputs, self._control.modes.cycle, now_ns, given, urgent, waiting))
+        self._unsent_inputs.append(
+            ControlInput(self._inputs, self._control.modes.cycle, now_ns, content, urgent, waiting)
+        )
 
     def record(self, tick: Tick, overruns: int, parts_ns: Sequence[int]) -> None:
         """Append the newest cycle's record."""
@@ -110,36 +120,36 @@ class Reports:
 
     @property
     def full(self) -> bool:
-        """Whether the batch is full, and must be flushed."""
+        """Whether the batch is full and must be sent."""
         return self.batched == self._batch_size
 
     @property
     def idle(self) -> bool:
-        """Whether nothing waits to be sent except with a batch."""
-        return not (self._answers or self._told < self._events)
+        """Whether no event and no answer waits to be sent."""
+        return not (self._answers or self._sent_events < self._events)
 
     @property
     def batch(self) -> NDArray[np.uint8]:
-        """Room for the records of a batch, (n, SIZE) bytes, of which `batched` are there."""
+        """Array for the records of a batch, (n, SIZE) bytes, of which the first `batched` are filled."""
         return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
     def pass_on(self) -> None:
         """Send events and answers, if any, and the control's inputs before them.
 
-        An event belongs to the first cycle that shows it: that under way or, behind its end, the next.
+        An event is stamped with the first cycle that shows its effect: the present one or, after its end, the next.
         """
-        if self._control.ledger.answers or self._control.ledger.notices or len(self._given) > INPUTS_KEPT:
+        if self._control.ledger.answers or self._control.ledger.notices or len(self._unsent_inputs) > INPUTS_KEPT:
             self._publish()
         if self._answers:
             self._send_answers()
 
     def postpone(self) -> None:
-        """Leave events to be sent behind the next cycle: its record shows them already."""
+        """Postpone events until after the next cycle; they keep the present cycle's number."""
         self._postponed = len(self._control.ledger.notices), self._control.modes.cycle
 
     def flush(self) -> None:
-        """Send the batch, accept new peers, and send the events kept for them."""
-        self._send_given()
+        """Send the batch, accept new peers, and send them the events kept for them."""
+        self._send_inputs()
         if self.batched:
             batch = self._batch[: 1 + self.batched * SIZE]
             self.batched = 0
@@ -161,17 +171,17 @@ class Reports:
                 port.send(message(self._welcome))
                 port.send(message(self._status))
                 if port is self._gateway:
-                    self._told = 0
+                    self._sent_events = 0
 
     def report_protections(self) -> None:
-        """Report to the gateway which protections drives lack, if drives set up meanwhile lack others."""
+        """Report to the gateway which protections the drives lack, if that has changed."""
         missing = self._drives.missing_protections
         if missing != self._welcome.missing_protections:
             self._welcome = msgspec.structs.replace(self._welcome, missing_protections=missing)
             self._gateway.send(message(self._welcome))
 
     def _report_progress(self) -> None:
-        """Publish the progress of the drives' configuration, a few times a second."""
+        """Publish the progress of the drives' configuration, at intervals of PROGRESS_EVERY."""
         cycles = self._control.cycles
         if (cycles - self._progress_at) * self._period >= PROGRESS_EVERY:
             self._progress_at, self._unready = cycles, self._control.measured.feedback.unready
@@ -179,15 +189,15 @@ class Reports:
 
     def _measure_bus_load(self) -> None:
         """Compute and report the share of the bus in use, once a second."""
-        cycles = self._control.cycles - self._weighed_at
+        cycles = self._control.cycles - self._bus_measured_at
         if cycles * self._period >= 1.0:
             bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
             self._bus_load = round(bits / (cycles * self._period * self._bitrate), 3)
-            self._weighed_at += cycles
+            self._bus_measured_at += cycles
             self._publish_status()
 
     def listen(self) -> None:
-        """Announce the recorder's messages, and its loss."""
+        """Receive a message of the recorder, if any, and announce it; announce the loss of the recorder."""
         packet = self._recorder.receive()
         if self._recorder.clear_lost() and self._recorded:
             self._recorded = False
@@ -200,22 +210,22 @@ class Reports:
         if not self._recorded:
             self._recorded, self._unrecorded = True, ""
         try:
-            said = decode_recorder(memoryview(packet)[1:])
-        except msgspec.DecodeError as error:  # the recorder must not be able to stop the robot
-            words = f"the recorder said something unreadable: {error}"
+            content = decode_recorder(memoryview(packet)[1:])
+        except msgspec.DecodeError as error:  # a faulty recorder must not stop the robot
+            words = f"the recorder has sent an invalid packet: {error}"
             text = coded(words, EventCode.RECORDER_UNREADABLE, error=str(error))
             self._control.ledger.notices.append(Notice("service", "warning", text.text, **text.fields))
             return
-        if isinstance(said, Announcement):
-            self._control.ledger.notices.append(said.notice)
+        if isinstance(content, Announcement):
+            self._control.ledger.notices.append(content.notice)
         else:
-            self._unrecorded = quoted(said.why) if said.why else ""
+            self._unrecorded = quoted(content.why) if content.why else ""
         self._publish_status()
 
     def _publish(self) -> None:
-        """Answer requests, number the events, and send the control's inputs."""
+        """Send the control's inputs, number and send the events, and enqueue the answers."""
         control, ledger = self._control, self._control.ledger
-        self._send_given()
+        self._send_inputs()
         (postponed, earlier), self._postponed = self._postponed, (0, 0)
         for number, notice in enumerate(ledger.notices):
             self._events += 1
@@ -230,26 +240,26 @@ class Reports:
         self._answers.extend(map(message, ledger.answers))
         ledger.answers.clear()
 
-    def _send_given(self) -> None:
-        """Send the recorder the control's inputs."""
-        for given in self._given:
-            self._recorder.send(message(given))
-        self._given.clear()
+    def _send_inputs(self) -> None:
+        """Send the control's inputs to the recorder."""
+        for control_input in self._unsent_inputs:
+            self._recorder.send(message(control_input))
+        self._unsent_inputs.clear()
 
     def _publish_status(self) -> None:
-        """Send the status that records do not have, if it has changed."""
+        """Send the status, if it has changed."""
         control, goal = self._control, self._control.ledger.goal
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
         fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
-        said = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
-        status = Status(*said, self._unrecorded, tuple(map(quoted, control.measured.unready)))
+        fields = goal_id, control.override, fault, control.target, self._bus_load, counts, control.lease.user, lag
+        status = Status(*fields, self._unrecorded, tuple(map(quoted, control.measured.unready)))
         if status != self._status:
             self._status, packet = status, message(status)
             self._gateway.send(packet)
             self._recorder.send(packet)
 
     def _send_answers(self) -> None:
-        """Send some answers; those for a slow gateway wait, those for a lost one are dropped."""
+        """Send at most ANSWERS_A_CYCLE answers; they wait for a slow gateway, and are dropped for a lost one."""
         if not self._gateway.connected:
             self._answers.clear()
         for _ in range(min(len(self._answers), ANSWERS_A_CYCLE)):
@@ -258,7 +268,7 @@ class Reports:
             self._answers.popleft()
 
     def _send_events(self) -> None:
-        """Send the gateway every kept event that it does not know."""
-        self._told = max(self._told, self._events - len(self._kept))
-        while self._told < self._events and self._gateway.send(self._kept[self._told - self._events]):
-            self._told += 1
+        """Send the gateway every kept event that it has not received."""
+        self._sent_events = max(self._sent_events, self._events - len(self._kept))
+        while self._sent_events < self._events and self._gateway.send(self._kept[self._sent_events - self._events]):
+            self._sent_events += 1

@@ -33,29 +33,29 @@ from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
 
-AHEAD = 3
-"""Goals of one user that the loop has at a time: one being planned, the next one, and one more, which replaces the
-next one if both have the same target. The others wait here: a command overtakes them, and goals that wait when the
-robot is stopped do not begin any more."""
-AHEAD_OF_ALL = 16
-"""Goals of all users that the loop has at a time: as many as it takes in four cycles."""
-UNDER_WAY = 8
-"""Commands and checks of one user that the loop has at a time; more are refused, except those that stop the robot."""
-UNDER_WAY_OF_ALL = 64
+MAX_GOALS_OF_USER = 3
+"""Most goals of one user in the loop: one being planned, the next one, and one more, which replaces the next one if
+both have the same target. Further goals wait in the gateway, where commands overtake them and a stop withdraws them."""
+MAX_GOALS = 16
+"""Most goals of all users in the loop: as many as it reads in four cycles."""
+MAX_COMMANDS_OF_USER = 8
+"""Most commands and checks of one user in the loop; further ones are refused, except commands that stop the robot."""
+MAX_COMMANDS = 64
 """The same for all users."""
-REPLY_WITHIN = 15.0
-"""Longest time for the loop to carry a command out; after it an error is answered [s]."""
-LOOKS, LOOKS_PER_SECOND = 50, 20.0
-"""Looks of one user that pass in a burst, and then per second: three times those of an alignment without a camera."""
+REPLY_TIMEOUT_S = 15.0
+"""Longest time for the loop to carry out a command, after which an error is answered [s]."""
+LOOK_BURST, LOOKS_PER_SECOND = 50, 20.0
+"""Alignment looks of one user accepted in a burst, and then per second: three times as many as an alignment without a
+camera sends."""
 
 
-class _Waiting(NamedTuple):
+class _PendingRequest(NamedTuple):
     incoming: Incoming
     deadline: float
 
 
 class Requests:
-    """Goals and commands of clients in the loop, each with a ticket until it ends; passes answers to their senders."""
+    """Goals and commands in the loop, by ticket; forwards requests to the loop and answers to their senders."""
 
     def __init__(
         self,
@@ -64,35 +64,35 @@ class Requests:
         guard: Guard,
         replies: Replies,
         loop_death: LoopDeath,
-        hurrying: Callable[[], AbstractContextManager[None]],
+        urgent_section: Callable[[], AbstractContextManager[None]],
     ) -> None:
-        """`hurrying` makes the loop handle packets sent in it in the cycle in which they arrive."""
+        """Connect the parts; packets sent inside `urgent_section` are handled in the cycle of their arrival."""
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
-        self._home_within = REPLY_WITHIN + sum(homing)
+        self._home_within = REPLY_TIMEOUT_S + sum(homing)
         self._takeover = config.control.takeover
         self._link = link
-        self._hurrying = hurrying
+        self._urgent_section = urgent_section
         self._guard = guard
         self._replies = replies
         self._loop_death = loop_death
         self.backlog = Backlog()
-        """Goals that the loop has not been given yet."""
-        self._ahead: dict[int, str] = {}
-        """Users of the goals that the loop has, by ticket."""
+        """Goals not sent to the loop yet."""
+        self._goals: dict[int, str] = {}
+        """User of each goal in the loop, by ticket."""
         self._commands: dict[int, str] = {}
         """Users of the commands and checks that the loop has, by ticket."""
-        self._waiting: dict[int, _Waiting] = {}
+        self._pending: dict[int, _PendingRequest] = {}
         self._tickets = 0
 
     def __iter__(self) -> Iterator[Incoming]:
-        """Yield the messages that are not answered yet."""
-        yield from (waiting.incoming for waiting in self._waiting.values())
+        """Yield the messages not answered yet."""
+        yield from (waiting.incoming for waiting in self._pending.values())
         yield from (goal.incoming for goal in self.backlog)
 
     # ------------------------------------------------------------------ goals
 
     def goal(self, incoming: Incoming, user: str, goal: Goal) -> None:
-        """Enqueue a goal behind the user's others. Raises RefusedError if too many wait."""
+        """Enqueue a goal behind the user's others. Raises RefusedError if too many are waiting."""
         self.backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
@@ -102,78 +102,78 @@ class Requests:
         self.send_goals()
 
     def send_goals(self) -> None:
-        """Send the loop as many goals of each user as it may have."""
-        of = Counter(self._ahead.values())
+        """Send goals to the loop, up to the limits per user and in total."""
+        of = Counter(self._goals.values())
         for user in self.backlog.users:
-            if len(self._ahead) >= AHEAD_OF_ALL:
+            if len(self._goals) >= MAX_GOALS:
                 return
-            if of[user] < AHEAD:
+            if of[user] < MAX_GOALS_OF_USER:
                 incoming, request = self.backlog.first(user)
                 if not self._link.send(message(request)):
                     return
                 self.backlog.drop_first(user)
-                self._ahead[request.ticket] = user
+                self._goals[request.ticket] = user
                 self._loop_death.follow(request)
-                self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + REPLY_WITHIN)
+                self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + REPLY_TIMEOUT_S)
 
     # ------------------------------------------------------------------ commands
 
     def command(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> int:
         """Send a command to the loop; return its ticket.
 
-        Raises RefusedError if the loop has too many, or the user's role forbids it.
+        Raises RefusedError if too many commands are under way, or the user's role forbids taking the lease over.
         """
         if not name.stops:
-            self._check_under_way(user)
+            self._check_command_count(user)
         if isinstance(content, AcquireLease) and content.force:
             self._guard.check(user, self._takeover, "taking the lease over")
         self._tickets += 1
         request = CommandRequest(self._tickets, user, name, content)
-        with self._hurrying() if name.stops else nullcontext():
-            self._send(incoming, request, self._home_within if name is Command.HOME else REPLY_WITHIN)
+        with self._urgent_section() if name.stops else nullcontext():
+            self._send(incoming, request, self._home_within if name is Command.HOME else REPLY_TIMEOUT_S)
         return request.ticket
 
     def check(self, incoming: Incoming, user: str, goal: LoopGoal) -> None:
-        """Have a goal planned without moving to it. Raises RefusedError if too many requests are under way."""
-        self._check_under_way(user)
+        """Request the plan of a goal without moving to it. Raises RefusedError if too many requests are under way."""
+        self._check_command_count(user)
         self._tickets += 1
-        self._send(incoming, CheckRequest(self._tickets, user, goal), REPLY_WITHIN)
+        self._send(incoming, CheckRequest(self._tickets, user, goal), REPLY_TIMEOUT_S)
 
     def _send(self, incoming: Incoming, request: CommandRequest | CheckRequest, within: float) -> None:
-        """Send the loop a request, to be answered within a time [s]. Raises RefusedError if it takes no more."""
+        """Send the loop a request, to be answered within a time [s]. Raises RefusedError if its queue is full."""
         if not self._link.send(message(request)):
-            raise RefusedError(RefusalCode.BUSY, "too many requests at once: send it again")
+            raise RefusedError(RefusalCode.BUSY, "too many requests: send it again")
         self._commands[request.ticket] = request.user
-        self._waiting[request.ticket] = _Waiting(incoming, time.monotonic() + within)
+        self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + within)
 
-    def _check_under_way(self, user: str) -> None:
-        """Raise RefusedError if the loop has the most commands and checks that it may have, of a user or of all."""
+    def _check_command_count(self, user: str) -> None:
+        """Raise RefusedError if too many commands and checks are under way, of this user or in total."""
         own, all_ = sum(sender == user for sender in self._commands.values()), len(self._commands)
-        if own >= UNDER_WAY:
+        if own >= MAX_COMMANDS_OF_USER:
             raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
-        if all_ >= UNDER_WAY_OF_ALL:
+        if all_ >= MAX_COMMANDS:
             raise RefusedError(RefusalCode.BUSY, f"{all_} commands are under way already: send fewer")
 
     # ------------------------------------------------------------------ answers
 
     def answer(self, ticket: int, content: msgspec.Struct) -> None:
-        """Answer the request with that ticket, and send the loop the next goal."""
-        waiting = self._waiting.pop(ticket, None)
+        """Answer the request with this ticket, and send the next goal to the loop."""
+        waiting = self._pending.pop(ticket, None)
         self._commands.pop(ticket, None)
         if waiting is not None:
             self._replies.answer(waiting.incoming, content)
-        if self._ahead.pop(ticket, None) is not None:
+        if self._goals.pop(ticket, None) is not None:
             self.send_goals()
 
-    def give_up_late(self) -> None:
-        """Answer requests that the loop has not carried out in time, with an error."""
+    def expire(self) -> None:
+        """Answer a time-out error to requests that the loop has not carried out in time."""
         now = time.monotonic()
-        for ticket in [ticket for ticket, waiting in self._waiting.items() if waiting.deadline < now]:
+        for ticket in [ticket for ticket, waiting in self._pending.items() if waiting.deadline < now]:
             self.answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))
 
 
 class CommandReader:
-    """Reader of commands, which has them carried out; `refuse` answers the others."""
+    """Decoder of commands, which passes valid ones to Requests and refuses the others."""
 
     def __init__(
         self,
@@ -189,16 +189,16 @@ class CommandReader:
         self._inbox = inbox
         self._refuse = refuse
         self._of_unread: set[int] = set()
-        """Tickets of stops of one goal, sent behind messages not read yet: one of these may be that goal."""
+        """Tickets of stops of a single goal that may still be in an unread message."""
 
-    def read(self, incoming: Incoming, user: str, called: str) -> None:
-        """Carry a command out, unless it is a copy of an earlier one. Raises RefusedError for an unknown one."""
+    def read(self, incoming: Incoming, user: str, command: str) -> None:
+        """Carry out a command, unless it is a copy of an earlier one. Raises RefusedError for an unknown command."""
         try:
-            name = Command(called)
+            name = Command(command)
         except ValueError as error:
-            problem = f"{quoted(called)}: no such command; there are {', '.join(Command)}"
+            problem = f"{quoted(command)}: no such command; there are {', '.join(Command)}"
             raise RefusedError(RefusalCode.UNKNOWN_COMMAND, problem) from error
-        fresh = self._replies.fresh(incoming) if name in STOPS else incoming
+        fresh = self._replies.without_copies(incoming) if name in STOPS else incoming
         if fresh is None:
             return
         try:
@@ -212,15 +212,15 @@ class CommandReader:
         except RefusedError as refusal:
             if name not in STOPS:
                 raise
-            # A stop, however malformed, is meant as one: it is carried out as if it had no content.
+            # A malformed stop is still meant as a stop: carry it out as if it had no content.
             self._carry_out(incoming.unanswered(), user, name, None)
-            raise RefusedError(refusal.code, f"{refusal}; the robot is told to {name} all the same") from refusal
+            raise RefusedError(refusal.code, f"{refusal}; {name} takes effect nevertheless") from refusal
         self._carry_out(incoming, user, name, content)
 
     def refused(self, ticket: int, error: ErrorReply) -> CommandReply | ErrorReply:
-        """Return the answer to a command that the loop refuses.
+        """Return the reply to a command that the loop refuses.
 
-        A goal that the loop does not know, and that is still unread, will not begin any more: the request is fulfilled.
+        A stop of a goal that the loop does not know yet is confirmed if the goal may be unread: it will be withdrawn.
         """
         unread = ticket in self._of_unread
         self._of_unread.discard(ticket)
@@ -229,12 +229,12 @@ class CommandReader:
         return error
 
     def _stopped(self) -> CommandReply:
-        """Return the answer to a stop of a goal that never reached the loop."""
+        """Return the reply to a stop of a goal that never reaches the loop."""
         newest = self._states.newest()
         return CommandReply(Command.STOP, newest.mode, newest.seq)
 
     def confirmed(self, ticket: int) -> None:
-        """Record that a command has been carried out."""
+        """Record that the loop has carried out a command."""
         self._of_unread.discard(ticket)
 
     def _carry_out(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> None:
@@ -253,16 +253,16 @@ class CommandReader:
 
 
 class Looks:
-    """Alignment looks that clients report; `announce` has the loop make an event of each."""
+    """Forwarder of the alignment looks that clients report, which the loop publishes as events."""
 
     def __init__(self, announce: Callable[[Notice], bool], clock: Callable[[], float] = time.monotonic) -> None:
         self._announce = announce
         self._clock = clock
-        self._pace = Pace(LOOKS, LOOKS_PER_SECOND)
+        self._pace = Pace(LOOK_BURST, LOOKS_PER_SECOND)
 
-    def forward(self, user: str, sent: AlignmentLook) -> AlignmentLook:
-        """Forward a look, and return it. Raises RefusedError."""
-        look = structs.replace(sent, words=quoted(sent.words))
+    def forward(self, user: str, received: AlignmentLook) -> AlignmentLook:
+        """Forward a look, and return it. Raises RefusedError if there are too many."""
+        look = structs.replace(received, words=quoted(received.words))
         now = self._clock()
         if self._pace.wait(user, now) > 0.0:
             raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks a second: send fewer")

@@ -1,4 +1,4 @@
-"""The gateway's own sockets, and file descriptors: their limit, and a reserve for uses that must not lack them."""
+"""Sockets of the gateway, and file descriptors: their limit, and a reserve for connections that must not lack them."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from typing import Any
 from trirail.wire.stop_protocol import StopAddress
 
 SOCKET_MODE = 0o660
-"""Mode of a Unix socket: its owner and its group may connect, which takes the right to write; nobody else."""
+"""Mode of a Unix socket: owner and group may connect, which needs write permission."""
 
 
 def raise_descriptor_limit() -> None:
-    """Raise the descriptor limit of this process, and of those that it starts, to the system's hard limit."""
+    """Raise the descriptor limit of this process and its children to the hard limit."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(ValueError, OSError):  # some kernels refuse an unlimited one
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -32,24 +32,22 @@ def descriptor_limit() -> int:
 
 
 def descriptors_used() -> int:
-    """Return the number of its descriptors in use."""
+    """Return the number of descriptors that this process has open."""
     counted = Path("/proc/self/fd").stat().st_size  # Linux 6.2 and later; 0 before
-    return counted or len(os.listdir("/proc/self/fd")) - 1  # one is that of the listing
+    return counted or len(os.listdir("/proc/self/fd")) - 1  # without the descriptor of the listing
 
 
 def connections(ports: Container[int]) -> list[tuple[str, int]]:
-    """Return the other ends of TCP connections to ports of this machine, also of those that they have closed.
-
-    proc(5), /proc/net/tcp: addresses are words of the machine's order, states those of the kernel's tcp_states.h.
-    """
-    found = []
+    """Return the peers of TCP connections to local ports, including connections that the peer has closed."""
+    # proc(5), /proc/net/tcp: addresses are words in host byte order, states those of the kernel's tcp_states.h.
+    peers = []
     for table in ("tcp", "tcp6"):
         with contextlib.suppress(OSError):  # a machine without IPv6
             for line in Path(f"/proc/self/net/{table}").read_text(encoding="ascii").splitlines()[1:]:
                 _, here, there, state, *_ = line.split()
                 if state in _CONNECTED and int(here.rpartition(":")[2], 16) in ports:
-                    found.append(_address(there))
-    return found
+                    peers.append(_address(there))
+    return peers
 
 
 _CONNECTED = ("01", "08")
@@ -64,9 +62,9 @@ def _address(written: str) -> tuple[str, int]:
 
 
 def disconnect(peers: Container[tuple[str, int]]) -> None:
-    """Shut down every connection of this process to one of these hosts and ports, whatever its owner."""
+    """Shut down every connection of this process to these hosts and ports, also those of libraries."""
     for number in map(int, os.listdir("/proc/self/fd")):
-        with contextlib.suppress(OSError):  # it is closed, or connected to nobody
+        with contextlib.suppress(OSError):  # closed meanwhile, or not connected
             if not stat.S_ISSOCK(os.fstat(number).st_mode):
                 continue
             with socket.socket(fileno=os.dup(number)) as connection:
@@ -75,7 +73,7 @@ def disconnect(peers: Container[tuple[str, int]]) -> None:
 
 
 class Reserve:
-    """Reserve of descriptors, so that nothing else in this process uses them up."""
+    """Reserve of file descriptors, which nothing else in this process can use up."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -87,16 +85,16 @@ class Reserve:
         return len(self._kept)
 
     def release(self) -> None:
-        """Close one, for the next to be opened. IndexError if there is none."""
+        """Close one descriptor, so that another can be opened. Raises IndexError if none is left."""
         os.close(self._kept.pop())
 
     def close(self, descriptor: int) -> None:
-        """Close a descriptor opened in place of one, and reserve it again in the same step."""
+        """Close a descriptor opened from the reserve, and return it to the reserve in the same step."""
         os.dup2(self._null, descriptor, inheritable=False)
         self._kept.append(descriptor)
 
     def refill(self, opened: int = 0) -> None:
-        """Reserve the full number, less those opened in place of some; fewer if the system refuses."""
+        """Reserve the full number less `opened`, the number in use; fewer if the system refuses."""
         with contextlib.suppress(OSError):
             while len(self._kept) < self._count - opened:
                 self._kept.append(os.dup(self._null))
@@ -109,14 +107,15 @@ class Reserve:
 
 
 def listen(address: StopAddress) -> list[socket.socket]:
-    """Listen at every address of a host's name. Raises OSError if that is impossible."""
+    """Listen at a Unix socket, or at every address of a host name. Raises OSError on failure."""
     if isinstance(address.where, str):
-        Path(address.where).unlink(missing_ok=True)  # of a gateway that was killed: Zenoh's own lock is ours by now
+        # Left behind by a gateway that was killed; Zenoh's lock file shows that no other one is running.
+        Path(address.where).unlink(missing_ok=True)
         places: list[tuple[socket.AddressFamily, Any]] = [(socket.AF_UNIX, address.where)]
     else:
         host, port = address.where
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        places = [(family, where) for family, _, _, _, where in found]
+        resolved = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        places = [(family, where) for family, _, _, _, where in resolved]
     listening = []
     try:
         for family, where in places:
@@ -136,7 +135,7 @@ def listen(address: StopAddress) -> list[socket.socket]:
 
 
 def source(connected: socket.socket, address: object) -> str:
-    """Return the share of a connection: its address, or the process at the other end of a Unix socket."""
+    """Return the source of a connection: the peer's address, or its process id for a Unix socket."""
     if connected.family == socket.AF_UNIX:
         credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
         return str(struct.unpack("3i", credentials)[0])

@@ -1,10 +1,10 @@
-"""Door for stops beside Zenoh's endpoints: a thread whose event loop serves each connection in a task of its own.
+"""Door for stops: a server beside Zenoh's endpoints that accepts only stops, in a thread with an event loop.
 
-TLS is on the sockets themselves: asyncio's streams would give each connection a buffer of 256 KB, which a flood of
-sessions multiplies, and close its descriptor later than the reserve needs it.
+Each connection has a task of its own. TLS uses the sockets directly: asyncio's streams would give each connection a
+buffer of 256 KB, which a flood multiplies, and would close its descriptor later than the reserve needs it.
 
-Each connection has a share: by its address until its user is known, by the user's name from then on; beyond the share
-its oldest connection is closed, so that a new one is served whatever others hold.
+Each source has a share of the connections: an address until the user is known, the user from then on. Beyond the share
+its oldest connection is closed, so that a flood from one source keeps no other out.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answer_with
 from trirail.wire.text import quoted
 
-PLACES: Final = 4096
-"""Most connections, or a quarter of the process's descriptors if that is less; they are reserved for them."""
+MAX_CALLERS: Final = 4096
+"""Most connections, or a quarter of the process's descriptors if that is less; the descriptors are reserved."""
 REQUEST_TIMEOUT_S: Final = 10.0
-"""Longest time to send a request: the shorter it is, the more connections an idle holder has to open."""
+"""Longest time until a connection has sent its request [s]; a shorter one makes idle floods more expensive."""
 ANSWER_TIMEOUT_S: Final = 20.0
-"""Longest wait for the answer, which comes within 15 s."""
-ACCEPTED_AT_ONCE: Final = 64
-"""Connections accepted before the existing ones continue."""
+"""Longest wait for the answer, which comes within 15 s [s]."""
+ACCEPTED_PER_TURN: Final = 64
+"""Most connections accepted before the existing ones are served."""
 
 T = TypeVar("T")
 Answer = Callable[[CommandReply | ErrorReply], None]
 """Receiver of the answer to a request, from any thread."""
-Take = Callable[[str, StopRequest, Answer], None]
-"""Receiver of a request, with the name in its sender's certificate, "" without certificates."""
+RequestHandler = Callable[[str, StopRequest, Answer], None]
+"""Receiver of a request, with the name in the sender's certificate; "" without certificates."""
 
 
 class _Stage(Enum):
@@ -52,12 +52,12 @@ class _Stage(Enum):
 
 
 _SHARES: Final = {_Stage.SILENT: 1 / 2, _Stage.TALKING: 1 / 8, _Stage.KNOWN: 1 / 8, _Stage.WAITING: 1 / 64}
-"""Shares of the places: connections of one address that are silent or in a handshake; of one user, before the request
+"""Share of all connections per source: of one address while silent and in a handshake, of one user before the request
 and after it."""
 
 
 class _Caller:
-    """A connection, the task that serves it, and the share that it counts in."""
+    """Connection of a client, with the task that serves it and the share to which it counts."""
 
     def __init__(self, connection: socket.socket, source: str) -> None:
         self.connection = connection
@@ -68,16 +68,16 @@ class _Caller:
 
 
 class StopDoor:
-    """Server for stops at addresses, from `start` until it is closed."""
+    """Server for stops; `start` begins to serve, `close` ends."""
 
-    def __init__(self, secured: ssl.SSLContext | None, take: Take) -> None:
+    def __init__(self, secured: ssl.SSLContext | None, handle_request: RequestHandler) -> None:
         self._secured = secured
-        self._take = take
+        self._handle_request = handle_request
         self._callers: dict[_Caller, None] = {}  # the oldest first
         self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # those first that are longest in it
         self._listening: list[socket.socket] = []
-        self._places = min(PLACES, descriptor_limit() // 4)
-        self._reserve = Reserve(self._places)
+        self._max_callers = min(MAX_CALLERS, descriptor_limit() // 4)
+        self._reserve = Reserve(self._max_callers)
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
@@ -115,7 +115,7 @@ class StopDoor:
     # ------------------------------------------------------------------ accept and drop
 
     def _accept(self, listening: socket.socket) -> None:
-        for _ in range(ACCEPTED_AT_ONCE):
+        for _ in range(ACCEPTED_PER_TURN):
             if not self._reserve and self._callers:
                 self._drop(next(iter(self._callers)))
             if self._reserve:
@@ -143,7 +143,7 @@ class StopDoor:
     def _count(self, caller: _Caller) -> None:
         share = self._shares.setdefault((caller.stage, caller.share), {})
         share[caller] = None
-        if len(share) > self._places * _SHARES[caller.stage]:
+        if len(share) > self._max_callers * _SHARES[caller.stage]:
             self._drop(next(iter(share)))
 
     def _discount(self, caller: _Caller) -> None:
@@ -233,7 +233,7 @@ class StopDoor:
                 self._loop.call_soon_threadsafe(finish, content)
 
         try:
-            self._take(user, request, answer)
+            self._handle_request(user, request, answer)
         except RefusedError as refusal:
             return ErrorReply(refusal.code, quoted(str(refusal)))
         more = self._loop.create_task(self._receive(caller))

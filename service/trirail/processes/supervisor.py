@@ -1,4 +1,4 @@
-"""Supervisor, `trirail run`: starts the other processes, watches and restarts them, and ends them in order."""
+"""Supervisor (`trirail run`): starts the other processes, monitors and restarts them, and ends them in order."""
 
 from __future__ import annotations
 
@@ -18,65 +18,76 @@ from trirail.errors import ServiceError
 from trirail.processes.compiling import Progress
 from trirail.processes.forked_processes import ChildProcess, ForkServerLink
 from trirail.processes.heartbeats import PROCESSES, HangWatch, Heartbeats
-from trirail.processes.monitoring import LEAST_CYCLES, Health, Running
+from trirail.processes.monitoring import MIN_SILENT_CYCLES, Health, Running
 from trirail.processes.operating_system import Signals, Watchdog, notify
 from trirail.processes.order import Order
-from trirail.processes.realtime import give_back
+from trirail.processes.realtime import release_startup_memory
 from trirail.processes.sockets import raise_descriptor_limit
 from trirail.wire import links
 from trirail.wire.credentials import Admission
 from trirail.wire.messages import Event, Level
 
 CHILDREN = ("gateway", "recorder", "loop", "planner")
-"""Processes in the order of their start: the first two need no mathematics, and come up while it is being imported."""
+"""Processes in the order of their start: the first two need no compiled code, and start while it is being imported."""
 CHILDREN_WITH_DRIVES = ("gateway", "recorder", "loop", "drives", "planner")
-"""The same with simulated drives; the loop rehearses while the drives come up, and then waits for them."""
+"""The same with simulated drives; the loop rehearses while the drives start, and then waits for them."""
 PORTS = ("gateway", "recorder", "planner")
-"""Processes that connect to the loop, in the order of trirail.processes.loop.Ports."""
+"""Processes that connect to the loop, in the order of trirail.processes.ports.Ports."""
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
-"""Processes without which there is no service; the planner may be away, and is restarted."""
+"""Essential processes; the service survives the loss of the others."""
 CONSEQUENCES = {
     "gateway": "the loop stops the robot and holds",
-    "planner": "the motion under way goes on, new goals are refused",
+    "planner": "the motion under way continues, new goals are refused",
     "recorder": "the robot is not affected",
-    "drives": "the robot is in fault, and they come back with the service's next start",
+    "drives": "the robot is in fault; restart the service to restart them",
 }
 """Consequence of a process's death for the robot."""
 START_WITHIN = 300.0
-"""Longest time for the processes to come up, and for each function that the very first start compiles [s]."""
+"""Longest time for the processes to come up, and for compiling each function at the first start [s]."""
 FORKS_WITHIN = 5.0
-"""Longest time for the fork server, once the service is up, to fork a child: it does nothing else [s]."""
+"""Longest time for the fork server to fork a child once the service is up [s]."""
 END_WITHIN = 6.0
 """Longest time for processes to end before they are killed [s]."""
 RESTART_DURING_START = 1.0
-"""Pause before the restart of a process that ended by itself before the service was up [s]: long enough to notice
-that the loop has ended."""
+"""Pause before restarting a process that has ended before the service was up [s]: long enough to notice that the loop
+has ended."""
 RESTARTS = 5
 """Restarts of one process within a minute that follow without a pause."""
-TURN = 0.1
-"""Interval at which the supervisor checks that the others are alive [s]."""
-SILENT = 0.7
-"""Longest silence of a process able to give a sign of life; beyond it the process hangs, and is killed [s]."""
-RECORDER_SILENT = 5.0
-"""The same of the recorder, which may wait for a disk: no motion depends on it [s]."""
-RETRY = 10.0
-"""Pause before any further restart of recorder or planner [s]; further ones of the gateway end the service."""
+CHECK_PERIOD_S = 0.1
+"""Interval between two checks of the other processes [s]."""
+MAX_SILENCE_S = 0.7
+"""Longest time without a heartbeat [s], after which a process is killed as hung; see heartbeats.HangWatch."""
+MAX_RECORDER_SILENCE_S = 5.0
+"""The same for the recorder [s], which may wait for a disk, and on which no motion depends."""
+RETRY_PAUSE_S = 10.0
+"""Pause before any further restart of recorder or planner [s]; a further end of the gateway ends the service."""
 
 
 class Supervisor:
-    """Supervisor of the service, in the foreground; `say` takes messages about the processes, `tell` every event."""
+    """Supervisor of the service, in the foreground.
+
+    Parameters
+    ----------
+    record
+        Recording file; None for a file named by the time.
+    report
+        Called with each message about the processes, and its level.
+    on_event
+        Called with each event of the service.
+
+    """
 
     def __init__(
         self,
         config: Config,
         record: Path | None,
-        say: Callable[[str, Level], None],
-        tell: Callable[[Event], None] = lambda _: None,
+        report: Callable[[str, Level], None],
+        on_event: Callable[[Event], None] = lambda _: None,
     ) -> None:
         self._order = Order(config, str(record) if record else None, _admission(config))
         self._record = self._order.record
-        self._say = say
-        self._tell = tell
+        self._report = report
+        self._on_event = on_event
         self._names = CHILDREN_WITH_DRIVES if config.can.interface == "simulated" else CHILDREN
         self._children: dict[str, ChildProcess] = {}
         self._selector = selectors.DefaultSelector()
@@ -84,29 +95,30 @@ class Supervisor:
         self._due: dict[str, float] = {}
         self._started = dict.fromkeys(self._names, 0)
         self._heartbeats = Heartbeats.create()
-        loop_silent = max(SILENT, LEAST_CYCLES * config.period)
+        loop_silent = max(MAX_SILENCE_S, MIN_SILENT_CYCLES * config.period)
         self._patience = {
             "loop": loop_silent,
-            "gateway": max(SILENT, config.watchdogs.gateway_timeout),
-            "planner": SILENT,
-            "recorder": RECORDER_SILENT,
+            "gateway": max(MAX_SILENCE_S, config.watchdogs.gateway_timeout),
+            "planner": MAX_SILENCE_S,
+            "recorder": MAX_RECORDER_SILENCE_S,
         }
         self._watches = {
-            name: HangWatch(self._heartbeats.of(name), seconds, TURN) for name, seconds in self._patience.items()
+            name: HangWatch(self._heartbeats.heart(name), seconds, CHECK_PERIOD_S)
+            for name, seconds in self._patience.items()
         }
-        self._health = Health(self._heartbeats, config.period, TURN)
-        self._watchdog = Watchdog([self._heartbeats.of(name) for name in WATCHED_BY_SYSTEMD])
+        self._health = Health(self._heartbeats, config.period, CHECK_PERIOD_S)
+        self._watchdog = Watchdog([self._heartbeats.heart(name) for name in WATCHED_BY_SYSTEMD])
         self._next_turn = 0.0
-        self._went_on = 0.0
+        self._progress_at = 0.0
         self._ending = False
         self._failed = False
-        self._turned = False
+        self._loop_has_run = False
         self._up = False
 
     def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
         """Run until a signal or the end of an essential process; return the exit code.
 
-        `up` is called once with the ready message of each process.
+        `up` is called once, with the ready message of each process.
         """
         raise_descriptor_limit()
         with _runtime_folder() as folder, Signals() as signals:
@@ -116,7 +128,7 @@ class Supervisor:
             self._parent = ForkServerLink(self._order, folder, self._heartbeats, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
-                with _metrics_server(self._order.config, self._health):  # it may have a thread
+                with _metrics_server(self._order.config, self._health):  # after the fork: the server has a thread
                     self._run_children(up, signals)
             finally:
                 self._parent.close()
@@ -134,7 +146,7 @@ class Supervisor:
 
     def _start(self, name: str) -> None:
         if name in PROCESSES:
-            self._heartbeats.of(name).rest()
+            self._heartbeats.heart(name).rest()
         self._started[name] += 1
         record = self._record if name == "recorder" else None
         child = ChildProcess(self._parent, name, record, again=self._started[name] > 1)
@@ -142,50 +154,52 @@ class Supervisor:
         self._selector.register(child.pipe, selectors.EVENT_READ, child)
 
     def _watch(self, up: Callable[[dict[str, dict[str, Any]]], None], signals: Signals) -> None:
-        progress = Progress(lambda words: self._say(words, "info"), START_WITHIN)
+        progress = Progress(lambda words: self._report(words, "info"), START_WITHIN)
         began = time.monotonic()
         while not self._ending:
-            keys = [key for key, _ in self._selector.select(TURN)]
-            self._hear_parent()
-            heard: list[ChildProcess | None] = [key.data for key in keys if key.fileobj is not self._parent]
-            # The loop first: the others end because it has ended, and not by themselves.
-            for child in sorted(heard, key=lambda child: child is not self._children.get("loop")):
+            keys = [key for key, _ in self._selector.select(CHECK_PERIOD_S)]
+            self._receive_from_parent()
+            senders: list[ChildProcess | None] = [key.data for key in keys if key.fileobj is not self._parent]
+            # The loop first: if it has ended, the others end because of it.
+            for child in sorted(senders, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
                     ending = progress.interrupted if not self._up else "stopping the robot and disabling the drives"
-                    self._say(f"{signals.first().name}: {ending}", "info")
+                    self._report(f"{signals.first().name}: {ending}", "info")
                     self._ending = True
-                elif not child.listen() and not self._ending:
+                elif not child.read_messages() and not self._ending:
                     self._on_end(child)
                 if child is not None:
                     self._pass_on(child)
                 while child is not None and child.compiling:
-                    self._went_on = time.monotonic()
+                    self._progress_at = time.monotonic()
                     progress.begin(child.compiling.pop(0))
             if self._ending:
                 continue
             self._start_due()
-            self._look_after()
+            self._kill_hung()
             if self._up:
                 self._watchdog.feed()
                 continue
-            ready = {name: child.ready_with for name, child in self._children.items() if child.ready_with is not None}
+            ready = {
+                name: child.ready_message for name, child in self._children.items() if child.ready_message is not None
+            }
             if len(ready) == len(self._names):
                 self._up = True
                 up(ready)
                 notify("READY=1")
-                give_back()
-            elif time.monotonic() - max(began, self._went_on) > START_WITHIN:
+                release_startup_memory()
+            elif time.monotonic() - max(began, self._progress_at) > START_WITHIN:
                 missing = ", ".join(name for name in self._names if name not in ready)
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
 
-    def _look_after(self) -> None:
-        """Once a turn, kill processes that should give signs of life and do not; their end is handled as any other."""
+    def _kill_hung(self) -> None:
+        """Kill hung processes, once per CHECK_PERIOD_S; `_on_end` then handles their end."""
         now = time.monotonic()
         if now < self._next_turn:
             return
-        self._next_turn = now + TURN
+        self._next_turn = now + CHECK_PERIOD_S
         for child in self._children.values():
-            if child.ready_with is None and now - max(child.began, self._went_on) > START_WITHIN:
+            if child.ready_message is None and now - max(child.began, self._progress_at) > START_WITHIN:
                 if child.pid is None:
                     self._parent.kill()
                 child.kill_hung(START_WITHIN)
@@ -201,53 +215,55 @@ class Supervisor:
         child, restarts = self._children.get(name), self._started[name] - 1
         if child is None:
             return Running(None, ready=False, restarts=restarts)
-        return Running(child.pid, child.ready_with is not None, restarts)
+        return Running(child.pid, child.ready_message is not None, restarts)
 
     def _on_end(self, child: ChildProcess) -> None:
-        """Decide on the consequence of a process's end."""
+        """Handle the end of a process: restart it, or end the service."""
         self._forget(child)
         child.wait(time.monotonic() + END_WITHIN)
         if child.name != "loop" and self._loop_is_ending():
-            return  # so it has ended as well, as it should
+            return  # the others end normally after the loop
         if not self._up and child.name != "loop" and child.returncode == 0:
-            # Most likely the loop could not start, which it has reported, and this one has lost its connection to it.
+            # Most likely the loop could not start, has reported that, and so closed its connection to this process.
             self._due[child.name] = time.monotonic() + RESTART_DURING_START
             return
         said_why = child.returncode == os.EX_CONFIG
         name, restarts = child.name, self._restarts[child.name]
         if name == "loop":
-            self._turned = child.ready_with is not None
+            self._loop_has_run = child.ready_message is not None
             if child.returncode == 0:
                 consequence = "it has stopped the robot and disabled the drives"
-            elif self._turned:
+            elif self._loop_has_run:
                 consequence = "the drives stop by their own watchdogs"
             else:
                 consequence = "it had not begun"
-            self._fail("" if said_why else f"the loop is dead ({child.how}): {consequence}; ending")
+            self._fail("" if said_why else f"the loop is dead ({child.end_description}): {consequence}; ending")
             return
-        if child.ready_with is None and not restarts:
-            self._fail("" if said_why else f"the {name} could not start ({child.how})")
+        if child.ready_message is None and not restarts:
+            self._fail("" if said_why else f"the {name} could not start ({child.end_description})")
             return
         if name == "drives":
-            if child.returncode:  # else the loop has released them, and its own end is reported
-                self._say(f"the simulated drives have died ({child.how}): {CONSEQUENCES[name]}", "error")
+            if child.returncode:  # otherwise the loop has disconnected from them, and its end is reported
+                self._report(f"the simulated drives have died ({child.end_description}): {CONSEQUENCES[name]}", "error")
             return
         now = time.monotonic()
         restarts[:] = [moment for moment in restarts if now - moment < 60.0] + [now]
-        wait = 0.0 if len(restarts) <= RESTARTS else RETRY
+        wait = 0.0 if len(restarts) <= RESTARTS else RETRY_PAUSE_S
         if wait and name == "gateway":
-            self._fail(f"the gateway keeps dying ({child.how}): ending the service")
+            self._fail(f"the gateway keeps dying ({child.end_description}): ending the service")
             return
         when = f" in {wait:g} s" if wait else ""
-        self._say(f"the {name} has died ({child.how}): {CONSEQUENCES[name]}; starting it again{when}", "warning")
+        self._report(
+            f"the {name} has died ({child.end_description}): {CONSEQUENCES[name]}; starting it again{when}", "warning"
+        )
         if name == "recorder":
-            self._record = None  # never over the first recording
+            self._record = None  # do not overwrite the first recording
         self._due[name] = now + wait
 
     def _loop_is_ending(self) -> bool:
-        """Return whether the loop has turned and does not any more: its end is reported, and not that of the others."""
+        """Return whether the loop has run and has stopped its heartbeat: only its own end is reported then."""
         loop = self._children.get("loop")
-        return loop is None or (loop.ready_with is not None and not self._heartbeats.of("loop").count)
+        return loop is None or (loop.ready_message is not None and not self._heartbeats.heart("loop").count)
 
     def _start_due(self) -> None:
         for name in [name for name, due in self._due.items() if due <= time.monotonic()]:
@@ -257,25 +273,27 @@ class Supervisor:
     def _fail(self, reason: str) -> None:
         self._failed = self._ending = True
         if reason:
-            self._say(reason, "error")
+            self._report(reason, "error")
 
-    def _hear_parent(self) -> None:
-        """Process messages of the others' parent; without it there is no service."""
-        self._parent.hear()
+    def _receive_from_parent(self) -> None:
+        """Process messages of the fork server; end the service if the fork server has died."""
+        self._parent.receive()
         if self._parent.gone and not self._ending:
             loop = self._children.get("loop")
-            turns = loop is not None and loop.ready_with is not None
+            turns = loop is not None and loop.ready_message is not None
             consequence = "the loop stops the robot and disables the drives" if turns else "the loop had not begun"
-            self._fail(f"the process that forks the others has died ({self._parent.how()}): {consequence}; ending")
+            self._fail(
+                f"the process that forks the others has died ({self._parent.describe_end()}): {consequence}; ending"
+            )
 
     def _pass_on(self, child: ChildProcess) -> None:
-        while child.happened:
-            self._tell(child.happened.pop(0))
-        while child.measured:
-            self._health.store(child.name, child.measured.pop(0))
+        while child.events:
+            self._on_event(child.events.pop(0))
+        while child.measurements:
+            self._health.store(child.name, child.measurements.pop(0))
 
     def _forget(self, child: ChildProcess) -> None:
-        while child.listen():
+        while child.read_messages():
             pass
         self._pass_on(child)
         self._selector.unregister(child.pipe)
@@ -283,7 +301,7 @@ class Supervisor:
         del self._children[child.name]
 
     def _end(self) -> None:
-        """End the loop first, so that the others can report it; then those. Planner and drives report nothing."""
+        """End the loop first, so that gateway and recorder can report its end, then the other processes."""
         notify("STOPPING=1")
         self._health.end({name: self._running(name) for name in self._names})
         for child in self._children.values():
@@ -292,30 +310,30 @@ class Supervisor:
         if loop := self._children.get("loop"):
             loop.send_signal(signal.SIGTERM)
             if not loop.wait(time.monotonic() + END_WITHIN):
-                self._kill_unwilling(loop)
-            self._turned = self._turned or loop.ready_with is not None
-        for name in ("planner", "drives"):  # they keep nothing, and may be frozen or in their start
+                self._kill_unresponsive(loop)
+            self._loop_has_run = self._loop_has_run or loop.ready_message is not None
+        for name in ("planner", "drives"):  # killed: they have no state, and may be frozen or still starting
             if left := self._children.get(name):
                 self._kill(left)
                 self._forget(left)
-        # The others end by themselves once the loop has gone and its messages are published and on disk; one that has
-        # never turned has sent none.
-        by_itself = time.monotonic() + (END_WITHIN if self._turned else 0.0)
+        # Gateway and recorder end by themselves once the loop's messages are published and on disk; a loop that has
+        # never run has sent none.
+        by_itself = time.monotonic() + (END_WITHIN if self._loop_has_run else 0.0)
         asked = by_itself + END_WITHIN
         for child in list(self._children.values()):
             if not child.wait(by_itself):
                 child.send_signal(signal.SIGTERM)
         for child in list(self._children.values()):
             if not child.wait(asked):
-                self._kill_unwilling(child)
+                self._kill_unresponsive(child)
                 self._failed = True
-            # If the start is interrupted, SIGTERM may arrive before they have installed its handler.
-            up = self._turned and child.ready_with is not None
+            # During the start SIGTERM may arrive before a process has installed its handler.
+            up = self._loop_has_run and child.ready_message is not None
             self._failed = self._failed or (up and child.returncode != 0)
             self._forget(child)
 
-    def _kill_unwilling(self, child: ChildProcess) -> None:
-        self._say(f"the {child.name} does not end: killing it", "warning")
+    def _kill_unresponsive(self, child: ChildProcess) -> None:
+        self._report(f"the {child.name} does not end: killing it", "warning")
         self._kill(child)
 
     def _kill(self, child: ChildProcess) -> None:
@@ -324,14 +342,14 @@ class Supervisor:
 
 
 def _admission(config: Config) -> Admission | None:
-    """Return the content of [zenoh.tls] now, for all starts of the gateway. Raises ServiceError if it is invalid."""
+    """Read the credentials of [zenoh.tls] once, for all starts of the gateway. Raises ServiceError if invalid."""
     zenoh = config.zenoh
     return Admission.read(Path(zenoh.tls.directory), zenoh.users) if zenoh.tls is not None else None
 
 
 @contextmanager
 def _runtime_folder() -> Iterator[Path]:
-    """Make a folder for sockets. Raises ServiceError if none can be made."""
+    """Create a temporary folder for sockets. Raises ServiceError on failure."""
     parent = os.environ.get("XDG_RUNTIME_DIR")
     with ExitStack() as stack:
         try:
@@ -346,7 +364,7 @@ def _runtime_folder() -> Iterator[Path]:
 
 
 def _metrics_server(config: Config, health: Health) -> AbstractContextManager[object]:
-    """Serve the metrics while the context lasts, if [telemetry] metrics_port is given."""
+    """Return the context in which metrics are served, if [telemetry] metrics_port is set."""
     if not config.telemetry.metrics_port:
         return nullcontext()
     from trirail.processes.metrics import MetricsServer

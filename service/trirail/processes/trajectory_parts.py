@@ -1,4 +1,4 @@
-"""Trajectories in several messages, kept until all their parts are there."""
+"""Assembly of trajectories that arrive in several messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from trirail.wire.sizes import MAX_POINTS
 from trirail.wire.text import quoted
 
 PARTS_WITHIN = 5.0
-"""Longest time from one part to the next; after it the goal is refused [s]."""
+"""Longest time between two parts, after which the goal is refused [s]."""
 
 
 class _Received(NamedTuple):
@@ -32,7 +32,7 @@ class _Incomplete:
 
     @property
     def message(self) -> Incoming:
-        """Its messages as one, with the number of the first part; an answer to it is one to all of them."""
+        """All parts as one message, with the number of the first; an answer to it goes to all parts."""
         first, *others = sorted((part.incoming for part in self.received.values()), key=lambda each: each.number)
         newest = others[-1] if others else first
         size = first.size + sum(each.size for each in others)
@@ -47,9 +47,15 @@ class _Incomplete:
 
 
 class TrajectoryParts:
-    """Trajectories under assembly from their parts, whose memory counts as their user's until they are answered.
+    """Assembly of trajectories; the memory of parts counts as their user's until they are answered.
 
-    `refuse` answers all parts of a goal of which some are missing; `clock` gives seconds.
+    Parameters
+    ----------
+    refuse
+        Function that refuses all parts of a goal.
+    clock
+        Monotonic clock [s].
+
     """
 
     def __init__(
@@ -60,13 +66,13 @@ class TrajectoryParts:
         self._incomplete: dict[tuple[str, str], _Incomplete] = {}
 
     def __iter__(self) -> Iterator[Incoming]:
-        """Yield the messages that are not answered yet."""
+        """Yield the messages not answered yet."""
         return (goal.message for goal in self._incomplete.values())
 
     def add(self, incoming: Incoming, user: str, goal: TrajectoryGoal) -> tuple[Incoming, PackedTrajectory] | None:
-        """Add a part; return the whole goal with its messages once all are there, else None.
+        """Add a part; return the whole goal with its messages once all parts have arrived, else None.
 
-        Raises RefusedError for a part that does not match those before it.
+        Raises RefusedError for a part that does not match the previous ones.
         """
         if goal.part is None or goal.id is None:
             return incoming, packed(goal)
@@ -86,7 +92,7 @@ class TrajectoryParts:
         return None
 
     def poll(self) -> None:
-        """Refuse the goals whose parts have not arrived in time."""
+        """Refuse goals whose parts have not arrived in time."""
         now = self._clock()
         for key, goal in list(self._incomplete.items()):
             if goal.due < now:
@@ -99,7 +105,7 @@ class TrajectoryParts:
 
 
 def _check(incomplete: _Incomplete, goal: TrajectoryGoal, number: int, of: int) -> None:
-    """Raise RefusedError for a part that does not match those that have arrived."""
+    """Raise RefusedError for a part that does not match the previous ones."""
     problem = ""
     points = sum(len(part.goal.rows) // ROW for part in incomplete.received.values()) + len(goal.points)
     first = next(iter(incomplete.received.values()), None)

@@ -20,7 +20,7 @@ from trirail.telemetry.contents import box_name
 from trirail.telemetry.recorder import Recorder
 from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.messages import Event
-from trirail.wire.packets import ControlInput, Happened, decode_answer, encode
+from trirail.wire.packets import ControlInput, EventReport, decode_answer, encode
 from trirail.wire.records import last_cycle
 
 BEFORE_S = 60.0
@@ -94,7 +94,7 @@ class BlackBox:
 
     def event(self, event: Event) -> None:
         """Store an event, and after a fault prepare its file."""
-        self._keep_packed(Happened(event))
+        self._keep_packed(EventReport(event))
         if event.kind == "fault":
             self._faults.append(event)
 
@@ -113,7 +113,7 @@ class BlackBox:
         for thread in self._writing:
             thread.join()
 
-    def _keep_packed(self, message: Happened | ControlInput) -> None:
+    def _keep_packed(self, message: EventReport | ControlInput) -> None:
         """Keep a message in packed form, which is many times smaller."""
         packed = encode(message)
         self._keep(lambda recorder: _replay_message(recorder, packed), size=len(packed) + MESSAGE_OVERHEAD)
@@ -165,7 +165,7 @@ class BlackBox:
 def _replay_message(recorder: Recorder, packed: bytes) -> None:
     """Pass a message of the loop to a recorder."""
     match decode_answer(packed):
-        case Happened(event):
+        case EventReport(event):
             recorder.event(event)
         case ControlInput() as item:
             recorder.control_input(item)

@@ -29,7 +29,7 @@ from trirail.wire.packets import (
     GoalRequest,
     PlannerLost,
 )
-from trirail.wire.plan_packets import Extended, NotPlanned, Planned
+from trirail.wire.plan_packets import NotPlanned, PathExtension, PreemptingMotion
 
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
@@ -117,9 +117,9 @@ def _input_text(item: ControlInput) -> str:
             return f"{event.lower().replace('_', ' ')}: {reason}"
         case DrivesFault(message=message):
             return message or "the drives' fault is over"
-        case Planned(number=number, run=run):
+        case PreemptingMotion(number=number, run=run):
             return f"plan {number}: a motion of {len(run.path.knots) // 8 - 1} pieces"
-        case Extended(number=number, s=s):
+        case PathExtension(number=number, s=s):
             return f"plan {number}: a motion blended into the previous one, {s:.3f} s along its path"
         case NotPlanned(number=number, message=message):
             return f"plan {number}: {message}"

@@ -16,7 +16,7 @@ from trirail.wire.event_codes import EventCode
 from trirail.wire.looks import AlignmentLook, alignment_event_text
 from trirail.wire.messages import GoalReply, Notice
 from trirail.wire.packets import Announcement, ControlInput, GoalRequest
-from trirail.wire.plan_packets import Extended, Planned
+from trirail.wire.plan_packets import PathExtension, PreemptingMotion
 
 
 class _RecordedNotice(NamedTuple):
@@ -60,7 +60,7 @@ def encode_input(what: ControlInput) -> str:
     """Return an input as JSON."""
     if isinstance(what.given, Announcement):
         entry = _recorded_notice(what.given.notice)
-    elif isinstance(what.given, Planned | Extended):
+    elif isinstance(what.given, PreemptingMotion | PathExtension):
         entry = _recorded_plan(what.given)
     elif isinstance(what.given, GoalRequest):
         entry = msgspec.to_builtins(what.given)
@@ -89,7 +89,7 @@ def _recorded_notice(notice: Notice) -> _Line:
     return {"type": name} | {recorded: getattr(notice, field) for field, recorded in _NOTICES[name].fields.items()}
 
 
-def _recorded_plan(plan: Planned | Extended) -> _Line:
+def _recorded_plan(plan: PreemptingMotion | PathExtension) -> _Line:
     """Return the recorded fields of an answer of the planner."""
     fields = msgspec.to_builtins(plan)
     fields |= fields.pop("reply")
@@ -113,5 +113,5 @@ def _announcement(entry: _Line) -> _Line:
 def _plan(entry: _Line) -> _Line:
     """Return the fields of the planner's answer that was recorded."""
     reply = {name: entry.pop(name) for name in GoalReply.__struct_fields__ if name in entry}
-    unrecorded = {"id": "", "duration": None, "queued": entry["type"] == Extended.__name__}
+    unrecorded = {"id": "", "duration": None, "queued": entry["type"] == "Extended"}
     return entry | {"reply": unrecorded | reply}

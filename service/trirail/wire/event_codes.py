@@ -37,7 +37,7 @@ class EventCode(StrEnum):
     POWERED_NOT_HOMED = "powered_not_homed", "all drives are enabled, slider positions are unknown"
     HOMED = "homed", "all drives are homed"
     OUTSIDE_LIMITS = (
-        *("outside_limits", "the robot stands outside its limits"),
+        *("outside_limits", "the robot is outside its limits"),
         *("part", "name", "quantity", "value", "limit", "unit"),
     )
 

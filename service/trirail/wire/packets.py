@@ -86,7 +86,7 @@ class Checked(Struct, frozen=True, tag=True):
     reply: GoalReply
 
 
-class Confirmed(Struct, frozen=True, tag=True):
+class CommandDone(Struct, frozen=True, tag=True):
     """Loop to gateway: the command has been carried out."""
 
     ticket: int
@@ -118,7 +118,7 @@ class Welcome(Struct, frozen=True, tag=True):
     """Protections that the drives lack."""
 
 
-class Happened(Struct, frozen=True, tag=True):
+class EventReport(Struct, frozen=True, tag=True):
     """Loop to gateway and recorder: an event."""
 
     event: Event
@@ -153,10 +153,10 @@ class Status(Struct, frozen=True, tag=True):
 
 
 class Disturbance(Struct, frozen=True, tag="Mishap"):  # as recordings have it
-    """An unrequested change, in the form that Control.happen takes."""
+    """Unrequested change, an input of Control.handle."""
 
     event: str
-    """Name of a trirail.control.modes.Event."""
+    """Name of a trirail.control.modes.ModeEvent."""
     reason: str
     event_code: EventCode = EventCode.OTHER
     params: Params = {}
@@ -210,17 +210,17 @@ class Unrecorded(Struct, frozen=True, tag=True):
     why: str
 
 
-RecorderSaid = Announcement | Unrecorded
-Answer = Accepted | Checked | Confirmed | Refused | Welcome | Farewell | Happened | Status | ControlInput
+RecorderMessage = Announcement | Unrecorded
+Answer = Accepted | Checked | CommandDone | Refused | Welcome | Farewell | EventReport | Status | ControlInput
 
-prepare(Request, Answer, RecorderSaid, *(command.content for command in Command))
+prepare(Request, Answer, RecorderMessage, *(command.content for command in Command))
 encode = msgpack.Encoder().encode
 decode_request = decoder(Request, packed=True).decode
 decode_answer = decoder(Answer, packed=True).decode
-decode_recorder = decoder(RecorderSaid, packed=True).decode
+decode_recorder = decoder(RecorderMessage, packed=True).decode
 
 
-def message(content: Request | Answer | RecorderSaid) -> bytes:
+def message(content: Request | Answer | RecorderMessage) -> bytes:
     """Return the packet of a message."""
     return bytes((Kind.MESSAGE,)) + encode(content)
 
@@ -229,10 +229,10 @@ def event_packet(event: Event) -> bytes:
     """Return the packet of an event, shortened if necessary: the loop keeps events and sends them to a new gateway, so
     one that is too large to read would fail again and again.
     """
-    packet = message(Happened(event))
+    packet = message(EventReport(event))
     if len(packet) <= MAX_PACKET:
         return packet
     words = f"{event.message[:1000]}… ({len(event.message)} characters)"
     reason = event.reason and f"{event.reason[:1000]}…"
     name, goal, user = (text and text[:100] for text in (event.id, event.goal, event.user))
-    return message(Happened(structs.replace(event, message=words, id=name, reason=reason, goal=goal, user=user)))
+    return message(EventReport(structs.replace(event, message=words, id=name, reason=reason, goal=goal, user=user)))

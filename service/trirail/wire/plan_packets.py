@@ -62,7 +62,7 @@ class PlanRequest(Struct, frozen=True):
     """Distance from the end of the last run at which this goal may follow it [m]; None if it preempts the motion."""
 
 
-class Planned(Struct, frozen=True, tag=True):
+class PreemptingMotion(Struct, frozen=True, tag="Planned"):  # as recordings have it
     """Planner to loop: a motion that preempts the present one."""
 
     number: int
@@ -80,7 +80,7 @@ class Planned(Struct, frozen=True, tag=True):
     """Planned switches of outputs, of trirail.motion.marks.SWITCH; their times count from the start of the path."""
 
 
-class Extended(Struct, frozen=True, tag=True):
+class PathExtension(Struct, frozen=True, tag="Extended"):  # as recordings have it
     """Planner to loop: a path that follows the last queued one."""
 
     number: int
@@ -89,9 +89,9 @@ class Extended(Struct, frozen=True, tag=True):
     """Time along the last path at which the new one starts [s]."""
     path: PackedPath
     reply: GoalReply
-    """Reply as in Planned; the loop adds the duration as well."""
+    """Reply as in PreemptingMotion; the loop adds the duration as well."""
     switches: bytes = b""
-    """Planned switches as in Planned."""
+    """Planned switches as in PreemptingMotion."""
 
 
 class NotPlanned(Struct, frozen=True, tag=True):
@@ -110,7 +110,7 @@ class NotPlanned(Struct, frozen=True, tag=True):
         return RefusedError(self.code, self.message, slider=self.slider, value=self.value, limit=self.limit)
 
 
-PlanAnswer = Planned | Extended | NotPlanned
+PlanAnswer = PreemptingMotion | PathExtension | NotPlanned
 
 
 class Overtaken(BaseException):
