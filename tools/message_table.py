@@ -22,7 +22,7 @@ from trirail.wire.event_codes import EventCode
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "service/reference/messages.md"
 SOURCES = (ROOT / "service/trirail", ROOT / "drivers/trirail_drivers")
-HEAD = """\
+PAGE_HEAD = """\
 # Messages
 
 Every message for people, as its template and, where a test causes it, as an example. The codes are
@@ -51,11 +51,10 @@ class Message(NamedTuple):
 def messages() -> list[Message]:
     """Return all messages of the source, sorted, without repetitions."""
     files = [file for folder in SOURCES for file in sorted(folder.rglob("*.py"))]
-    found = {message for file in files for message in of_module(ast.parse(file.read_text(encoding="utf-8")))}
-    return sorted(found)
+    return sorted({message for file in files for message in messages_in(ast.parse(file.read_text(encoding="utf-8")))})
 
 
-def of_module(tree: ast.Module) -> Iterator[Message]:
+def messages_in(tree: ast.Module) -> Iterator[Message]:
     """Yield the messages of a module."""
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     inner = {id(node) for function in functions for node in ast.walk(function) if node is not function}
@@ -63,7 +62,7 @@ def of_module(tree: ast.Module) -> Iterator[Message]:
         texts = dict(_assignments(scope))
         for node in ast.walk(scope):
             if isinstance(node, ast.Call) and (scope is not tree or id(node) not in inner):
-                yield from _of_call(node, texts)
+                yield from _message_of_call(node, texts)
 
 
 def _assignments(scope: ast.AST) -> Iterator[tuple[str, ast.expr]]:
@@ -80,7 +79,7 @@ def _assignments(scope: ast.AST) -> Iterator[tuple[str, ast.expr]]:
                 )
 
 
-def _of_call(call: ast.Call, texts: dict[str, ast.expr]) -> Iterator[Message]:
+def _message_of_call(call: ast.Call, texts: dict[str, ast.expr]) -> Iterator[Message]:
     name = getattr(call.func, "id", getattr(call.func, "attr", ""))
     arguments = call.args
     if name == "coded" and len(arguments) == 2:
@@ -163,7 +162,7 @@ def examples(written: Path) -> list[tuple[str, str]]:
 def kept(page: str) -> dict[tuple[str, str], str]:
     """Return the examples of a page, by code and template."""
     rows = re.findall(r"^\| `(.*?)` \| (.*?) \| (.*?) \|$", page, re.MULTILINE)
-    return {(code, template): example for code, template, example in rows}
+    return {(code, template): example for code, template, example in rows if example}
 
 
 def example_of(message: Message, caused: list[tuple[str, str]]) -> str:
@@ -180,20 +179,19 @@ def example_of(message: Message, caused: list[tuple[str, str]]) -> str:
     )
 
 
-def page(found: list[Message], given: dict[tuple[str, str], str]) -> str:
+def page(all_messages: list[Message], example_cells: dict[tuple[str, str], str]) -> str:
     """Return the page, with an example for each message that has one."""
-    parts = [HEAD]
+    parts = [PAGE_HEAD]
     for section in (REFUSALS, EVENTS, ERRORS):
-        what = "class" if section == ERRORS else "code"
-        parts.append(f"## {section}\n\n| {what} | template | example |\n|---|---|---|")
-        rows = [message for message in found if message.section == section]
-        parts[-1] += "".join(f"\n{_row(message, given)}" for message in rows) + "\n"
+        column = "class" if section == ERRORS else "code"
+        rows = [_row(message, example_cells) for message in all_messages if message.section == section]
+        parts.append("\n".join([f"## {section}\n", f"| {column} | template | example |", "|---|---|---|", *rows, ""]))
     return "\n".join(parts)
 
 
-def _row(message: Message, given: dict[tuple[str, str], str]) -> str:
+def _row(message: Message, example_cells: dict[tuple[str, str], str]) -> str:
     template = _cell(message.template)
-    return f"| `{message.code}` | {template} | {given.get((message.code, template), '')} |"
+    return f"| `{message.code}` | {template} | {example_cells.get((message.code, template), '')} |"
 
 
 def _cell(text: str) -> str:
@@ -206,15 +204,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Write the page of all messages.")
     parser.add_argument("--examples", type=Path, metavar="FILE", help="messages that tests have caused")
     options = parser.parse_args()
-    found = messages()
-    given = kept(PAGE.read_text(encoding="utf-8")) if PAGE.exists() else {}
+    all_messages = messages()
+    example_cells = kept(PAGE.read_text(encoding="utf-8")) if PAGE.exists() else {}
     if options.examples:
         caused = examples(options.examples)
-        for message in found:
+        for message in all_messages:
             if example := example_of(message, caused):
-                given[message.code, _cell(message.template)] = _cell(example)
-    PAGE.write_text(page(found, given), encoding="utf-8")
-    print(f"{PAGE}: {len(found)} messages, {sum(bool(given.get((m.code, _cell(m.template)))) for m in found)} examples")
+                example_cells[message.code, _cell(message.template)] = _cell(example)
+    PAGE.write_text(page(all_messages, example_cells), encoding="utf-8")
+    with_example = sum((each.code, _cell(each.template)) in example_cells for each in all_messages)
+    print(f"{PAGE}: {len(all_messages)} messages, {with_example} with an example")
     return 0
 
 

@@ -173,6 +173,7 @@ class StopDoor:
                 line, user = await self._request(caller)
                 timeout.reschedule(self._loop.time() + ANSWER_TIMEOUT_S)
                 answer = await self._answer(caller, user, line)
+            self._check_open(caller)
             caller.connection.send(answer_with(answer))  # no line is longer than the socket's buffer
         except (OSError, ValueError):  # it has gone, says too much or too little, or has no good certificate
             pass
@@ -209,11 +210,20 @@ class StopDoor:
     async def _when_readable(self, caller: _Caller, act: Callable[[], T]) -> T:
         """Return the result of an action, which is tried whenever the connection has become readable."""
         while True:
+            self._check_open(caller)
             caller.readable.clear()
             try:
                 return act()
             except (BlockingIOError, ssl.SSLWantReadError):
                 await caller.readable.wait()
+
+    def _check_open(self, caller: _Caller) -> None:
+        """Raise ConnectionError if a connection has been closed.
+
+        OpenSSL keeps the number of its descriptor, which may be that of a newer connection by now.
+        """
+        if caller not in self._callers:
+            raise ConnectionError
 
     async def _answer(self, caller: _Caller, user: str, line: bytes) -> CommandReply | ErrorReply:
         """Pass a request on; return its answer. Raises ConnectionError if the caller goes, or sends more."""
