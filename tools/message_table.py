@@ -59,9 +59,10 @@ def messages_in(tree: ast.Module) -> Iterator[Message]:
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     inner = {id(node) for function in functions for node in ast.walk(function) if node is not function}
     for scope in [tree, *(function for function in functions if id(function) not in inner)]:
-        texts = dict(_assignments(scope))
+        assigned = sorted(_assignments(scope), key=lambda each: each[1].lineno)
         for node in ast.walk(scope):
             if isinstance(node, ast.Call) and (scope is not tree or id(node) not in inner):
+                texts = dict(each for each in assigned if each[1].lineno <= node.lineno)
                 yield from _message_of_call(node, texts)
 
 

@@ -22,6 +22,7 @@ def check(name, value):
     if value > 2:
         raise RefusedError(RefusalCode.ABOVE_LIMIT, text, value=value)
     coded("the robot is at rest", EventCode.STANDSTILL)
+    text = "of another message"
     raise ConfigError(f"{', '.join(names)} are there twice")
     raise ValueError("part of another message")
     raise DriveError(str(error))
