@@ -334,7 +334,7 @@ def test_what_is_printed_is_a_configuration_of_zenohd(
             'robots = ["ann"]\n[zenoh]\nlisten = ["tls/0.0.0.0:7447"]\n[zenoh.tls]\n[zenoh.users]\nann = "viewer"',
             "names",
         ),
-        ('robots = ["a"]\n[routers]\nnorth = ["b", "a"]\n[zenoh]', "a stands twice"),
+        ('robots = ["a"]\n[routers]\nnorth = ["b", "a"]\n[zenoh]', "a is given twice"),
         ("robots = [", "not TOML: Invalid"),
     ],
 )

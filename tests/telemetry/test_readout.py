@@ -36,9 +36,9 @@ def test_it_says_mode_goal_pose_sliders_and_what_is_wrong() -> None:
     record["progress"], record["remaining"] = 0.4, 0.71
     said = readout.markdown(record, ReadoutState("g-1", (0.03, 0.0, 0.5), 0.5, "drive B: EMCY 8700"))
     assert "**FAULT**   override 50%   goal **g\\-1**: 40%, 0.7 s left" in said
-    assert "40%, waits half-way" in readout.markdown(record, ReadoutState("g-1", override=0.0))
+    assert "40%, waits on its path" in readout.markdown(record, ReadoutState("g-1", override=0.0))
     record["mode"] = MODES.index(Mode.HOLDING)
-    assert "40%, waits half-way" in readout.markdown(record, ReadoutState("g-1"))
+    assert "40%, waits on its path" in readout.markdown(record, ReadoutState("g-1"))
     record["mode"] = MODES.index(Mode.FAULT)
     assert "**drive B\\: EMCY 8700**" in said
     assert "| measured | 12.346 | -20.000 | 12.500 | λ [mm] | 1.000 | -2.500 | 100.000 |" in said

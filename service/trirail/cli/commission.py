@@ -72,7 +72,7 @@ def commission(
     simulated = settings.can.interface == "simulated"
     if (yes or fault) and not simulated:
         option = "--yes" if yes else "--fault"
-        raise ConfigError(f"{option} is for simulated drives: what real ones do a person has to look at")
+        raise ConfigError(f"{option} is for simulated drives: a person must watch real ones")
     if out is not None and out.exists():
         raise ConfigError(f"{out} exists already; name another file with --out")
     name = f"commission-{settings.robot.name}-{time.strftime('%Y%m%d-%H%M%S')}.json"

@@ -59,7 +59,7 @@ def load(path: Path) -> RouterConfig:
         raise ConfigError(f"{path}: robots, routers: name one robot at least")
     named = Counter([*config.all_robots, *config.routers, *config.zenoh.users])
     if twice := [name for name, times in named.items() if times > 1]:
-        raise ConfigError(f"{path}: robots, routers, zenoh.users: {', '.join(twice)} stands twice: names must differ")
+        raise ConfigError(f"{path}: robots, routers, zenoh.users: {', '.join(twice)} is given twice: names must differ")
     return config
 
 

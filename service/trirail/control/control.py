@@ -454,21 +454,21 @@ class Control:
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
         """Return the pose from which a move begins: the end of the goals before it, or the measured pose.
 
-        Raises RefusedError while a goal is stopped half-way, paused or at override 0: the user would expect a move from
-        there.
+        Raises RefusedError while a goal is stopped on its path, paused or at override 0: the user would expect a move
+        from there.
         """
         if origin == "measured":
             return self.measured.pose
         if self.state.paused or (self.override == 0.0 and self.schedule.last is not None):
             raise RefusedError(
                 RefusalCode.MOVING,
-                "a goal waits half-way, and a move would count from its end: send stop first, or resume it, or move "
+                "a goal waits on its path, and a move would count from its end: send stop first, or resume it, or move "
                 "from where the robot is measured to be",
             )
         return self._end_pose
 
     def _place_of_check(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
-        """Return the pose from which a check plans: as `_place`, but of a goal that waits half-way the end."""
+        """Return the pose from which a check plans: as `_place`, but of a goal that waits on its path, the end."""
         self._check_homed()
         return self.measured.pose if origin == "measured" else self._end_pose
 

@@ -184,7 +184,7 @@ class GoalQueue:
         """End planned goals that can no longer begin in time, and those behind them."""
         for number, goal in enumerate(self._ledger.goals):
             if number and cycle > goal.expires:
-                self._drop(number, goal.id, "expired", coded("it has not begun in time", EventCode.TOO_LATE))
+                self._drop(number, goal.id, "expired", coded("it did not begin in time", EventCode.TOO_LATE))
                 return
 
     def _next(self) -> _ReceivedGoal:
@@ -240,7 +240,10 @@ class GoalQueue:
             raise RefusedError(RefusalCode.BUSY, text, value=waited)
         if not abs(ago) <= MAX_TARGET_AGE_S:
             when = f"{ago:.3f} s ago" if ago > 0.0 else f"in {-ago:.3f} s"
-            text = f"the time of the target is {when} by this machine: at most {MAX_TARGET_AGE_S:g} s is allowed"
+            text = (
+                f"the time of the target is {when} by this machine's clock: {MAX_TARGET_AGE_S:g} s is the maximum; "
+                "synchronise the clocks"
+            )
             raise RefusedError(RefusalCode.WRONG_TIME, text, value=ago, limit=math.copysign(MAX_TARGET_AGE_S, ago))
         return planned.at(self._schedule.cycle * self._period - ago)
 

@@ -265,7 +265,7 @@ class PlanRequests:
         try:
             accepted = self._extend(answer) if isinstance(answer, PathExtension) else self._preempt(answer)
         except ValueError as error:
-            raise RefusedError(RefusalCode.PLANNER_LOST, f"the planner's answer is no motion: {error}") from error
+            raise RefusedError(RefusalCode.PLANNER_LOST, f"the planner's answer is not a motion: {error}") from error
         if accepted is not None:
             self.cancel()
         return accepted

@@ -119,7 +119,7 @@ def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     reached: Array = poses[room.holds(travels(geometry, poses), beyond)]
     if not len(reached):
-        raise CalibrationError("the limits leave the robot nowhere to go")
+        raise CalibrationError("the limits leave no pose to move to: widen limits.slider or limits.platform")
     return reached
 
 

@@ -81,7 +81,7 @@ def check_ends(points: Sequence[Point], start: MotionState) -> None:
     An acceleration at either end is allowed; Checker.sample counts it as jerk over one cycle.
     """
     if not start.at_rest:
-        raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it stands")
+        raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it is at rest")
     for name, unit, begin, current in zip(COORDINATES, UNITS, points[0].pose, start.pose, strict=True):
         if abs(begin - current) > MAX_START_OFFSET:
             text = "the trajectory begins at {} = {}, the robot is at {}: go there first, {}".format(

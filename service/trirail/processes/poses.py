@@ -237,13 +237,13 @@ class Poses:
         if mode is Mode.FAULT:
             raise RefusedError(RefusalCode.FAULT, "the robot is in fault: remove the cause, then send reset")
         if mode not in (Mode.DISABLED, Mode.HOLDING):
-            raise RefusedError(RefusalCode.MOVING, f"the robot is {mode}: teach a pose when it stands")
+            raise RefusedError(RefusalCode.MOVING, f"the robot is {mode}: teach a pose when it is at rest")
         if not np.all(record["homed"]):
             raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
         x, y, phi = record["pose"].tolist()
         there = travels(self._geometry, (x, y, phi))[0]
         if not np.abs(there - record["position"] + record["backlash"]).max() <= MAX_CLOSURE_ERROR_M:
-            raise RefusedError(RefusalCode.SINGULAR, "the sliders are where they belong to no pose: move them")
+            raise RefusedError(RefusalCode.SINGULAR, "the positions of the sliders belong to no pose: move the sliders")
         return x, y, phi
 
     def _write(self, change: _Change) -> None:

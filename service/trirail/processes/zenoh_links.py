@@ -142,7 +142,9 @@ class LinkMonitor:
     def _check_use(self, what: str, used: int, most: int, by: str) -> None:
         """Warn if a resource is nearly used up."""
         code = EventCode.SESSIONS_FULL if what == "sessions" else EventCode.DESCRIPTORS_FULL
-        words = f"{used} of {most} {what} of the gateway are in use{by}: soon nobody new is let in, but for stops"
+        words = (
+            f"{used} of {most} {what} of the gateway are in use{by}: beyond that, new clients can only stop the robot"
+        )
         self._warn(used >= most * WARNING_SHARE * self._hysteresis(code), coded(words, code, used=used, most=most))
 
     def _hysteresis(self, code: EventCode) -> float:

@@ -38,7 +38,7 @@ def markdown(record: np.void, state: ReadoutState, names: Labels = NAMES) -> str
     if state.goal is not None:
         share, left = float(record["progress"]), float(record["remaining"])
         waits = share < 1.0 and (state.override == 0.0 or MODES[record["mode"]] == Mode.HOLDING)
-        words = "waits half-way" if waits else f"{left:.1f} s left"
+        words = "waits on its path" if waits else f"{left:.1f} s left"
         head += f"   goal **{state.goal.translate(_ESCAPES)}**: {share:.0%}, {words}"
     wrong = [f"**{state.fault.translate(_ESCAPES)}**"] if state.fault else []
     target = ["–"] * 3 if state.target is None else _pose(state.target)

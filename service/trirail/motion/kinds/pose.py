@@ -26,7 +26,8 @@ class PoseMotion(GoalMotion[PoseGoal]):
         del source
         if goal.frame == PLATFORM:
             raise RefusedError(
-                RefusalCode.UNKNOWN_FRAME, "a pose in the platform's own frame is no place: send a move in that frame"
+                RefusalCode.UNKNOWN_FRAME,
+                "frame platform: a pose in the platform's own frame is not defined; send a move in that frame",
             )
         x0, y0, turned = frames.frame(goal.frame)
         dx, dy = rotated(goal.x, goal.y, turned)
