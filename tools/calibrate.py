@@ -49,7 +49,7 @@ def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]
             reader = csv.reader(file)
             names = [name.strip() for name in next(reader, [])]
             if sorted(names) != sorted(COLUMNS):
-                raise CalibrationError(f"line 1: the columns are {', '.join(names)}; wanted are {', '.join(COLUMNS)}")
+                raise CalibrationError(f"line 1: the columns are {', '.join(names)}; expected {', '.join(COLUMNS)}")
             for fields in reader:
                 if fields:
                     rows.append(_numbers(names, fields, reader.line_num, "deg" if degrees else "rad"))
@@ -63,7 +63,7 @@ def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]
 def _numbers(names: Sequence[str], fields: Sequence[str], line: int, bare: str) -> list[float]:
     """Return the fields of a row in SI units, in the order of COLUMNS; an angle without a unit is in `bare`."""
     if len(fields) != len(names):
-        raise CalibrationError(f"line {line}: {len(fields)} fields; wanted are {len(names)}")
+        raise CalibrationError(f"line {line}: {len(fields)} fields; expected {len(names)}")
     texts = dict(zip(names, fields, strict=True))
     values = []
     for name in COLUMNS:

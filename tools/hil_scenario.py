@@ -166,7 +166,7 @@ def wait_for_state(robot: Robot, condition: Callable[[State], bool], what: str) 
 def expect(result: Result, outcome: str, robot: Robot) -> None:
     """Raise Failed unless a goal ended as it should."""
     if result.outcome != outcome:
-        raise Failed(f"goal: {result.message}; wanted is {outcome}. {_about(robot.state())}")
+        raise Failed(f"goal: {result.message}; expected {outcome}. {_about(robot.state())}")
 
 
 def _about(state: State) -> str:

@@ -99,7 +99,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     span = records[first : first + n + REACHED_AFTER_CYCLES]
     t = np.arange(1.0, n + 1.0) * period
     if n != wanted or not np.array_equal(np.diff(span["cycle"]), np.ones(n + REACHED_AFTER_CYCLES - 1)):
-        raise ServiceError(f"goal {goal}: {n} cycles of motion are recorded; wanted are {wanted} without a gap")
+        raise ServiceError(f"goal {goal}: {n} cycles of motion are recorded; expected {wanted} without a gap")
     if np.max(np.abs(span["progress"][:n] * DURATION - t)) > 1e-3 * period:
         raise ServiceError(f"goal {goal}: its time did not run evenly, by the progress in its records")
     position, velocity, acceleration = (

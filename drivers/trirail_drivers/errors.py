@@ -60,7 +60,7 @@ class ConfigurationRefused(DriveError):
         self, drive: str, name: str, index: int, subindex: int, wanted: object, read_back: object, seconds: float
     ) -> None:
         super().__init__(
-            f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): wanted {wanted}, found {read_back} "
+            f"drive {drive}: object {index:04X}:{subindex:02X} ({name}): expected {wanted}, found {read_back} "
             f"after {seconds:.3g} s"
         )
         self.drive = drive

@@ -155,4 +155,4 @@ def _sync_folder(folder: Path) -> None:
 
 def _check(path: Path, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
-        raise FileError(f"{path}: {_KINDS.get(stat.S_IFMT(status.st_mode), 'no file')}; wanted a regular file")
+        raise FileError(f"{path}: {_KINDS.get(stat.S_IFMT(status.st_mode), 'no file')}; expected a regular file")

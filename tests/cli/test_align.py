@@ -93,11 +93,11 @@ def test_calibrate_check_run(locator: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("program", "words"),
     [
-        ("echo nonsense", "wanted is"),
+        ("echo nonsense", "expected"),
         ("true", "has ended with exit code 0"),
         ("sleep 60", "no line in 0.05 s: does it flush what it prints"),
         ("/no/such/program", "cannot run"),
-        ("""echo '{"left": [1, "a"]}'""", "wanted is"),
+        ("""echo '{"left": [1, "a"]}'""", "expected"),
     ],
 )
 def test_a_program_that_tells_no_marks_is_named_with_what_is_wanted(
@@ -257,9 +257,9 @@ def test_one_camera_that_shows_several_marks_is_opened_once_and_read_once_a_look
         ({"camera": ("a=0", "b=0")}, "give each a --window"),
         ({"camera": ("a=0", "b=0"), "window": ("a=0,0,9,9",)}, "give each a --window"),
         ({"camera": ("a=0",), "window": ("b=0,0,9,9",)}, "no --camera shows that mark"),
-        ({"camera": ("a=0",), "window": ("a=0,0,9",)}, "MARK=U,V,WIDTH,HEIGHT is wanted"),
-        ({"camera": ("a=0",), "window": ("a=0,0,-9,9",)}, "MARK=U,V,WIDTH,HEIGHT is wanted"),
-        ({"camera": ("a",)}, "MARK=DEVICE is wanted"),
+        ({"camera": ("a=0",), "window": ("a=0,0,9",)}, "expected MARK=U,V,WIDTH,HEIGHT"),
+        ({"camera": ("a=0",), "window": ("a=0,0,-9,9",)}, "expected MARK=U,V,WIDTH,HEIGHT"),
+        ({"camera": ("a",)}, "expected MARK=DEVICE"),
         ({"program": "true", "window": ("a=0,0,9,9",)}, "--window is for pictures"),
     ],
 )

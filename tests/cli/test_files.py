@@ -58,7 +58,7 @@ COMMANDS = [
 def test_what_is_no_regular_file_is_refused(kind: str, command: list[str], tmp_path: Path, refused: Say) -> None:
     given = [word.replace("FILE", str(tmp_path / "x")) for word in command]
     path = Path(next(word for word in given if word.startswith(str(tmp_path))))
-    said = {"FIFO": "a FIFO; wanted a regular file", "folder": "a folder;", "nothing": "No such file or directory"}
+    said = {"FIFO": "a FIFO; expected a regular file", "folder": "a folder;", "nothing": "No such file or directory"}
     if kind == "FIFO":
         os.mkfifo(path)
     elif kind == "folder":

@@ -389,9 +389,7 @@ def test_a_trajectory_is_points_rows_an_array_or_a_file(
 def test_a_transposed_array_is_told_what_a_row_is(connect: str) -> None:
     with Robot("demo", connect, "ann") as robot, pytest.raises(RefusedError) as found:
         robot.follow(np.zeros((4, 9)))
-    assert str(found.value).startswith(
-        "points: row 0 is 9 values; wanted are TrajectoryPoints, rows of t [s], x, y [m],"
-    )
+    assert str(found.value).startswith("points: row 0 is 9 values; expected TrajectoryPoints, rows of t [s], x, y [m],")
 
 
 # ---------------------------------------------------------------------- ids, names and the end

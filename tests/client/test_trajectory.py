@@ -69,7 +69,7 @@ def test_a_trajectory_of_fewer_than_two_points_is_told_by_its_file(rows: int) ->
 
 @pytest.mark.parametrize("head", ["t,x,y", "t,x,y,phi,vx", "t,x,y,phi,vx,vy,w,ax", "t,t,x,y,phi", "t,x,y,phi,z", ""])
 def test_columns_are_those_that_there_are_each_once_and_by_threes(head: str) -> None:
-    with pytest.raises(TrirailError, match=r"line 1: columns .*; wanted t, x, y, phi, and if known vx, vy, w and"):
+    with pytest.raises(TrirailError, match=r"line 1: columns .*; expected t, x, y, phi, and if known vx, vy, w and"):
         read_text(head + "\n")
 
 

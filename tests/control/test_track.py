@@ -160,7 +160,9 @@ def test_a_target_beyond_the_border_is_waited_for_there(rig: ControlRig) -> None
     assert rig.mode is Mode.MOVING
     assert rig.control.commanded.pose == pytest.approx((0.15, 0.03, 0.0), abs=1e-6)
     said = [notice.message for notice in rig.notices if notice.level == "warning"]
-    assert said == ["the target of goal t1 is beyond the limit of platform x (position 150 mm): the robot waits there"]
+    assert said == [
+        "the target of goal t1 is beyond the limit of platform x (position 150 mm); the robot waits at the limit"
+    ]
     track(rig, lambda _: ((0.1, 0.03, 0.0), STILL), regular(50.0, 1.0))
     assert rig.control.commanded.pose == pytest.approx((0.1, 0.03, 0.0), abs=1e-6)
     assert_within_limits(rig)
@@ -170,7 +172,7 @@ def test_a_target_out_of_a_sliders_travel_is_waited_for_too(rig: ControlRig) -> 
     rig.enable()
     track(rig, lambda _: ((0.14, 0.14, -0.9), STILL), regular(50.0, 3.0))
     assert rig.mode is Mode.MOVING
-    assert any("the robot waits there" in notice.message for notice in rig.notices)
+    assert any("the robot waits at the limit" in notice.message for notice in rig.notices)
     pose = np.array(rig.control.commanded.pose)
     assert pose[0] == pytest.approx(pose[1], abs=1e-3)  # straight on from where it stood
     assert np.linalg.norm(pose[:2]) > 0.02

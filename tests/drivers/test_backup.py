@@ -246,7 +246,7 @@ def test_what_is_no_file_of_parameters_is_refused(tmp_path: Path, old: str, new:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
-    with pytest.raises(DriveError, match=f"(?s)a.dcf is no file of a drive's parameters.*{said}"):
+    with pytest.raises(DriveError, match=f"(?s)a.dcf is not a parameter file of a drive.*{said}"):
         parameter_file.read(path)
 
 
@@ -311,7 +311,7 @@ def test_a_damaged_file_of_an_earlier_version_is_refused(tmp_path: Path, old: st
     path = tmp_path / "a.toml"
     assert old in OLD
     path.write_text(OLD.replace(old, new))
-    with pytest.raises(DriveError, match=f"(?s)a.toml is no file of a drive's parameters.*{re.escape(said)}"):
+    with pytest.raises(DriveError, match=f"(?s)a.toml is not a parameter file of a drive.*{re.escape(said)}"):
         parameter_file.read(path)
 
 
@@ -490,10 +490,10 @@ def test_another_master_ends_it_on_the_way(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "refused", "replaceable"),
     [
-        ({"product": 9}, "product is 00000002h, the file's 00000009h; use a file of the same product", False),
-        ({"vendor": 9}, "vendor is 00000001h, the file's 00000009h; use a file of the same product", False),
+        ({"product": 9}, "product is 00000002h, the file's 00000009h; use a file for the same product", False),
+        ({"vendor": 9}, "vendor is 00000001h, the file's 00000009h; use a file for the same product", False),
         ({"vendor": None}, r"drive A has vendor 00000001h \(the file's unknown\).*--replace", True),
-        ({"device_type": 401}, "device_type is .*; use a file of the same product", False),
+        ({"device_type": 401}, "device_type is .*; use a file for the same product", False),
         ({"serial": 9}, r"drive A has serial 00000004h \(the file's 00000009h\).*--replace", True),
         ({"revision": 9}, r"drive A has revision 00000003h \(the file's 00000009h\).*--replace", True),
         ({"node": 2}, r"drive A has node 00000001h \(the file's 00000002h\).*--replace", True),
@@ -738,7 +738,7 @@ class TestFileOfAnotherProgram:
         ("old", "new", "said"),
         [
             ("NodeId=0x01", "NodeId=0x02", "--replace"),
-            ("NodeId=0x01", "NodeId=200", "no file of a drive's parameters"),
+            ("NodeId=0x01", "NodeId=200", "not a parameter file of a drive"),
             ("VendorNumber=0xFB", "VendorNumber=0x7", "same product"),
             ("DefaultValue=0x00000002", "DefaultValue=0x00000003", "same product"),
             ("DefaultValue=0x00000002", "ParameterValue=3", "same product"),
@@ -753,7 +753,7 @@ class TestFileOfAnotherProgram:
             ("[6083]", "[6081]", "already exists"),
             ("[6081]", "[6081SUB1]", "belongs to no object"),
             ("LowLimit=1", "DataType=0x0006", "already exists"),
-            ("DataType=0x0007\nAccessType=rw\nLowLimit=1", "DataType=0x0006\nAccessType=rw", "has 4 bytes, the file 2"),
+            ("DataType=0x0007\nAccessType=rw\nLowLimit=1", "DataType=0x0006\nAccessType=rw", "has 4 bytes, but 2 in the file"),
         ],
     )
     def test_is_refused_whole_where_anything_is_wrong(self, old: str, new: str, said: str, tmp_path: Path) -> None:

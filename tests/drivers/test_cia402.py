@@ -179,7 +179,7 @@ class TestConfigure:
             variable = objects.get_variable(index, subindex)
             assert variable is not None
             assert str(refused.value).startswith(
-                f"drive A: object {index:04X}:{subindex:02X} ({variable.qualname}): wanted "
+                f"drive A: object {index:04X}:{subindex:02X} ({variable.qualname}): expected "
             )
             assert ", found " in str(refused.value)
             rig.drives.close()
@@ -190,7 +190,7 @@ class TestConfigure:
         rig = closing(Rig(changed("B", eds=str(tmp_path / "other.eds"))))
         entry = rig.devices[1].objects[0x6085, 0]
         entry.on_write = lambda entry, old: setattr(entry, "value", 1)
-        with pytest.raises(ConfigurationRefused, match=r"drive B: object 6085:00 \(Ramp\): wanted 20000000, found 1"):
+        with pytest.raises(ConfigurationRefused, match=r"drive B: object 6085:00 \(Ramp\): expected 20000000, found 1"):
             rig.drives.configure(PERIOD)
 
     def test_eds_that_is_not_there(self) -> None:

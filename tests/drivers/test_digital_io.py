@@ -89,7 +89,7 @@ def test_a_bit_that_the_maker_reserves_is_refused_by_name(rig: Rig) -> None:
     rig.bus.faults.poll(rig.clock.now)
     with pytest.raises(
         DriveError,
-        match=r"^drive A: object 60FE:02 .* stays 00010000h, wanted 00030000h: its maker reserves bit 17; use",
+        match=r"^drive A: object 60FE:02 .* stays 00010000h, expected 00030000h: its maker reserves bit 17; use",
     ):
         rig.drives.configure(STEP)
 

@@ -105,8 +105,8 @@ def test_what_happens_in_a_moment_lasts_only_if_told_to(line: str) -> None:
 @pytest.mark.parametrize(
     ("line", "right"),
     [
-        ("", "a fault is missing at the end, as in: A silent; known are drop, "),
-        ("A", "a fault is missing"),
+        ("", "expected a fault at the end, such as: A silent; known faults are drop, "),
+        ("A", "expected a fault"),
         ("A slient", 'unknown fault "slient"; did you mean silent?'),
         ("D silent", 'unknown fault "D"; known are .*, A, B, C, all'),
         ("silent", "silent is a fault of a drive: name it, as in: A silent"),

@@ -97,6 +97,6 @@ def test_a_mapping_that_fits_with_another_transmission_type_says_so(closing: Clo
         (0x1401, 1): 0x301, (0x1401, 2): 255, (0x1601, 0): 1, (0x1601, 1): 0x607A_0020,
     }  # fmt: skip
     rig = closing(Rig("elmo_gold", Habits(fixed_pdos=True, values=values, access={(0x1401, 2): "ro"})))
-    said = r"1601 = 607A0020h, which fits, but its transmission type 1401:02 stays 255; wanted 1"
+    said = r"1601 = 607A0020h, which fits, but its transmission type 1401:02 stays 255; expected 1"
     with pytest.raises(DriveError, match=said):
         rig.drives.configure(PERIOD)

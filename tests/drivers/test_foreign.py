@@ -215,7 +215,7 @@ def test_what_another_master_has_left_in_a_drive_does_not_disturb_the_cycle(
 def test_a_drive_that_keeps_a_sync_of_another_kind_is_refused(closing: Closing, index: int) -> None:
     kind = 5 if index == 0x1019 else 7
     rig = closing(Rig("elmo_gold", Habits(without=frozenset({index}), more=((index, 0, kind, "ro", 0x81, False),))))
-    with pytest.raises(DriveError, match=f"drive A: object {index:04X}:00 .* stays .*; wanted 0"):
+    with pytest.raises(DriveError, match=f"drive A: object {index:04X}:00 .* stays .*; expected 0"):
         rig.ready()
 
 
@@ -317,7 +317,9 @@ def test_what_is_no_protection_cannot_be_accepted_to_be_missing(
     text = (SIM.parent / f"drives/{example}.toml").read_text()
     path = tmp_path / "robot.toml"
     path.write_text(text.replace("[drives.B]", f'[drives.B]\naccept_without = ["{name}"]'))
-    with pytest.raises(ConfigError, match=rf'drives.B.accept_without: "{name}" is no protection; there are {known}'):
+    with pytest.raises(
+        ConfigError, match=rf'drives.B.accept_without: "{name}" is not a known protection; choose from {known}'
+    ):
         load(path)
 
 

@@ -422,7 +422,7 @@ def test_no_drive_gets_power_in_homing_mode(rig: Rig) -> None:
     assert modes(rig) == [6, 8, 8]
     rig.drives[0].objects.on_write(0x6060, lambda entry, old: None)  # takes no mode any more
     answer = refusal(rig.command("enable"))
-    assert "drive A: homing: object 6061:00 (Modes of operation display): wanted 8, found 6" in answer.message
+    assert "drive A: homing: object 6061:00 (Modes of operation display): expected 8, found 6" in answer.message
     assert all(drive.state is PowerState.SWITCH_ON_DISABLED for drive in rig.drives)
 
 

@@ -171,8 +171,8 @@ def test_a_drive_is_asked_by_a_look_alone_and_not_by_the_service(
 @pytest.mark.parametrize(
     ("unit", "wanted"),
     [
-        (0xF7B5_0300, "limits.slider.velocity = 0.5 is 5e.14 of it, .*; wanted a coarser unit"),
-        (0x09B5_0300, "limits.slider.velocity = 0.5 is 0.0005 of it, .*; wanted a finer unit"),
+        (0xF7B5_0300, "limits.slider.velocity = 0.5 is 5e.14 of it, .*; use a coarser unit"),
+        (0x09B5_0300, "limits.slider.velocity = 0.5 is 0.0005 of it, .*; use a finer unit"),
     ],
 )
 def test_a_unit_that_cannot_say_the_sliders_limit_is_refused(

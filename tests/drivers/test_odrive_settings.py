@@ -107,10 +107,10 @@ def test_a_setting_that_is_not_as_it_must_be_is_refused_or_accepted_and_told(
     ("path", "value", "said"),
     [
         (WATCHDOG, False, "enable_watchdog, its stop when the host is silent: axis0.config.enable_watchdog is False"),
-        (WATCHDOG_TIMEOUT, 5.0, "axis0.config.watchdog_timeout is 5 s, wanted <= 0.3 s"),
-        (SCALE, 100, "axis0.config.can.input_vel_scale is 100, wanted 1000"),
-        (HEARTBEAT, 50, "axis0.config.can.heartbeat_msg_rate_ms is 50, wanted 100, drives.heartbeat"),
-        (CYCLIC[1], 10, "axis0.config.can.encoder_msg_rate_ms is 10, wanted 0"),
+        (WATCHDOG_TIMEOUT, 5.0, "axis0.config.watchdog_timeout is 5 s, expected at most 0.3 s"),
+        (SCALE, 100, "axis0.config.can.input_vel_scale is 100, expected 1000"),
+        (HEARTBEAT, 50, "axis0.config.can.heartbeat_msg_rate_ms is 50, expected 100, drives.heartbeat"),
+        (CYCLIC[1], 10, "axis0.config.can.encoder_msg_rate_ms is 10, expected 0"),
     ],
 )
 def test_each_is_said_with_what_is_wanted_and_how_to_accept_it(
@@ -213,8 +213,8 @@ def test_a_users_own_table_makes_a_firmware_known(
         (table(UNKNOWN, {WATCHDOG: -1}), r"it lacks axis0\.config\.enable_watchdog"),
         (table(UNKNOWN, {SCALE: 70_000}), r"is endpoint 70000 of type 'uint32', which no message holds"),
         (table(UNKNOWN, {}, {SCALE: "uint64"}), r"of type 'uint64', which no message holds"),
-        ("{}", r"is no flat_endpoints\.json \(Object missing"),
-        ("[", r"is no flat_endpoints\.json"),
+        ("{}", r"is not a valid flat_endpoints\.json \(Object missing"),
+        ("[", r"is not a valid flat_endpoints\.json"),
         (None, r"No such file"),
     ],
 )

@@ -156,7 +156,9 @@ def test_reset_is_refused_with_drive_and_progress(rig: RecoveryRig) -> None:
     assert f" of {expected.expected} {counted})" in answer.message
     rig.recover()
     assert rig.said(f"drive B restarted: {work}") == [f"drive B restarted: {work}", *rig.said("reset refused")]
-    assert rig.said("drive B is configured") == ["drive B is configured; every drive is: send reset, then enable"]
+    assert rig.said("drive B is configured") == [
+        "drive B is configured, as all drives are now: send reset, then enable"
+    ]
 
 
 def test_no_set_up_is_sent_while_another_drive_has_power(rig: RecoveryRig) -> None:
@@ -276,7 +278,7 @@ def test_settings_that_read_back_different_are_named_and_the_service_stays() -> 
     path = "axis0.config.can.heartbeat_msg_rate_ms"
     odrive.settings[path] = 50
     rig.supply(1)
-    rig.until(lambda: bool(rig.said(f"{path} is 50, wanted 100, drives.heartbeat")), ENDS)
+    rig.until(lambda: bool(rig.said(f"{path} is 50, expected 100, drives.heartbeat")), ENDS)
     answer = rig.command("reset")
     assert isinstance(answer, Refused)
     remedy = 'drives.B.accept_without = ["heartbeat_msg_rate_ms"]'

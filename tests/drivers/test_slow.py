@@ -66,7 +66,7 @@ def test_a_value_that_never_comes_is_told_with_the_time_that_it_was_given() -> N
     rig = SlowRig("elmo_gold", lambda node: Slowness(effect=lambda: 2.0 * (node == 2)))
     said = refusal(rig)
     assert re.match(
-        r"drive B: object 1006:00 \(Communication cycle period\): wanted 2000, found \d+ after 0\.5\d* s$", said
+        r"drive B: object 1006:00 \(Communication cycle period\): expected 2000, found \d+ after 0\.5\d* s$", said
     ), said
 
 
@@ -227,4 +227,4 @@ def test_a_mode_that_does_not_come_with_power_stops_all_three(closing: Closing, 
 
 def test_another_mode_than_none_is_refused_before_power() -> None:
     rig = SlowRig("elmo_gold", lambda node: Slowness(shows=3 if node == 2 else None))
-    assert re.match(r"drive B: object 6061:00 \(.*\): wanted 8, found 3 after 0\.5\d* s$", refusal(rig))
+    assert re.match(r"drive B: object 6061:00 \(.*\): expected 8, found 3 after 0\.5\d* s$", refusal(rig))

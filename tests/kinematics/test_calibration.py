@@ -212,7 +212,7 @@ def test_poses_must_be_enough() -> None:
     random = np.random.default_rng(9)
     seen = poses(random, 6)
     assert identify(START, seen, inverse(START, seen).position).misfit < 1e-6
-    with pytest.raises(CalibrationError, match="5 poses are too few: 6 are the least"):
+    with pytest.raises(CalibrationError, match="5 poses are too few: at least 6 are required"):
         identify(START, seen[:5], inverse(START, seen[:5]).position)
 
 
@@ -371,16 +371,16 @@ ROW = "0.01,0.02,0.1,0.03,0.01,0.02\n"
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("", "line 1: the columns are ; wanted are x, y, phi, A, B, C"),
-        (ROW, "line 1: the columns are 0.01, 0.02, 0.1, 0.03, 0.01, 0.02; wanted are x, y, phi, A, B, C"),
-        ("x,y,phi,A,B\n", "line 1: the columns are x, y, phi, A, B; wanted are x, y, phi, A, B, C"),
-        ("x,y,phi,A,B,C,D\n", "line 1: the columns are x, y, phi, A, B, C, D; wanted are x, y, phi, A, B, C"),
-        ("x,y,phi,A,B,B\n", "line 1: the columns are x, y, phi, A, B, B; wanted are x, y, phi, A, B, C"),
+        ("", "line 1: the columns are ; expected x, y, phi, A, B, C"),
+        (ROW, "line 1: the columns are 0.01, 0.02, 0.1, 0.03, 0.01, 0.02; expected x, y, phi, A, B, C"),
+        ("x,y,phi,A,B\n", "line 1: the columns are x, y, phi, A, B; expected x, y, phi, A, B, C"),
+        ("x,y,phi,A,B,C,D\n", "line 1: the columns are x, y, phi, A, B, C, D; expected x, y, phi, A, B, C"),
+        ("x,y,phi,A,B,B\n", "line 1: the columns are x, y, phi, A, B, B; expected x, y, phi, A, B, C"),
         (HEADER + ROW + "\n0,0,nan,0,0,0\n", "line 4: phi: 'nan' is not an angle"),
         (HEADER + ROW + "0,0,0,0,-inf,0\n", "line 3: B: '-inf' is not a length"),
         (HEADER + "0,0,zero,0,0,0\n", "line 2: phi: 'zero' is not an angle"),
-        (HEADER + "0,0,0,0,0\n", "line 2: 5 fields; wanted are 6"),
-        (HEADER + "0,0,0,0,0,0,0\n", "line 2: 7 fields; wanted are 6"),
+        (HEADER + "0,0,0,0,0\n", "line 2: 5 fields; expected 6"),
+        (HEADER + "0,0,0,0,0,0,0\n", "line 2: 7 fields; expected 6"),
     ],
 )
 def test_a_wrong_file_is_refused_by_line(

@@ -152,8 +152,8 @@ def test_what_is_no_number_is_refused_as_ever() -> None:
 @pytest.mark.parametrize(
     ("low", "high", "nodes", "said"),
     [
-        (LOW, HIGH, np.zeros((3, 4, 4, 3)), "wanted are"),
-        (LOW, HIGH, np.zeros((4, 4, 4)), "wanted are"),
+        (LOW, HIGH, np.zeros((3, 4, 4, 3)), "expected"),
+        (LOW, HIGH, np.zeros((4, 4, 4)), "expected"),
         (LOW, HIGH, np.full((4, 4, 4, 3), np.nan), "not finite"),
         (LOW, (0.1, np.inf, 0.1), np.zeros((4, 4, 4, 3)), "not finite"),
         (LOW, (0.1, -0.15, 0.1), np.zeros((4, 4, 4, 3)), "no inside"),

@@ -188,7 +188,7 @@ def test_what_is_no_recording_is_refused_with_its_path(tmp_path: Path) -> None:
     cut.write_bytes((tmp_path / "whole.rrd").read_bytes()[:1000])
     for path, why in {
         tmp_path / "absent.rrd": "No such file or directory",
-        tmp_path: "a folder; wanted a regular file",
+        tmp_path: "a folder; expected a regular file",
         text: "not a recording: an RRD file begins with RRF2",
         empty: "not a recording: an RRD file begins with RRF2",
         cut: "holds no",

@@ -152,7 +152,7 @@ def test_what_is_no_file_is_not_recorded_to(tmp_path: Path, kind: str) -> None:
         path.symlink_to("/dev/null")
     else:
         path.mkdir()
-    with pytest.raises(FileError, match=rf"a\.rrd: a {kind}; wanted a regular file"):
+    with pytest.raises(FileError, match=rf"a\.rrd: a {kind}; expected a regular file"):
         Recorder(load(SIM), tmp_path, path=path, live=False)
 
 

@@ -129,7 +129,7 @@ def test_the_motion_is_found_by_its_goal() -> None:
 
 @pytest.mark.parametrize("lost", [slice(700, 701), slice(40, 60), slice(3030, 3050), slice(1500, 3200)])
 def test_a_gap_is_refused(lost: slice) -> None:
-    with pytest.raises(ServiceError, match=r"goal g: .* wanted are 3000 without a gap"):
+    with pytest.raises(ServiceError, match=r"goal g: .* expected 3000 without a gap"):
         driven(recording(EXAMPLES[0], lost=lost), "g", PERIOD)
 
 
@@ -140,7 +140,7 @@ def test_records_that_are_lost_elsewhere_do_not_matter() -> None:
 def test_a_motion_that_was_stopped_is_refused() -> None:
     made = recording(EXAMPLES[0])
     made.records["mode"][2000:2100] = MODES.index(Mode.STOPPING)
-    with pytest.raises(ServiceError, match="goal g: 1960 cycles of motion are recorded; wanted are 3000 without a gap"):
+    with pytest.raises(ServiceError, match="goal g: 1960 cycles of motion are recorded; expected 3000 without a gap"):
         driven(made, "g", PERIOD)
 
 

@@ -242,7 +242,7 @@ class Cia402Axis(Axis):
         """Check the mode display 6061h: 0 is no mode yet, another mode is a fault."""
         self.mode.shown = mode == self.exchange.mode
         if not self.mode.shown and mode:
-            self.note_fault("state", 0, f"shows mode {mode} (object 6061), with power; wanted {self.exchange.mode}")
+            self.note_fault("state", 0, f"shows mode {mode} (object 6061), with power; expected {self.exchange.mode}")
 
     def request(self) -> bytes:
         """Return the next SDO request: its statusword, its mode display, or both in turn."""

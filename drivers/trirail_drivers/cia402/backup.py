@@ -232,8 +232,8 @@ async def _write(
         size = len(held[key].data) if key in held else len(intended[key].data)
         if intended[key].fixed_size and size != len(intended[key].data):
             raise DriveError(
-                f"drive {remote.name}: object {named(key)} has {size} bytes, the file {len(intended[key].data)}; "
-                "nothing was written"
+                f"drive {remote.name}: object {named(key)} has {size} bytes, but "
+                f"{len(intended[key].data)} in the file; nothing was written"
             )
     written: list[Key] = []
     refused: dict[Key, str] = {}
@@ -301,7 +301,7 @@ def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> No
         if theirs is not None and field in ("device_type", "vendor", "product"):
             raise DriveError(
                 f"drive {name}: its {field} is {format_number(mine)}, the file's {format_number(theirs)}; "
-                "use a file of the same product"
+                "use a file for the same product"
             )
         others.append(f"{field} {format_number(mine)} (the file's {format_number(theirs)})")
     if others and not replace:

@@ -74,7 +74,7 @@ def _check_velocity(name: str, drive: Drive, required: Requirements) -> None:
 
 
 def _counts_remedy(widest: float) -> str:
-    return f"wanted counts_per_metre of at least {1.0 / widest:g}"
+    return f"expected counts_per_metre of at least {1.0 / widest:g}"
 
 
 def _check_counts(name: str, drive: Drive, required: Requirements) -> None:
@@ -87,11 +87,11 @@ def _check_counts(name: str, drive: Drive, required: Requirements) -> None:
         raise DriveError(
             f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: "
             f"limits.slider.position = [{low:g}, {high:g}] is {reach:g} counts, beyond a drive's limit of "
-            f"{INT32_MAX}; wanted fewer counts, or an offset nearer to the travel"
+            f"{INT32_MAX}; use fewer counts, or an offset nearer to the travel"
         )
     if 2.0 * velocity * drive.counts_per_metre >= INT32_MAX:
         raise DriveError(
             f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}: limits.slider.velocity = "
-            f"{velocity:g} is {velocity * drive.counts_per_metre:g} counts/s, and twice that must be "
-            f"below {INT32_MAX}; wanted at most {INT32_MAX / (2.0 * velocity):.4g} counts_per_metre"
+            f"{velocity:g} is {velocity * drive.counts_per_metre:g} counts/s, more than half of {INT32_MAX}; "
+            f"use at most {INT32_MAX / (2.0 * velocity):.4g} counts_per_metre"
         )

@@ -183,7 +183,7 @@ class HomingSequence:
             if shown == 0 and not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
                 return  # it shows its mode only with power
             if self._now >= deadline:
-                raise HomingFailedError(f"object 6061:00 (Modes of operation display): wanted {mode}, found {shown}")
+                raise HomingFailedError(f"object 6061:00 (Modes of operation display): expected {mode}, found {shown}")
 
     def _sdo(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
         """Do one SDO transfer across cycles, without blocking; return the answer."""

@@ -207,9 +207,7 @@ async def _switch_off(remote: Remote, seconds: float) -> None:
     )
     statusword = await remote.read(0x6041) if statusword is None else statusword
     if not remote.rehearsed and canopen_frames.power_state(statusword) in HAS_POWER:
-        raise DriveError(
-            f"drive {remote.name}: does not take its power off within {waited:.3g} s (statusword {statusword:04X})"
-        )
+        raise DriveError(f"drive {remote.name}: did not power off within {waited:.3g} s (statusword {statusword:04X})")
 
 
 async def read_start(remote: Remote, io: DigitalIo) -> Start:

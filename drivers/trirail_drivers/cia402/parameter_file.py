@@ -149,7 +149,7 @@ def read(path: Path, node: int | None = None) -> SavedParameters:
     try:
         return _read_dcf(path, node) if path.suffix.lower() in (".dcf", ".eds") else _read_toml(path)
     except (configparser.Error, ValueError, LookupError, AttributeError, TypeError) as error:  # canopen's, too
-        raise DriveError(f"{path} is no file of a drive's parameters: {' '.join(str(error).split())}") from error
+        raise DriveError(f"{path} is not a parameter file of a drive: {' '.join(str(error).split())}") from error
 
 
 def _read_toml(path: Path) -> SavedParameters:

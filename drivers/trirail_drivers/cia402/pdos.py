@@ -346,7 +346,7 @@ class Pdos:
                     return pdo
                 but = ""
                 if fits(pdo.entries):
-                    but = f", which fits, but its transmission type {index:04X}:02 stays {pdo.kind}; wanted {kind}"
+                    but = f", which fits, but its transmission type {index:04X}:02 stays {pdo.kind}; expected {kind}"
                 seen.append(f"{index + 0x200:04X} = {', '.join(f'{entry:08X}h' for entry in pdo.entries)}{but}")
         mapped = f": it has {'; '.join(seen)}" if seen else ""
         mapping = base + 0x201

@@ -42,7 +42,7 @@ def check_nodes(drives: Drives) -> None:
     nodes["drives.master_node"] = drives.master_node
     for key, node in nodes.items():
         if node == 0:
-            raise DriveError(f"{key} = 0: on CANopen that addresses all nodes; wanted 1 to 127")
+            raise DriveError(f"{key} = 0: on CANopen that addresses all nodes; expected 1 to 127")
     if len(set(nodes.values())) < len(nodes):
         listed = ", ".join(f"{key} = {node}" for key, node in nodes.items())
         raise DriveError(f"node ids must differ, but are {listed}")
@@ -84,7 +84,7 @@ async def _configure_sync(drive: Differences, key: Key, wanted: int, bits: int) 
     await drive.ensure(*key, wanted)
     if (await remote.peek(*key) or 0) & bits != wanted:
         raise DriveError(
-            f"drive {remote.name}: {title(key)} stays {shown(*key, current)}; wanted {shown(*key, wanted)}"
+            f"drive {remote.name}: {title(key)} stays {shown(*key, current)}; expected {shown(*key, wanted)}"
         )
 
 

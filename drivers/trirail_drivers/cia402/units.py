@@ -145,7 +145,7 @@ def parse_unit(key: str, text: str, power: int) -> Unit:
         if power == 1
         else ("accelerations", '"counts/s2", "rpm/s", "rev/s2", "deg/s2", "rad/s2", "mm/s2"')
     )
-    raise DriveError(f'{key} = "{text}" is no unit of {kind}; wanted one as {shown}')
+    raise DriveError(f'{key} = "{text}" is not a unit of {kind}; use one such as {shown}')
 
 
 def check(name: str, drive: Drive, key: Literal["velocity_unit", "acceleration_unit"]) -> None:
@@ -198,9 +198,9 @@ def velocity_misfit(fastest: float, per_metre: float) -> str:
     limit = fastest * per_metre
     text = f"limits.slider.velocity = {fastest:g} is {limit:g} of it"
     if limit < 1.0:
-        return f"{text}, below the smallest velocity of 1; wanted a finer unit"
+        return f"{text}, below the smallest velocity of 1; use a finer unit"
     if 2.0 * limit >= INT32_MAX:  # a velocity may exceed its limit a little
-        return f"{text}, and twice that must be below {INT32_MAX}; wanted a coarser unit"
+        return f"{text}, more than half of {INT32_MAX}; use a coarser unit"
     return ""
 
 

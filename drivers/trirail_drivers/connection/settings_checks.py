@@ -72,7 +72,7 @@ def _check_heartbeat(drives: Drives, required: Requirements) -> None:
     if drives.heartbeat < required.period:
         raise DriveError(
             f"drives.heartbeat = {drives.heartbeat:g}: heartbeats go out with the cycle; "
-            f"wanted at least its period, {required.period:g} s"
+            f"expected at least its period, {required.period:g} s"
         )
 
 
@@ -80,4 +80,4 @@ def _check_protection(key: str, protection: str, protocol: str) -> None:
     protections = PROTOCOLS[protocol].protections
     if protection not in protections:
         known = ", ".join(protections) or "none"
-        raise DriveError(f'{key}: "{protection}" is no protection; there are {known}')
+        raise DriveError(f'{key}: "{protection}" is not a known protection; choose from {known}')

@@ -88,7 +88,9 @@ def read(name: str, path: Path) -> Table:
     except FileError as error:
         raise DriveError(f"{key}: {error}; download the one for your firmware: {DOWNLOADS}") from error
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise DriveError(f"{key}: {path} is no flat_endpoints.json ({error}); download it: {DOWNLOADS}") from error
+        raise DriveError(
+            f"{key}: {path} is not a valid flat_endpoints.json ({error}); download it: {DOWNLOADS}"
+        ) from error
 
 
 def endpoints_of(name: str, version: Version, own: str | None) -> Mapping[str, Endpoint] | None:

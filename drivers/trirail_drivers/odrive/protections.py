@@ -69,13 +69,17 @@ def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, 
     if not settings[WATCHDOG]:
         reasons["enable_watchdog"] = f"{WATCHDOG} is False"
     elif not settings[WATCHDOG_TIMEOUT] <= longest * (1.0 + _FLOAT32_TOLERANCE):
-        reasons["enable_watchdog"] = f"{WATCHDOG_TIMEOUT} is {settings[WATCHDOG_TIMEOUT]:g} s, wanted <= {longest:g} s"
+        reasons["enable_watchdog"] = (
+            f"{WATCHDOG_TIMEOUT} is {settings[WATCHDOG_TIMEOUT]:g} s, expected at most {longest:g} s"
+        )
     if (scale := settings.get(SCALE, VELOCITY_SCALE)) != VELOCITY_SCALE:
-        reasons["input_vel_scale"] = f"{SCALE} is {scale:g}, wanted {VELOCITY_SCALE}"
+        reasons["input_vel_scale"] = f"{SCALE} is {scale:g}, expected {VELOCITY_SCALE}"
     if settings[HEARTBEAT] != (wanted := round(1000 * drives.heartbeat)):
-        reasons["heartbeat_msg_rate_ms"] = f"{HEARTBEAT} is {settings[HEARTBEAT]:g}, wanted {wanted}, drives.heartbeat"
+        reasons["heartbeat_msg_rate_ms"] = (
+            f"{HEARTBEAT} is {settings[HEARTBEAT]:g}, expected {wanted}, drives.heartbeat"
+        )
     if on := [f"{path} is {settings[path]:g}" for path in CYCLIC if settings.get(path)]:
-        reasons["cyclic_messages"] = f"{', '.join(on)}, wanted 0"
+        reasons["cyclic_messages"] = f"{', '.join(on)}, expected 0"
     return reasons
 
 

@@ -168,7 +168,7 @@ async def _wait_until_idle(one: OdriveSetupTask) -> int:
             raise DriveTimeout(client.name, "heartbeat (heartbeat_msg_rate_ms)", within)
         if data is None:
             name = cansimple.state_name(state or 0)
-            raise DriveError(f"drive {client.name}: does not take its power off: it is in {name}, expected idle")
+            raise DriveError(f"drive {client.name}: did not power off: its state is {name}, expected idle")
         errors, state, _, _ = _unpacked(client, cansimple.BEAT, data)
         if cansimple.is_starting(state, errors):
             within = max(within, BOOT_TIMEOUTS * client.timeout)

@@ -225,7 +225,7 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
                 condition = _condition(words)
     drives = _DRIVES[words.left.pop(0)] if words.next_is(*_DRIVES) else ()
     if not words.left:
-        raise FaultSyntaxError(f"a fault is missing at the end, as in: A silent; known are {', '.join(_KINDS)}")
+        raise FaultSyntaxError(f"expected a fault at the end, such as: A silent; known faults are {', '.join(_KINDS)}")
     name = words.left.pop(0)
     if name not in _KINDS:
         known = (*_KINDS, *(() if drives else _DRIVES))

@@ -157,7 +157,7 @@ class Console:
                 return answer or question.default or ""
             if not self._open and not self._typed:
                 raise QuitRequest
-            self._shown.print("  an answer is wanted here, or q to leave: ", end="")
+            self._shown.print("  enter an answer, or q to leave: ", end="")
 
     def _next(self) -> str | None:
         """Return the next line that was typed; None where none is there yet."""

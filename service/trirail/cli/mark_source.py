@@ -91,7 +91,7 @@ def program(command: str) -> Iterator[Source]:
         try:
             marks: Marks = decoded(line, LINE)
         except (msgspec.MsgspecError, ValueError) as error:
-            wanted = 'wanted is {"mark": [u, v], …} in pixels'
+            wanted = 'expected {"mark": [u, v], …} in pixels'
             raise TrirailError(f"{command!r} printed {line.strip()[:80]!r}: {error}; {wanted}") from error
         return marks
 
@@ -125,7 +125,7 @@ def folder(
     """
     cv2 = _opencv()
     if not path.is_dir():
-        raise TrirailError(f"{path}: no folder; one is wanted with a picture for each mark, as left.png")
+        raise TrirailError(f"{path}: not a folder; expected one with a picture of each mark, such as left.png")
 
     used: set[Path] = set()
 
@@ -140,7 +140,7 @@ def folder(
             time.sleep(POLL_S)
         pictures = {each.stem: each for each in sorted(path.glob("[!.]*")) if each.suffix.lower() in PICTURES}
         if not pictures:
-            raise TrirailError(f"{path}: no picture in it; wanted is one for each mark, as left.png")
+            raise TrirailError(f"{path}: no picture in it; expected one of each mark, such as left.png")
         wanted = windows or {name: MarkWindow(name) for name in pictures}
         marks: dict[str, tuple[float, float]] = {}
         codes = None if family is None else Codes(family)
@@ -340,7 +340,7 @@ class MarkSource:
 def _device(text: str) -> tuple[str, str]:
     name, equals, device = text.partition("=")
     if not (name and equals and device):
-        raise TrirailError(f"--camera {text}: MARK=DEVICE is wanted, as left=0")
+        raise TrirailError(f"--camera {text}: expected MARK=DEVICE, such as left=0")
     return name, device
 
 
@@ -352,6 +352,6 @@ def _window(text: str) -> tuple[str, MarkWindow]:
         if not (name and equals and min(u, v) >= 0 and min(width, height) > 0):
             raise ValueError  # noqa: TRY301 - the message is made below
     except ValueError:
-        right = "MARK=U,V,WIDTH,HEIGHT is wanted, whole pixels from the corner above on the left, as left=0,0,640,960"
+        right = "expected MARK=U,V,WIDTH,HEIGHT in whole pixels from the upper left corner, such as left=0,0,640,960"
         raise TrirailError(f"--window {text}: {right}") from None
     return name, MarkWindow(picture or name, u, v, width, height)

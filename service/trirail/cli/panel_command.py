@@ -106,6 +106,7 @@ def read_token(file: Path) -> str:
         raise ConfigError(f"{file}: others may read this token (mode {mode:03o}): chmod 600 {file}")
     if not TOKEN.fullmatch(text):
         raise ConfigError(
-            f"{file}: no token: 16 to 128 letters, digits, - and _ are expected; delete the file to have one made"
+            f"{file}: not a valid token: expected 16 to 128 letters, digits, - or _; "
+            "delete the file to create a new one"
         )
     return text

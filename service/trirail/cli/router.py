@@ -56,7 +56,7 @@ def load(path: Path) -> RouterConfig:
         raise ConfigError(f"{path}: {error}") from error
     config = msgspec.structs.replace(config, zenoh=config.zenoh.beside(path.parent))
     if not config.all_robots:
-        raise ConfigError(f"{path}: robots, routers: name one robot at least")
+        raise ConfigError(f"{path}: robots, routers: name at least one robot")
     named = Counter([*config.all_robots, *config.routers, *config.zenoh.users])
     if twice := [name for name, times in named.items() if times > 1]:
         raise ConfigError(f"{path}: robots, routers, zenoh.users: {', '.join(twice)} is given twice: names must differ")

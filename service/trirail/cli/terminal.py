@@ -179,7 +179,8 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
             return wait_for_end()
         except KeyboardInterrupt as second:
             raise ServiceError(
-                f"goal {goal.id} may still be running: the stop was not confirmed; trirail stop stops the robot"
+                f"goal {goal.id} may still be running, since the stop was not confirmed; "
+                "run trirail stop to stop the robot"
             ) from second
 
 

@@ -46,7 +46,7 @@ def run(
     Raises ServiceError where there is no display, no service, no live view, or no such file.
     """
     if file is not None and not file.is_file():
-        raise ServiceError(f"{file} is no file; recordings are .rrd files in the service's telemetry.directory")
+        raise ServiceError(f"{file} is not a file; recordings are .rrd files in the service's telemetry.directory")
     if not web and not has_display():
         raise ServiceError(
             "no display for the viewer: DISPLAY and WAYLAND_DISPLAY are not set; trirail view --web shows it in a "

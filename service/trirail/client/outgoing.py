@@ -102,7 +102,7 @@ def number(value: object, what: str) -> float:
             return _finite(float(plain))
     except (TypeError, ValueError, ArithmeticError):
         pass
-    raise RefusedError(RefusalCode.MALFORMED, f"{what} is {quoted(repr(value))}: a finite number is wanted")
+    raise RefusedError(RefusalCode.MALFORMED, f"{what} is {quoted(repr(value))}: expected a finite number")
 
 
 def seconds(value: object) -> float | None:
@@ -111,7 +111,7 @@ def seconds(value: object) -> float | None:
         return None
     wait = number(value, "timeout")
     if wait < 0.0:
-        raise RefusedError(RefusalCode.MALFORMED, f"timeout is {wait:g} s: 0 or more is wanted, or None for no end")
+        raise RefusedError(RefusalCode.MALFORMED, f"timeout is {wait:g} s: expected 0 or more, or None for no end")
     return wait if wait < threading.TIMEOUT_MAX else None
 
 

@@ -124,7 +124,7 @@ def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
     for key, value in ({"listen": f'["{locator}"]', "live_port": str(live_port)} | PATIENT).items():
         text, count = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
         if count != 1:
-            raise ServiceError(f"{SIM}: {key} was expected once, it is there {count} times")
+            raise ServiceError(f"{SIM}: {key} was expected once, but found {count} times")
     path = folder / SIM.name
     path.write_text(text, encoding="utf-8")
     return path, locator

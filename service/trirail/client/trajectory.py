@@ -42,7 +42,7 @@ def points_of(source: Points) -> tuple[TrajectoryPoint, ...]:
         points = tuple(itertools.starmap(_point_of, enumerate(source)))
     except TypeError as error:
         raise RefusedError(
-            RefusalCode.MALFORMED, f"points: {quoted(repr(source))} is none of these: {POINTS_FORMAT}"
+            RefusalCode.MALFORMED, f"points: {quoted(repr(source))} has no accepted format; expected {POINTS_FORMAT}"
         ) from error
     if why := too_many(len(points)):
         raise RefusedError(RefusalCode.MALFORMED, f"points: {why}")
@@ -56,7 +56,7 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
     values = [] if isinstance(row, str | bytes | Mapping) else list(row)
     if len(values) != len(COLUMNS):
         actual = f"{len(values)} values" if values else quoted(repr(row))
-        raise RefusedError(RefusalCode.MALFORMED, f"points: row {n} is {actual}; wanted are {POINTS_FORMAT}")
+        raise RefusedError(RefusalCode.MALFORMED, f"points: row {n} is {actual}; expected {POINTS_FORMAT}")
     t, x, y, phi = (number(value, f"points: {name} of row {n}") for name, value in zip(COLUMNS, values, strict=True))
     return TrajectoryPoint(t, x, y, phi)
 
@@ -64,7 +64,7 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
 def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
     """Return a function of an id that returns the goal to the first pose of a trajectory."""
     if not points:
-        raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; wanted are {POINTS_FORMAT}")
+        raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; expected {POINTS_FORMAT}")
     x, y, phi = points[0].x, points[0].y, points[0].phi
     return lambda name: PoseGoal(x=x, y=y, phi=phi, id=name)
 
@@ -97,7 +97,7 @@ def _points(path: Path, text: str) -> list[TrajectoryPoint]:
         try:
             return decoded(text, list[TrajectoryPoint])
         except RecursionError as error:
-            raise TrirailError(f"{path}: nested too deep; a list of points is wanted") from error
+            raise TrirailError(f"{path}: nested too deeply; expected a list of points") from error
         except (msgspec.MsgspecError, ValueError) as error:
             raise TrirailError(f"{path}: {quoted(str(error).replace('`', ''))}") from error
     try:
@@ -113,7 +113,7 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
     whole = all(not set(group) & set(names) or set(group) <= set(names) for group in (VELOCITY, ACCELERATION))
     if not set(COLUMNS) <= set(names) <= allowed or len(set(names)) < len(names) or not whole:
         raise TrirailError(
-            f"{path}: line 1: columns {quoted(', '.join(names)) or 'none'}; wanted {', '.join(COLUMNS)}, "
+            f"{path}: line 1: columns {quoted(', '.join(names)) or 'none'}; expected {', '.join(COLUMNS)}, "
             f"and if known {', '.join(VELOCITY)} and {', '.join(ACCELERATION)}, each once"
             + ("; commas separate columns, and numbers have a point" if ";" in "".join(names) else "")
         )

@@ -72,7 +72,9 @@ def reach_rules(zenoh: Zenoh) -> Iterator[Rule]:
 
 def _check_connect(zenoh: Zenoh) -> None:
     if zenoh.tls is not None and zenoh.connect and zenoh.router is None:
-        raise ConfigError("zenoh.connect: with [zenoh.tls] set zenoh.router to the name in the router's certificate")
+        raise ConfigError(
+            "zenoh.connect: where [zenoh.tls] is used, zenoh.router must be the name in the router's certificate"
+        )
 
 
 def _check_router(zenoh: Zenoh) -> None:

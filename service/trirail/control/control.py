@@ -371,7 +371,7 @@ class Control:
             self._commands.end_silent_lease()
             released = self.ledger.release(self.modes.cycle) if self.state.mode is Mode.MOVING else None
             if released is not None:
-                words = f"goal {released.id} of {released.user} is not renewed"
+                words = f"goal {released.id} of {released.user} was not renewed in time"
                 late = coded(words, EventCode.NOT_RENEWED, goal=released.id, user=released.user)
                 self.modes.apply_event(ModeEvent.NOT_RENEWED, late)
             beginning = self.goal_queue.step(self.modes.cycle, self._admit, self._place)
@@ -561,7 +561,7 @@ class Control:
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
-            words = "the measured sliders belong to no pose"
+            words = "the measured slider positions do not correspond to any pose"
             self.modes.trip(coded(words, EventCode.BAD_POSITION), FaultCause.PLACE)
             return False
         self.schedule.commanded = rest(pose)

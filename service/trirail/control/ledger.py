@@ -181,7 +181,10 @@ class Ledger:
         """Update the goal under way by a renewal; announce a target that is out of reach."""
         goal, goal_under_way = request.goal, self.goals[0]
         if goal.target is not None and plan.bound not in (None, goal_under_way.bound):
-            words = f"the target of goal {goal_under_way.id} is beyond the limit of {plan.bound}: the robot waits there"
+            words = (
+                f"the target of goal {goal_under_way.id} is beyond the limit of {plan.bound}; "
+                "the robot waits at the limit"
+            )
             text = coded(words, EventCode.BEYOND_LIMIT, goal=goal_under_way.id)
             self.notices.append(Notice("service", "warning", text.text, user=goal_under_way.user, **text.fields))
         bound = plan.bound or (goal_under_way.bound if goal.target is not None else None)  # a limit is reported once

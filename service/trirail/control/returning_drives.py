@@ -46,7 +46,7 @@ class ReturningDrives:
             words = f"drive {label} is configured; when every drive is, send reset"
             yield "info", coded(words, EventCode.DRIVE_READY, drive=label)
         else:
-            words = f"drive {label} is configured; every drive is: send reset, then enable"
+            words = f"drive {label} is configured, as all drives are now: send reset, then enable"
             yield "info", coded(words, EventCode.DRIVES_READY, drive=label)
         if not feedback.homed[i]:
             words = f"slider {label}: position unknown since its drive was off: send home"

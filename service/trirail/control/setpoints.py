@@ -163,7 +163,8 @@ class Setpoints:
         self._motion[0] = pose or math.nan
         if pose is None or inverse_into(self._legs, self._motion, self._tried):
             raise RefusedError(
-                RefusalCode.SINGULAR, "the measured sliders belong to no pose: move them by hand, then enable"
+                RefusalCode.SINGULAR,
+                "the measured slider positions do not correspond to any pose: move them by hand, then enable",
             )
         if sign_of_det_j2(self._legs, pose) != sign_of_det_j2(self._legs, ZERO_RATES):
             raise RefusedError(

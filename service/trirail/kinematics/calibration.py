@@ -68,7 +68,9 @@ def identify(
     are too few poses, if the starting geometry has no pose near a measured one, or if no geometry fits.
     """
     if len(poses) < MINIMUM:
-        raise CalibrationError(f"{len(poses)} poses are too few: {MINIMUM} are the least, some dozens are good")
+        raise CalibrationError(
+            f"{len(poses)} poses are too few: at least {MINIMUM} are required, and some dozens recommended"
+        )
     for name, value in (("position", position_noise), ("angle", angle_noise)):
         if not (math.isfinite(value) and value > 0.0):
             raise CalibrationError(f"the {name} noise is {value}: it must be finite and positive")

@@ -68,7 +68,7 @@ class Correction:
     def __post_init__(self) -> None:
         nodes = np.array(self.nodes, dtype=np.float64)
         if nodes.ndim != 4 or nodes.shape[3] != 3 or min(nodes.shape[:3]) <= DEGREE:
-            raise KinematicsError(f"a correction has nodes of shape {nodes.shape}: wanted are (l + 3, m + 3, n + 3, 3)")
+            raise KinematicsError(f"a correction has nodes of shape {nodes.shape}: expected (l + 3, m + 3, n + 3, 3)")
         if not (np.isfinite(nodes).all() and all(map(math.isfinite, (*self.low, *self.high)))):
             raise KinematicsError("a correction has a number that is not finite")
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):

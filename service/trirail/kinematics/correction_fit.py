@@ -68,7 +68,8 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
     low, high = room.low, room.high
     if len(poses) < MIN_POSES:
         raise CalibrationError(
-            f"{len(poses)} poses are too few for a map: {MIN_POSES} are the least, a hundred are good"
+            f"{len(poses)} poses are too few for a map: at least {MIN_POSES} are required, "
+            "and about a hundred recommended"
         )
     reached = _reached(geometry, room)
     for name, measured, within in zip(NAMES, poses.T, reached.T, strict=True):

@@ -122,7 +122,7 @@ def warm_up() -> None:
 def _rows(name: str, array: Array) -> int:
     """Return how many rows an array has, 1 if it is one."""
     if array.ndim not in {1, 2} or array.shape[-1] != 3:
-        raise KinematicsError(f"{name} has shape {array.shape}: it must have (3,) or (N, 3)")
+        raise KinematicsError(f"{name} has shape {array.shape}: expected (3,) or (N, 3)")
     return len(array) if array.ndim == 2 else 1
 
 
@@ -131,7 +131,7 @@ def _fill(rows: Array, name: str, value: ArrayLike) -> None:
     try:
         rows[:] = array
     except ValueError as error:
-        message = f"{name} has shape {array.shape}: it must have (3,), or one row for each of {len(rows)}"
+        message = f"{name} has shape {array.shape}: expected (3,), or one row for each of {len(rows)}"
         raise KinematicsError(message) from error
 
 

@@ -201,6 +201,6 @@ def _bus(can: Can, drives: Path) -> Can:
     deadline = time.monotonic() + DRIVES_WITHIN
     while not drives.exists():
         if time.monotonic() > deadline:
-            raise ServiceError(f"the simulated drives are not there within {DRIVES_WITHIN:g} s")
+            raise ServiceError(f"the simulated drives did not start within {DRIVES_WITHIN:g} s")
         time.sleep(LOOK_EVERY)
     return msgspec.structs.replace(can, interface="unix", channel=str(drives))

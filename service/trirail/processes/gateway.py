@@ -226,7 +226,9 @@ class Gateway:
         elif sent.part is None:
             self._requests.check(incoming, user, packed(sent))
         else:
-            problem = f"{NOT_CHECKED}: part: a trajectory that is checked is one message, of {MAX_PART} points at most"
+            problem = (
+                f"{NOT_CHECKED}: part: send a trajectory to be checked as one message of at most {MAX_PART} points"
+            )
             raise RefusedError(RefusalCode.MALFORMED, problem)
 
     def _announce(self, notice: Notice) -> bool:

@@ -243,7 +243,9 @@ class Poses:
         x, y, phi = record["pose"].tolist()
         there = travels(self._geometry, (x, y, phi))[0]
         if not np.abs(there - record["position"] + record["backlash"]).max() <= MAX_CLOSURE_ERROR_M:
-            raise RefusedError(RefusalCode.SINGULAR, "the positions of the sliders belong to no pose: move the sliders")
+            raise RefusedError(
+                RefusalCode.SINGULAR, "the slider positions do not correspond to any pose: move the sliders"
+            )
         return x, y, phi
 
     def _write(self, change: _Change) -> None:

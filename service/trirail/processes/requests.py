@@ -270,5 +270,5 @@ class Looks:
         level: Level = "info" if look.end in SUCCESSFUL_ENDS else "warning"
         text = alignment_event_text(look, in_words(look))
         if not self._announce(Notice("alignment", level, text.text, user=user, alignment=look, **text.fields)):
-            raise RefusedError(RefusalCode.BUSY, "the loop takes no more now: send it again")
+            raise RefusedError(RefusalCode.BUSY, "the loop accepts no more requests at the moment: send it again")
         return look

@@ -137,7 +137,7 @@ class BlackBox:
             # A flood of messages fills the memory before a minute has passed.
             words = (
                 f"black box: messages exceed {MAX_MESSAGES_MB:g} MB; "
-                f"those until t = {self._dropped_at:.1f} s are missing"
+                f"those before t = {self._dropped_at:.1f} s are missing"
             )
             self._warn(coded(words, EventCode.BLACK_BOX_SHORT, until=self._dropped_at))
         fills = [*self._latched.values(), *(kept.fill for kept in heapq.merge(self._records, self._messages))]
