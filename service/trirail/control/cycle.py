@@ -276,7 +276,7 @@ def command(
     target
         Rate at which the law ends.
     furthest : (1,)
-        Greatest time along the path so far [s]. An earlier time is refused.
+        Greatest time along the path up to now [s]. An earlier time is refused.
     begun, end, arrival
         Times along the path at which the current goal begins and ends, and time of the law at which it ends [s].
 

@@ -291,7 +291,7 @@ class Ledger:
     # ------------------------------------------------------------------ commands
 
     def undertake(self, request: CommandRequest, cycle: int) -> None:
-        """Add a command that is to be answered once it is complete."""
+        """Add a command, which is answered once it is complete."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
     @property
