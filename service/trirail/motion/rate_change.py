@@ -55,8 +55,7 @@ class RateChange:
 
     @property
     def lowers_rate(self) -> bool:
-        """Whether the rate falls and no law for it has been applied yet. Such a change does not wait for the planner.
-        """
+        """Whether the rate falls and no law for it is applied yet. Such a change does not wait for the planner."""
         runs = self._schedule.runs
         return not self.applied and bool(runs) and self.rate < max(runs[-1].target, runs[-1].law_state.rate)
 
