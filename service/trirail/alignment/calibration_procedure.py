@@ -1,5 +1,4 @@
-"""Calibration procedures: generators that request looks and motions like those in procedure, and return a calibration.
-"""
+"""Calibration procedures: generators, as in procedure, that request looks and motions and return a calibration."""
 
 from __future__ import annotations
 

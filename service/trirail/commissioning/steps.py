@@ -138,8 +138,7 @@ class Steps:
         return judge_power(name, drift, HOLD_TIME_S, stopped), {"drift": drift}
 
     def move(self, name: str) -> StepOutcome:
-        """Move one slider out and back with only its drive enabled. The person reports which slider moved, and how far.
-        """
+        """Move one slider out and back with only its drive enabled. The person reports which one moved, and how far."""
         index, drives = NAMES.index(name), self._config.drives
         resolution = self._observer.ask_rule_resolution()
         commanded = self._choose_distance(index)
