@@ -1,8 +1,8 @@
 """Smooth map of as-built errors, from the real pose of the platform to the pose for which the legs are solved.
 
 For a real pose p, the configured legs must be solved for q = p + c(p). The correction c is a tensor product of uniform
-cubic B-splines in x, y and phi. It is twice differentiable, so a motion with a continuous acceleration remains one, and
-its coefficients bound its slope. Outside its box, c has the value at the border.
+cubic B-splines in x, y and phi. It is twice differentiable, so a continuous acceleration stays continuous, and its
+coefficients bound its slope. Outside its box, c has the value at the border.
 
 trirail.kinematics.corrected has compiled versions of these functions for motions.
 """
