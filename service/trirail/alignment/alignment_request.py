@@ -1,4 +1,4 @@
-"""Requests that an alignment yields to its driver, and the observations that it receives in return."""
+"""Requests that an alignment yields to its driver, and the observations that it receives in reply."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from trirail.alignment.results import Measurement
 
 
 class StageMotion(NamedTuple):
-    """Request for a motion: to a pose, or with a `tool` a move of that point relative to its measured position."""
+    """Request for a motion to a pose or, with a `tool`, for a move of that point from its measured position."""
 
     by: Triple
-    """Target pose x, y [m], phi [rad] without a tool; else the relative move."""
+    """Target pose x, y [m], phi [rad]; with a tool, the relative move."""
     tool: Pair | None = None
     """Point of the platform in its own frame [m]."""
     approach: Triple | None = None
-    """Offset x, y [m], phi [rad] of an intermediate pose beyond the end, so that backlash stays on one side."""
+    """Offset x, y [m], phi [rad] of an intermediate pose beyond the target, so that backlash stays on one side."""
 
 
 class Observation(NamedTuple):
@@ -29,23 +29,23 @@ class Observation(NamedTuple):
     pose: Triple
     time: float
     sliders: Triple | None = None
-    """Measured positions of the sliders A, B, C [m]; None where they are those of the pose by the geometry."""
+    """Measured positions of the sliders A, B, C [m]; None if they are those that the geometry gives for the pose."""
 
 
 class LookReport(NamedTuple):
-    """Result of one look, for the driver to pass on to the service; it needs no answer."""
+    """Result of one look, which the driver passes on to the service. It needs no answer."""
 
     purpose: Literal["calibration", "alignment", "check"]
     observation: Observation | None = None
-    """None for an end without a look."""
+    """Observation of the look; None if the alignment ends without a look."""
     measurement: Measurement | None = None
-    """None in a calibration, and where the marks do not determine the part's pose."""
+    """Measurement; None in a calibration, and if the marks do not determine the part's pose."""
     correction: Triple | None = None
-    """Motion of the marks' centroid that follows: x, y [m], phi [rad]."""
+    """Next motion of the marks' centroid: x, y [m], phi [rad]."""
     end: str | None = None
-    """Reason of the end, None while the procedure continues."""
+    """Reason why the procedure ends; None while it continues."""
     words: str = ""
-    """Error message, for an end by an error."""
+    """Error message if the procedure ends because of an error."""
     noise: float | None = None
     """Noise of a completed calibration [pixel]."""
 

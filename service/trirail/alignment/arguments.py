@@ -92,7 +92,7 @@ def check_targets(value: object) -> None:
 
 
 def _parse_number(value: object) -> float | None:
-    """Return a number of any library as a Python float; None for truth values, texts and other objects."""
+    """Return a number of any library as a Python float; None for booleans, strings and other objects."""
     if isinstance(value, bool | str | bytes) or not any(hasattr(type(value), n) for n in ("__index__", "__float__")):
         return None
     try:

@@ -1,7 +1,7 @@
-"""Differences between two calibrations of the same cameras, with any part: was a camera moved in between?
+"""Differences between two calibrations of the same cameras, with any part, which show whether a camera was moved.
 
-A single look cannot tell a shifted camera from a shifted part: both show the marks elsewhere. A rotation of the stage
-can, since it moves a mark about the stage's centre by an amount that depends on the mark's real position.
+A single look cannot tell a shifted camera from a shifted part, because both show the marks in other places. A rotation
+of the stage can: it moves a mark about the stage's centre by an amount that depends on the real position of the mark.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class ViewChange(msgspec.Struct, frozen=True):
 
     view: str
     shift: Pair
-    """Displacement of the marks as the saved calibration locates them, x, y [m]."""
+    """Displacement of the marks according to the saved calibration, x, y [m]."""
     shift_deviation: Pair
     """Standard deviations of `shift` [m]."""
     turn: float
-    """Rotation of the picture, from u to v [rad]."""
+    """Rotation of the picture, positive from u to v [rad]."""
     scale: float
     """Relative change of the scale."""
     deviation: float
@@ -78,7 +78,7 @@ def _compare_view(saved: CameraCalibration, current: CameraCalibration, view: st
 
 
 def _place_deviations(calibration: CameraCalibration, view: str) -> Floats:
-    """Return the greatest standard deviations of the places of a view's marks, (2,) [m]."""
+    """Return the greatest standard deviations of the mark positions in a view, (2,) [m]."""
     return np.asarray(np.max([mark.deviation for mark in calibration.marks.values() if mark.view == view], axis=0))
 
 

@@ -1,4 +1,4 @@
-"""Calibration procedures: generators that request looks and motions, as in procedure, and return a calibration."""
+"""Calibration procedures: generators, as in procedure, that request looks and motions and return a calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEFAULT_MOVES: tuple[Triple, ...] = tuple(
     (x * 1e-3, y * 1e-3, math.radians(turn))
     for x, y, turn in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 )
-"""Moves of a calibration: 1 mm and 1°, each both ways, relative to the pose at its start."""
+"""Moves of a calibration relative to its start pose: 1 mm along each axis and 1°, each in both directions."""
 ZERO_OFFSET: Triple = (0.0, 0.0, 0.0)
 PLATFORM_CENTRE: Pair = (0.0, 0.0)
 
@@ -39,10 +39,10 @@ def calibrate_by_moves(
     looks: int = 1,
     approach: Triple | None = None,
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
-    """Look at the present pose and after each move from there, return to it, and calibrate.
+    """Look at the current pose and after each move from there, return to the start, and calibrate.
 
-    With an `approach`, the platform also moves to its present pose from that side first. The other parameters are those
-    of camera_calibration.calibrate.
+    With an `approach`, the platform first reaches its current pose from that side. The other parameters are those of
+    camera_calibration.calibrate.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def calibrate_by_moves(
     first = yield from observe_mean(looks)
     observations = [first]
     yield LookReport("calibration", first)
-    # Checked after the first look, which names the marks, and before any move.
+    # Checked after the first look, which shows the names of the marks, and before any move.
     if views is not None and (unknown := sorted(set(first.marks) - set(views))):
         text = f"marks without a view: {', '.join(unknown)}; name one for each, views names {', '.join(views)}"
         yield LookReport("calibration", end=AlignmentFault.MISSING, words=text)
@@ -84,7 +84,7 @@ def calibrate_by_moves(
 def repeat_calibration(
     saved: CameraCalibration, looks: int = 1
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
-    """Calibrate the same views by the same moves, relative to the present pose."""
+    """Calibrate the same views with the same moves, relative to the current pose."""
     x, y, phi = saved.poses[0]
     moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in saved.poses[1:]]
     views = {name: mark.view for name, mark in saved.marks.items()}

@@ -1,8 +1,8 @@
-"""Calibration of cameras from moves of the stage: the map of each view, and the places of the marks on the table.
+"""Calibration of cameras from moves of the stage: the map of each view, and the positions of the marks on the table.
 
-A mark at q on the platform is at w = t + R(phi) q in the base frame, with the platform at (t, phi). The unknowns of a
-view are its map and the places q of its marks: rotations of the stage determine q, translations determine the map.
-Gauss-Newton starts from the solution that is linear in b, M and M q for small phi.
+A mark at q on the platform is at w = t + R(phi) q in the base frame if the platform is at (t, phi). The unknowns of a
+view are its map and the positions q of its marks. Rotations of the stage determine q, and translations determine the
+map. Gauss-Newton starts from the solution that is linear in b, M and M q for small phi.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ Marks = Mapping[str, Pair]
 MAX_ITERATIONS = 30
 STEP_TOLERANCE = 1e-12
 MIN_TRAVEL_PX = 3.0
-"""Travel over all moves below which marks count as unmoved."""
+"""Travel over all moves below which the marks count as unmoved [pixel]."""
 MAX_RESIDUAL_SHARE = 0.1
-"""Residual of a view, as a share of its marks' travel, above which its pictures do not belong to the moves. One picture
-that is late by a move leaves 0.3 and more of that move, the distortion of a lens a hundredth."""
+"""Residual of a view, as a share of its marks' travel, above which its pictures do not match the moves. One picture
+that is late by a move leaves 0.3 or more of that move; the distortion of a lens leaves a hundredth."""
 MAX_CONDITION = 1e6
 """Condition of the scaled Jacobian above which the moves do not determine all unknowns."""
 
@@ -40,23 +40,23 @@ class CalibrationSample(NamedTuple):
 
 
 class MarkFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Fitted place of a mark of the calibration's part."""
+    """Fitted position of a mark on the calibrated part."""
 
     view: str
     """Name of the view that shows the mark."""
     place: Pair
-    """Position in the platform's frame, from the stage's centre [m]."""
+    """Position in the platform's frame, measured from the stage's centre [m]."""
     deviation: Pair
     """Standard deviations of `place` [m]."""
 
 
 class CameraCalibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Result of a calibration, as it is saved in a file."""
+    """Result of a calibration, in the form in which it is saved to a file."""
 
     views: dict[str, CameraView]
     marks: dict[str, MarkFit]
     noise: float
-    """Standard deviation of a mark's u or v, from the residuals [pixel]."""
+    """Standard deviation of a mark's u or v, computed from the residuals [pixel]."""
     residuals: tuple[dict[str, Pair], ...]
     """Observed minus computed pixels of each look and mark."""
     poses: tuple[tuple[float, float, float], ...]
@@ -64,7 +64,8 @@ class CameraCalibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     covariances: dict[str, tuple[tuple[float, ...], ...]]
     """Covariance of each view's unknowns: b [pixel], M by rows [pixel/m], the lens's bend, its marks' places [m]."""
     confirmed: bool = False
-    """True once a correction with this calibration had the predicted effect; until then corrections are bounded."""
+    """True once a correction with this calibration has had the predicted effect. Until then, corrections are
+    limited."""
     looks: int = 1
     """Pictures averaged in each look; `noise` is the noise of the average."""
 
@@ -251,7 +252,7 @@ class _ViewFit:
         return np.concatenate([solution[2], matrix.ravel(), np.zeros(self.first_place - 6), places.ravel()])
 
     def _scales(self) -> Floats:
-        """Return a unit for each unknown, such that all are about equally well determined."""
+        """Return a unit for each unknown in which all unknowns are about equally well determined."""
         span = max(float(np.ptp(self._seen, axis=0).max()), 1.0)
         travel = max(float(np.ptp(self._t, axis=0).max()), 1e-9)
         turn = max(float(np.ptp(self._phi)), 1e-9)
@@ -260,7 +261,7 @@ class _ViewFit:
         return np.array([span] * 2 + [span / travel] * 4 + bend + places)
 
     def _project(self, x: Points) -> Points:
-        """Return the computed pixels, (n, 2), for complex unknowns as well."""
+        """Return the computed pixels, (n, 2). The unknowns may be complex."""
         # One expression for all poses: the Jacobian calls this once per unknown and iteration.
         places = x[self.first_place :].reshape(-1, 2)
         q = places[self._mark_index]
@@ -270,7 +271,7 @@ class _ViewFit:
         return project_with(at, self._origin(places[0]), x[:2], x[2:6].reshape(2, 2), bend, self._lens)
 
     def _jacobian(self, x: Floats) -> Floats:
-        """Return the derivatives of the computed pixels, by a complex step, which has no cancellation."""
+        """Return the derivatives of the computed pixels, using a complex step, which has no cancellation."""
         step = 1e-20
         columns = [self._project(x + 1j * step * axis).imag.ravel() / step for axis in np.eye(len(x))]
         return np.stack(columns, axis=1)

@@ -1,8 +1,8 @@
-"""Marks that carry their name: ArUco and AprilTag codes, found by OpenCV and placed by the fit of their shape.
+"""Marks that show their own name: ArUco and AprilTag codes. OpenCV finds them, and a fit of their shape locates them.
 
-Two round marks can be taken for each other, two codes cannot. OpenCV's detector (Garrido-Jurado et al. 2014, Automatic
-generation and detection of highly reliable fiducial markers under occlusion) reads the number and gives the corners;
-the fit of trirail.alignment.finding, of all edges of the code, then gives the place.
+Two round marks can be mistaken for each other, but two codes cannot. OpenCV's detector (Garrido-Jurado et al. 2014,
+Automatic generation and detection of highly reliable fiducial markers under occlusion) reads the number and gives the
+corners. trirail.alignment.finding then fits all edges of the code to obtain its position.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.shapes import MarkShape
 
 MAX_SKEW = 0.1
-"""Greatest relative difference of a code's sides in a picture: a mark on the table is seen nearly from above."""
+"""Greatest relative difference between a code's sides in a picture. Marks on the table are seen nearly from above."""
 
 
 class CodedMark(NamedTuple):
-    """A code that was found."""
+    """Code that has been found in a picture."""
 
     number: int
     mark: DetectedMark
-    """Place of its middle; `turn` is the direction of its upper side, sizes are in sides as OpenCV saw them."""
+    """Position of the middle of the code. `turn` is the direction of its upper side; sizes are relative to OpenCV's
+    side."""
     side: float
     """Side of the code with its border [pixel]."""
 
@@ -43,11 +44,11 @@ def code_shape(family: CodeFamily, number: int, side: float) -> MarkShape:
 
 
 def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMark]:
-    """Return the codes of a family in a grey picture, (rows, columns), each number once.
+    """Return the codes of a family in a grey picture, (rows, columns). Each number occurs once.
 
-    A code that is there twice is ambiguous, and left out. The picture may be a mirror image of the table: it is read
-    both ways, and the way that shows more codes counts, since some codes are their own mirror images. Raises
-    ImportError without OpenCV.
+    A code that appears twice is ambiguous and is left out. The picture may be a mirror image of the table. It is
+    therefore read in both orientations, and the one that shows more codes is used, because some codes are their own
+    mirror images. Raises ImportError without OpenCV.
     """
     grey = np.ascontiguousarray(picture, np.uint8)
     detections, reflected = _detect(grey, family), _detect(grey[:, ::-1], family)
@@ -85,7 +86,7 @@ def _detect(grey: NDArray[np.uint8], family: CodeFamily) -> list[tuple[int, Floa
 
 
 def _mirrored(corners: Floats, columns: int) -> Floats:
-    """Return corners of the mirrored picture in the picture itself."""
+    """Convert corners in the mirrored picture to the original picture."""
     return np.column_stack([columns - 1.0 - corners[:, 0], corners[:, 1]])
 
 
@@ -94,7 +95,7 @@ def _detector(family: CodeFamily) -> Any:
     cv2 = importlib.import_module("cv2")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    # A corrected bit may turn the mirror image of one code into another: a name is worth more than a look.
+    # A corrected bit may turn the mirror image of one code into another. A wrong name is worse than a missed code.
     parameters.errorCorrectionRate = 0.0
     return cv2.aruco.ArucoDetector(_dictionary(family), parameters)
 

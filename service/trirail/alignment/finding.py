@@ -18,7 +18,7 @@ from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.shapes import MarkShape, brightness
 
 MIN_CORRELATION = 0.5
-"""Correlation from which a place is a candidate for the mark."""
+"""Correlation above which a place is a candidate for the mark."""
 MIN_EXPLAINED_SHARE = 0.8
 """Share of the picture's variation that the fitted mark must explain."""
 MIN_CONTRAST_SHARE = 0.02
@@ -51,7 +51,7 @@ class DetectedMark(NamedTuple):
 
 
 def find(picture: NDArray[np.generic], shape: MarkShape, turn: float = 0.0) -> DetectedMark | None:
-    """Return the mark that is most similar to a shape, None if there is none.
+    """Return the mark that is most similar to a shape; None if there is none.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def _render(shape: MarkShape, u: Floats, v: Floats, x: Floats) -> Floats:
 
 
 def _search(grey: Floats, shape: MarkShape, turn: float) -> tuple[float, float] | None:
-    """Return the pixel u, v of the greatest correlation with the shape, None if that is too small."""
+    """Return the pixel u, v with the greatest correlation with the shape; None if the correlation is too small."""
     side = 2 * math.ceil(shape.size * (0.5 + WINDOW_MARGIN)) + 1
     half = side // 2
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
@@ -121,7 +121,7 @@ def _window_sums(values: Floats, side: int) -> Floats:
 
 
 def fit_at(grey: Floats, shape: MarkShape, start: tuple[float, float], turn: float) -> DetectedMark | None:
-    """Return the mark fitted from a start pixel u, v, None if the fit does not look like the mark."""
+    """Return the mark fitted from a start pixel u, v; None if the fit does not resemble the mark."""
     half = shape.size * (0.5 + WINDOW_MARGIN)
     mu, mv = _window_offset(shape, turn)
     rows, columns = grey.shape

@@ -1,8 +1,9 @@
-"""Capture of pictures that belong to the current pose: checked, averaged, and separated from stale ones.
+"""Capture of pictures that show the current pose. Pictures are checked, averaged, and separated from stale ones.
 
-Between two looks the platform moves by a measured amount, and the calibration predicts the displacement of each mark.
-A picture that shows the marks elsewhere was taken before the motion (a camera's buffer), or the calibration no longer
-belongs to this camera. A single look cannot separate these two cases, a further picture can: a late camera catches up.
+Between two looks, the platform moves by a measured amount, and the calibration predicts the displacement of each mark.
+A picture that shows the marks elsewhere was either taken before the motion, because the camera buffers pictures, or the
+calibration no longer matches the camera. A single look cannot distinguish these cases. A further picture can, because a
+late camera catches up.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from trirail.alignment.rigid_motion import Floats, rotation_matrix
 from trirail.errors import AlignmentError, AlignmentFault
 
 MAX_STALE_PICTURES = 5
-"""Pictures that contradict the motion before them, after which the capture ends. Video drivers buffer 1 to 4."""
+"""Number of pictures contradicting the motion after which the capture ends. Video drivers buffer 1 to 4 pictures."""
 NOISE_DEVIATIONS = 4.0
 """Root mean square errors of a place in the plane beyond which noise does not explain a difference: 1 in 10^7."""
 MAX_MISS_SHARE = 0.2
-"""Share of a motion by which a mark may miss its predicted place. A camera turned by 5°, an error of 5 % in scale, or
-one of 5 mm in the centre of rotation causes a miss of up to a tenth."""
+"""Share of a motion by which a mark may miss its predicted position. A camera turned by 5°, an error of 5 % in
+scale, or an error of 5 mm in the centre of rotation causes a miss of up to a tenth."""
 MIN_TRAVEL_SHARE = 0.5
 """Share of its predicted travel below which a mark counts as unmoved."""
 
 
 class PictureFit(NamedTuple):
-    """Agreement of pictures with the motion before them."""
+    """Agreement of pictures with the preceding motion."""
 
     pictures: Sequence[Observation]
     explained: bool
@@ -68,7 +69,7 @@ def validate_picture(picture: Observation) -> Observation:
 
 
 def average(pictures: Sequence[Observation]) -> Observation:
-    """Return the mean of pictures; the mean of a mark is over those that show it."""
+    """Return the mean of pictures. The mean of a mark is taken over the pictures that show it."""
     seen: dict[str, list[Pair]] = {}
     for each in pictures:
         for name, pixel in each.marks.items():
@@ -124,7 +125,7 @@ def is_consistent(
 
 
 def observe_mean(count: int) -> Generator[AlignmentRequest, Observation, Observation]:
-    """Return the mean of `count` pictures; the mean of a mark is over those that show it."""
+    """Return the mean of `count` pictures. The mean of a mark is taken over the pictures that show it."""
     return average((yield from capture(count)))
 
 

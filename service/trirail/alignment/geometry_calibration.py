@@ -1,7 +1,7 @@
-"""Calibration of a stage by its own cameras: procedure, result, and the parameters that remain undetermined.
+"""Calibration of a stage with its own cameras: procedure, result, and the parameters that remain undetermined.
 
-A procedure as those of trirail.alignment.procedure: it looks at a few poses near the present one, estimates cameras and
-marks, plans the other poses over the whole travel, looks there, and fits everything together.
+The procedure is a generator like those of trirail.alignment.procedure. It looks at a few poses near the current one,
+estimates cameras and marks, plans more poses over the whole travel, looks there, and fits everything together.
 """
 
 from __future__ import annotations
@@ -33,46 +33,46 @@ from trirail.kinematics.robot import inverse
 
 DEFAULT_POSES, MIN_POSES = 30, 12
 GRID = 7
-"""Number of places along x, y and phi from which poses are chosen."""
+"""Number of values of x, y and phi from which poses are chosen."""
 TRAVEL_SHARE = 0.97
-"""Share of the travel that is used: the configured geometry may be wrong by a little."""
+"""Share of the travel that is used, because the configured geometry may be slightly wrong."""
 HELD_OUT = 5
-"""One of this many planned looks is held out of a fit, as a check of its predictions."""
+"""One of this many planned looks is left out of a fit, to check its predictions."""
 MIN_FIRST_LOOKS = 5
-"""First looks, of seven, that must show a mark for it to count."""
+"""Number of the seven first looks in which a mark must be visible to be used."""
 MAX_LEFT_OUT = 2
-"""Looks of the first moves that may be wrong."""
+"""Greatest number of looks of the first moves that may be wrong."""
 MAX_START_RESIDUAL_PX, MAX_START_SHARE = 1.0, 0.01
-"""Residual up to which the first looks count as right: pixels, and share of a mark's travel."""
+"""Residual up to which the first looks count as correct: in pixels, and as a share of a mark's travel."""
 SYSTEMATIC = 1.5
-"""Residual from which the looks are systematically off, in noises of the pictures."""
+"""Ratio of residual to picture noise above which the looks have systematic errors."""
 MIN_NAMED_SHARE = 0.3
-"""Share of a parameter in an undetermined combination, in units of its doubt, for it to be named."""
+"""Least share of a parameter in an undetermined combination, in units of its doubt, to name it."""
 
 
 class HeldOutResidual(NamedTuple):
-    """Distance of marks from their computed places in looks that the fit did not use, root mean square."""
+    """Root mean square distance of marks from their computed positions, in looks that the fit did not use."""
 
     looks: int
     before: float
-    """With the configured geometry, and cameras and marks fitted to it [pixel]."""
+    """Distance with the configured geometry, and with cameras and marks fitted to it [pixel]."""
     after: float
-    """With the calibrated geometry [pixel]."""
+    """Distance with the calibrated geometry [pixel]."""
     before_m: float
-    """The same on the table [m]."""
+    """Distance with the configured geometry, on the table [m]."""
     after_m: float
 
 
 class Outlier(NamedTuple):
-    """A mark that was seen where it cannot have been; it is not in the fit."""
+    """Mark that was seen where it cannot have been. The fit does not use it."""
 
     look: int
-    """Number of the look, from 1."""
+    """Number of the look, counted from 1."""
     mark: str
     distance: float
-    """From its computed pixel [pixel]."""
+    """Distance from its computed pixel [pixel]."""
     swapped_with: str | None
-    """The mark at whose computed pixel it was seen."""
+    """Mark at whose computed pixel this mark was seen."""
 
 
 class GeometryCalibration(NamedTuple):
@@ -80,29 +80,30 @@ class GeometryCalibration(NamedTuple):
 
     geometry: Geometry
     scales: Triple
-    """Real way of each slider for a metre by its encoder, less 1: new counts_per_metre are the old ones / (1 + it)."""
+    """Real travel of each slider per metre of its encoder, minus 1. Divide counts_per_metre by 1 plus this value."""
     parameters: dict[str, float]
-    """Corrections to the configured values by their names, as "A rail_angle" [m, rad, share]."""
+    """Corrections to the configured values, by names such as "A rail_angle" [m, rad, share]."""
     deviations: dict[str, float]
-    """Standard deviations of the same; infinite for undetermined parameters."""
+    """Standard deviations of these corrections; infinite for undetermined parameters."""
     undetermined: tuple[str, ...]
-    """Names of the parameters that the looks do not determine, or only in combination with others; each undetermined
-    combination stays as configured."""
+    """Names of the parameters that the looks do not determine, or determine only in combination with others.
+    Undetermined combinations keep their configured values."""
     residual: HeldOutResidual
     noise: float
-    """Standard deviation of a mark's u or v, from the residuals [pixel]."""
+    """Standard deviation of a mark's u or v, computed from the residuals [pixel]."""
     picture_noise: float
-    """The same from the pictures alone, at rest [pixel]; a greater `noise` means errors that no geometry explains."""
+    """Standard deviation from the pictures alone, at rest [pixel]. If `noise` is greater, no geometry explains the
+    rest."""
     cameras: CameraCalibration
     """Cameras and marks in the frame of the new geometry."""
     outliers: tuple[Outlier, ...]
     looks: tuple[StageLook, ...]
     map: ResidualMap | None
-    """Map of what remains after the fit; None where the looks are not systematically off, or too few for a map."""
+    """Map of the errors that remain after the fit; None if they are not systematic, or if there are too few looks."""
 
     @property
     def is_systematic(self) -> bool:
-        """True if the marks are off by more than their noise: by errors that no geometry explains."""
+        """True if the errors of the marks exceed their noise, because of errors that no geometry explains."""
         return self.noise > SYSTEMATIC * self.picture_noise
 
 
@@ -170,14 +171,14 @@ def calibrate_geometry(task: GeometryTask) -> Generator[AlignmentRequest, Observ
 
 
 class _Scatter:
-    """Scatter of the marks between the pictures of a look, at rest."""
+    """Scatter of the marks at rest, between the pictures of a look."""
 
     def __init__(self) -> None:
         self._squares: list[float] = []
         self._pictures = 1
 
     def add(self, pictures: Sequence[Observation]) -> None:
-        """Take the pictures of a look."""
+        """Add the pictures of a look."""
         self._pictures = len(pictures)
         for name in {name for each in pictures for name in each.marks}:
             seen = np.array([each.marks[name] for each in pictures if name in each.marks])
@@ -230,7 +231,7 @@ def start_model(task: GeometryTask, looks: Sequence[StageLook]) -> tuple[StageMo
 
 
 def _first_calibration(samples: Sequence[CalibrationSample], views: Mapping[str, str]) -> CameraCalibration:
-    """Return the calibration by as many of the samples as belong together. Raises AlignmentError."""
+    """Return the calibration from as many of the samples as match each other. Raises AlignmentError."""
     failure: AlignmentError | None = None
     for left_out in range(MAX_LEFT_OUT + 1):
         fits: list[CameraCalibration] = []
@@ -251,11 +252,11 @@ def _first_calibration(samples: Sequence[CalibrationSample], views: Mapping[str,
 
 
 def _allowed_residual(samples: Sequence[CalibrationSample]) -> float:
-    """Return the residual up to which the first looks count as right [pixel]."""
+    """Return the residual up to which the first looks count as correct [pixel]."""
     spreads = []
     for name in {name for sample in samples for name in sample.marks}:
         seen = np.array([sample.marks[name] for sample in samples if name in sample.marks])
-        # The median: one mark that is elsewhere must not raise it.
+        # Use the median, so that a single misplaced mark does not raise the limit.
         spreads.append(float(np.median(np.linalg.norm(seen - np.median(seen, axis=0), axis=1))))
     return max(MAX_START_RESIDUAL_PX, MAX_START_SHARE * max(spreads))
 
@@ -340,7 +341,7 @@ def _undetermined(model: StageModel, fit: StageFit) -> tuple[str, ...]:
 
 
 def _used(looks: Sequence[StageLook], fit: StageFit) -> list[StageLook]:
-    """Return the looks without outliers."""
+    """Return the looks with outliers removed."""
     used = {each for each, is_used in zip(list_marks(looks), fit.used.tolist(), strict=True) if is_used}
     return [
         look._replace(marks={name: pixel for name, pixel in look.marks.items() if (number, name) in used})
@@ -393,7 +394,7 @@ def _outliers(fit: StageFit, looks: Sequence[StageLook]) -> tuple[Outlier, ...]:
 def calibrated_cameras(
     model: StageModel, fit: StageFit, looks: Sequence[StageLook], pictures: int
 ) -> CameraCalibration:
-    """Return cameras and marks as trirail.alignment.procedure.align takes them."""
+    """Return cameras and marks in the form that trirail.alignment.procedure.align takes."""
     state, poses = model.state(fit.unknowns), model.poses(fit.unknowns, looks)
     marks, covariances = {}, {}
     every = np.arange(model.size)

@@ -26,7 +26,7 @@ NEWTON_ITERATIONS = 20
 
 
 class CameraView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Projection of a camera at one place, which shows one or more marks."""
+    """Projection of a camera at one place. It shows one or more marks."""
 
     origin: Pair
     """Point o of the table's plane [m]."""
@@ -100,7 +100,7 @@ def projection_jacobians(view: CameraView, points: Points) -> NDArray[np.float64
 
 
 def _undistort(distorted: Points, k: float) -> Points:
-    """Return d for given d (1 + k |d|²), by Newton's method on the length of d."""
+    """Return d for given d (1 + k |d|²), using Newton's method on the length of d."""
     length = np.linalg.norm(distorted, axis=1)
     d = length.copy()
     for _ in range(NEWTON_ITERATIONS):

@@ -1,4 +1,4 @@
-"""Misalignment of a part, from the pixels of its marks and of their targets."""
+"""Misalignment of a part, computed from the pixels of its marks and of their targets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Misalignment(NamedTuple):
     """Targets of these marks in the base frame, (n, 2) [m]."""
     motion: RigidMotion
     distance: float
-    """Relative error of the worst distance between two marks."""
+    """Relative error of the distance between two marks, for the worst pair."""
 
     @property
     def distances(self) -> Floats:

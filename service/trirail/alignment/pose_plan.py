@@ -1,10 +1,10 @@
-"""Plan of poses whose looks determine a stage best: optimal by the information matrix, one pose after the other.
+"""Plan of the poses whose looks determine a stage best. Poses are chosen one after the other by the information matrix.
 
-The information of looks is A = sum J' J, with J the derivatives of the pixels by the unknowns in standard deviations.
-The mean variance of a mark's computed pixel over the travel is trace(Q A^-1), Q the mean of J' J over all candidates:
-the I-optimal (or V-optimal) design (Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, 10.6). It does not
-depend on the frames, as pixels do not, and is what an alignment anywhere in the travel needs. Greedy: each next pose is
-the candidate that lowers the mean variance most.
+The information of looks is A = sum J' J, where J contains the derivatives of the pixels with respect to the unknowns,
+in standard deviations. The mean variance of a mark's computed pixel over the travel is trace(Q A^-1), where Q is the
+mean of J' J over all candidates. This is the I-optimal (or V-optimal) design (Atkinson, Donev and Tobias, Optimum
+Experimental Designs, 2007, 10.6). It does not depend on the frames, because pixels do not, and it is what an alignment
+anywhere in the travel needs. The choice is greedy: each next pose is the candidate that lowers the mean variance most.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.stage_model import StageLook, StageModel, StageState, carry
 
 FIELD_MARGIN = 0.03
-"""Share of a picture at each border that no planned mark enters: the first estimate does not know the lens yet."""
+"""Share of a picture at each border that planned marks avoid, because the first estimate does not include the lens."""
 WEAK_PRIOR = 1e-6
 """Information of each unknown before the first look, as a share of the greatest of all candidates."""
 
 
 class Candidate(NamedTuple):
-    """A pose that the stage reaches, and the marks that the cameras see there."""
+    """Pose that the stage can reach, and the marks that the cameras see there."""
 
     look: StageLook
     jacobian: Floats
-    """Derivatives of the marks' pixels by the unknowns, (2 marks, size)."""
+    """Derivatives of the marks' pixels with respect to the unknowns, (2 marks, size)."""
 
 
 def find_candidates(
@@ -76,7 +76,7 @@ def choose_poses(
     count: int,
     noise: float,
 ) -> list[StageLook]:
-    """Return `count` candidates, each the one that lowers the mean variance over all candidates most."""
+    """Choose `count` candidates in turn, each the one that lowers the mean variance over all candidates most."""
     every = np.concatenate([each.jacobian for each in candidates])
     scales = np.maximum(np.linalg.norm(every, axis=0), 1e-300)
     jacobians = [each.jacobian / scales / noise for each in candidates]

@@ -63,7 +63,8 @@ MAX_UNCONFIRMED_TRAVEL = 2.0
 """Greatest travel of a mark in the first correction with an unconfirmed calibration, as a multiple of its travel in the
 calibration's moves."""
 NOISE_LIMIT_DEVIATIONS = 2.0
-"""Standard deviations of a look within which an error is not corrected further if its noise exceeds the tolerance."""
+"""Number of standard deviations of a look within which an error is not corrected, if the noise exceeds the
+tolerance."""
 CONFIRMATION_SHARE = 0.2
 """Greatest miss of the predicted remaining error, as a share of the correction, with which it confirms the
 calibration."""
@@ -110,15 +111,15 @@ AlignmentProcedure = Generator[AlignmentRequest, Observation, Alignment]
 def align(task: AlignmentTask) -> AlignmentProcedure:
     """Measure and correct until the part is within tolerance, no correction is left, or the error grows.
 
-    A look after a correction counts if the correction explains it. With an approach, the platform also moves to its
-    present pose from that side before the first look.
+    A look after a correction counts only if the correction explains it. With an approach, the platform first reaches
+    its current pose from that side.
 
     Raises
     ------
     RefusedError
         An argument is invalid.
     AlignmentError
-        The looks do not determine the part's pose; no motion follows from such a look.
+        The looks do not determine the part's pose. Such a look causes no motion.
     """
     task.check()
     measurements: list[Measurement] = []
@@ -134,7 +135,7 @@ def align(task: AlignmentTask) -> AlignmentProcedure:
             confirmed = confirmed or (explained and _is_as_predicted(task, measurements, corrections[-1].share))
         end = _end_reason(task, measurements, misalignment.deviations(task.noise_share))
         if end is not None:
-            # Pictures that no motion explains may be old ones: they must not report success.
+            # Pictures that no motion explains may be stale, so they must not report success.
             if end is AlignmentEnd.REACHED and not explained:
                 raise (yield from _report_stale(look))
             yield LookReport("alignment", look, measurement, end=end)
@@ -171,9 +172,10 @@ def measure_part(task: AlignmentTask) -> Generator[AlignmentRequest, Observation
 
 
 def _measure_first(task: AlignmentTask) -> Generator[AlignmentRequest, Observation, tuple[Observation, Misalignment]]:
-    """Return the first look, which no motion can show to be new, and the misalignment.
+    """Return the first look and its misalignment. No motion can show that the first look is new.
 
-    A look that shows an aligned part is compared with further pictures: a late camera shows the part before it.
+    A look that shows an aligned part is compared with further pictures, because a late camera still shows an earlier
+    state.
     """
     pictures = yield from fresh_pictures.capture(task.looks)
     for _ in range(fresh_pictures.MAX_STALE_PICTURES):
@@ -214,7 +216,7 @@ def _measure_again(
 
 
 def _report_stale(look: Observation) -> Generator[AlignmentRequest, Observation, AlignmentError]:
-    """Report that the pictures do not show the robot's present pose; return the error to raise."""
+    """Report that the pictures do not show the robot's current pose. Return the error to raise."""
     words = (
         f"{fresh_pictures.MAX_STALE_PICTURES} pictures do not show the marks where the motion put them; take a new "
         "picture at each look (a camera's buffer holds old ones), or remove backlash with an approach"

@@ -1,7 +1,8 @@
-"""Map of the errors that remain after a calibration of the geometry, from the same looks.
+"""Map of the errors that remain after a calibration of the geometry, computed from the same looks.
 
-A look shows the platform's pose by its marks, without any leg: the rigid motion from their places on the platform to
-where the cameras see them. trirail.kinematics.correction_fit makes the map of these poses.
+The marks in a look show the pose of the platform independently of the legs: it is the rigid motion from their positions
+on the platform to the positions at which the cameras see them. trirail.kinematics.correction_fit makes the map from
+these poses.
 """
 
 from __future__ import annotations
@@ -22,24 +23,24 @@ from trirail.kinematics.geometry import Geometry, Room
 
 MIN_MARKS = 2
 CELLS = (2, 2, 2)
-"""Cells of the map: 30 to 60 looks determine no more."""
+"""Number of cells of the map along x, y and phi. 30 to 60 looks cannot determine more."""
 MAX_LEFT_SHARE = 0.8
-"""Share of the errors at held-out looks that a map may leave to be offered."""
+"""Share of the errors at held-out looks above which the map is not offered."""
 
 
 class ResidualMap(NamedTuple):
-    """A correction map, and how well it predicts looks that were held out of it."""
+    """Correction map, and how well it predicts looks that were held out of the fit."""
 
     correction: Correction
     looks: int
     before: tuple[float, float]
-    """Pose errors without the map, root mean square: of x and y [m], of phi [rad]."""
+    """Root mean square pose errors without the map: of x and y [m], and of phi [rad]."""
     after: tuple[float, float]
-    """Pose errors at each look by maps that were made without it, root mean square."""
+    """Root mean square pose errors at each look, with maps that were fitted without this look."""
 
     @property
     def helps(self) -> bool:
-        """True if the errors at held-out looks are clearly smaller with the map, in position or angle."""
+        """True if the map clearly reduces the errors at held-out looks, in position or angle."""
         place, angle = (after / max(before, 1e-15) for before, after in zip(self.before, self.after, strict=True))
         return min(place, angle) < MAX_LEFT_SHARE and max(place, angle) <= 1.0
 
@@ -61,7 +62,7 @@ def fit_residual_map(
 
 
 def _pose(state: StageState, view_of: Mapping[str, str], look: StageLook) -> Floats:
-    """Return the platform's pose by the marks alone, (3,) [m, rad]."""
+    """Return the pose of the platform according to the marks alone, (3,) [m, rad]."""
     places = np.array([state.places[name] for name in look.marks])
     seen = [locate_pixels(state.views[view_of[name]], np.array([pixel]))[0] for name, pixel in look.marks.items()]
     motion = fit_rigid_motion(places, np.array(seen))

@@ -1,4 +1,4 @@
-"""Result of an alignment: the measurements, the corrections between them, and the reason of its end."""
+"""Result of an alignment: the measurements, the corrections between them, and the reason why it ended."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from trirail.alignment.rigid_motion import Floats
 
 
 class AlignmentEnd(StrEnum):
-    """Reason of an alignment's end."""
+    """Reason why an alignment ended."""
 
     REACHED = "reached"
     """Every mark and the part's angle are within tolerance."""
     CORRECTIONS = "corrections"
-    """The allowed number of corrections is used up."""
+    """The allowed number of corrections has been used."""
     GROWING = "growing"
-    """A correction increased the error: a wrong sign, a mirrored picture, or a camera that was moved."""
+    """A correction increased the error, because of a wrong sign, a mirrored picture, or a camera that was moved."""
     NOISE = "noise"
     """The noise of a look exceeds the tolerance, and the remaining error is within that noise."""
 
@@ -34,7 +34,7 @@ class Measurement(msgspec.Struct, frozen=True):
     errors: dict[str, Pair]
     """Displacement of each mark to its target, x, y in the base frame [m]."""
     worst: float
-    """Greatest distance of a mark's travel in the motion that aligns the part [m]."""
+    """Greatest distance that a mark travels in the motion that aligns the part [m]."""
     shift: Pair
     """Displacement of the marks' centroid to its target [m]."""
     turn: float
@@ -42,7 +42,7 @@ class Measurement(msgspec.Struct, frozen=True):
     misfit: float
     """Greatest distance of a mark from its target after the best rigid motion [m]."""
     distance: float
-    """Relative error of the worst distance between two marks."""
+    """Relative error of the distance between two marks, for the worst pair."""
     pose: Triple
     """Measured pose of the platform: x, y [m], phi [rad]."""
     time: float
@@ -50,18 +50,18 @@ class Measurement(msgspec.Struct, frozen=True):
 
 
 class AlignmentCorrection(msgspec.Struct, frozen=True):
-    """A completed correction motion."""
+    """Correction motion that has been completed."""
 
     by: Triple
     """Motion of the marks' centroid: x, y [m]; phi [rad]."""
     share: float
-    """Share of the measured error: below 1 for the first correction with an unconfirmed calibration."""
+    """Corrected share of the measured error. It is below 1 for the first correction with an unconfirmed calibration."""
     seconds: float
-    """Time from the look before it until the robot is at rest."""
+    """Time from the preceding look until the robot is at rest [s]."""
 
 
 class Alignment(msgspec.Struct, frozen=True):
-    """Course of an alignment; it has one more measurement than corrections."""
+    """History of an alignment. It has one more measurement than corrections."""
 
     why: AlignmentEnd
     measurements: tuple[Measurement, ...]

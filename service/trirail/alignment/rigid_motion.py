@@ -89,9 +89,9 @@ def worst_distance_error(points: Floats, targets: Floats) -> float:
 
 
 def find_swap(points: Floats, targets: Floats) -> tuple[int, ...] | None:
-    """Return the order in which the points are much nearer to their targets, None if it is their own.
+    """Return the order of the points that is much closer to the targets; None if it is their own order.
 
-    The points of a part that is turned by less than 90° are nearest in their own order.
+    The points of a part that is turned by less than 90° are closest in their own order.
     """
     if len(points) > MAX_PERMUTED_MARKS:
         return None

@@ -22,11 +22,11 @@ class MarkShape(NamedTuple):
 
     kind: MarkKind
     size: float
-    """Diameter of a disc, length of a cross's bars, side of a corner's square or of a code with its border."""
+    """Diameter of a disc, length of a cross's bars, or side of a corner's square or of a code with its border."""
     width: float = 0.0
     """Width of a cross's bars; 0 means a fifth of their length."""
     cells: tuple[tuple[int, ...], ...] = ()
-    """Rows of a code's cells with its border, from v to greater v: 1 for ink, 0 for ground."""
+    """Rows of a code's cells with its border, in the direction of v: 1 for ink, 0 for ground."""
 
     @property
     def bar_width(self) -> float:

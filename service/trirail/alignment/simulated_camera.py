@@ -1,4 +1,4 @@
-"""A simulated camera, which renders the marks of a part on the table at the robot's real pose."""
+"""Simulated camera that renders the marks of a part on the table at the robot's real pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_BRIGHTNESS = 255
 
 
 class DrawnMark(NamedTuple):
-    """A mark of the part on the table."""
+    """Mark of a part on the table."""
 
     shape: MarkShape
     """Shape, in metres."""
@@ -28,10 +28,11 @@ class DrawnMark(NamedTuple):
 
 
 class SimulatedCamera(NamedTuple):
-    """A camera's projection, its marks, and the imperfections of its pictures.
+    """Projection of a camera, its marks, and the imperfections of its pictures.
 
-    Light falls off towards the corners by a share `shade`; `noise` is the standard deviation of a pixel's brightness,
-    of 255. A picture is exposed for `exposure` seconds, which end `delay` seconds before it is read.
+    Light falls off towards the corners by a share `shade`. `noise` is the standard deviation of a pixel's brightness,
+    on a scale of 255. A picture is exposed for `exposure` seconds; the exposure ends `delay` seconds before the picture
+    is read.
     """
 
     view: CameraView
@@ -48,7 +49,7 @@ class SimulatedCamera(NamedTuple):
     delay: float = 0.0
 
     def picture(self, pose_at: Callable[[float], Triple], time: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Return the grey picture read at a time [s], (rows, columns); `pose_at` gives the robot's pose at a time."""
+        """Return the grey picture read at a time [s], (rows, columns). `pose_at` gives the robot's pose at a time."""
         end = time - self.delay
         if self.exposure > 0.0:
             instants = end - self.exposure * (np.arange(EXPOSURE_SAMPLES) + 0.5) / EXPOSURE_SAMPLES
@@ -77,7 +78,7 @@ class SimulatedCamera(NamedTuple):
             at = to_base_frame(mark.place, pose)[None]
             (u, v), jacobian = project_points(self.view, at)[0], projection_jacobians(self.view, at)[0]
             reach = 1.5 * mark.shape.size * float(np.abs(jacobian).max()) + 5.0 * self.blur
-            # Only the window around a mark is rendered: beyond five blurs from its edges it adds nothing.
+            # Only the window around a mark is rendered. Beyond five blurs from its edges, a mark adds nothing.
             top, bottom = (int(np.clip(v + d, 0, self.rows)) for d in (-reach, reach + 1))
             left, right = (int(np.clip(u + d, 0, self.columns)) for d in (-reach, reach + 1))
             if top >= bottom or left >= right:

@@ -1,8 +1,8 @@
-"""Robust fit of a stage model to looks: outliers are left out, undetermined combinations stay as configured.
+"""Robust fit of a stage model to looks. Outliers are left out, and undetermined combinations keep configured values.
 
-The residuals are weighed by their own noise, estimated from their median. A first fit with a soft loss (soft l1,
-Triggs et al. 2000, Bundle Adjustment, 4.3) finds the outliers; the last one is least squares without them. In both the
-drawings count as one more observation of each correction, with the doubts of trirail.alignment.stage_model.
+The residuals are weighted by their own noise, which is estimated from their median. A first fit with a soft loss (soft
+l1, Triggs et al. 2000, Bundle Adjustment, 4.3) finds the outliers. The last fit is least squares without them. In both
+fits, the drawings count as one more observation of each correction, with the doubts of trirail.alignment.stage_model.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from trirail.alignment.stage_model import StageLook, StageModel, list_marks
 from trirail.errors import AlignmentError, AlignmentFault, KinematicsError
 
 OUTLIER_DEVIATIONS = 6.0
-"""Distance of a mark from its computed pixel, in standard deviations, from which it is an outlier."""
+"""Distance of a mark from its computed pixel, in standard deviations, above which it is an outlier."""
 MIN_NOISE_PX = 0.01
 MAX_OUTLIER_SHARE = 0.3
 TOLERANCE = 1e-12
 MAX_EVALUATIONS = 100
 MAX_ROUNDS = 6
 RAYLEIGH_MEDIAN = 1.1774
-"""Median distance in the plane, in standard deviations of one coordinate."""
+"""Median of the distance in the plane, in standard deviations of one coordinate."""
 
 
 class StageFit(NamedTuple):
-    """Unknowns of a stage model fitted to looks."""
+    """Unknowns of a stage model, fitted to looks."""
 
     unknowns: Floats
     covariance: Floats
-    """Covariance of the unknowns, (size, size); zero for combinations that stay as configured."""
+    """Covariance of the unknowns, (size, size); zero for combinations that keep their configured values."""
     determined: Floats
     """Orthonormal basis of the leg unknowns that the looks determine, (legs, K)."""
     noise: float
-    """Standard deviation of a mark's u or v, from the residuals [pixel]."""
+    """Standard deviation of a mark's u or v, computed from the residuals [pixel]."""
     residuals: Floats
-    """Seen less computed pixels, (n, 2), in the order of list_marks."""
+    """Observed minus computed pixels, (n, 2), in the order of list_marks."""
     used: NDArray[np.bool]
-    """True for those that are no outliers, (n,)."""
+    """True for each mark that is not an outlier, (n,)."""
 
 
 def fit_stage(
     model: StageModel, looks: Sequence[StageLook], start: Floats | None = None, *, fixed_legs: bool = False
 ) -> StageFit:
-    """Return the fit of a model to looks, from the configured stage or from other unknowns; legs may stay `fixed_legs`.
+    """Fit a model to looks, starting from the configured stage or from `start`; `fixed_legs` keeps the legs unchanged.
 
-    Raises AlignmentError if the looks are too few, or do not belong to the moves.
+    Raises AlignmentError if the looks are too few, or do not match the moves.
     """
     marks = list_marks(looks)
     unknowns = model.initial() if start is None else start
@@ -58,7 +58,7 @@ def fit_stage(
         raise AlignmentError(
             AlignmentFault.MOVES, f"{len(marks)} marks seen over {len(looks)} looks are too few: add looks or marks"
         )
-    if fixed_legs:  # the configured legs are to explain what the true ones do: nothing is an outlier
+    if fixed_legs:  # the configured legs must explain what the true ones do, so nothing is an outlier
         free = np.eye(model.size)[:, model.legs :]
         return _result(model, looks, _minimise(model, looks, unknowns, used, free, 1.0, robust=False), used, free)
     unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, robust=True)
@@ -97,9 +97,9 @@ def _result(
 
 
 def leg_information(model: StageModel, jacobian: Floats) -> Floats:
-    """Return the information of looks about the legs, with cameras and marks unknown: rows (., legs).
+    """Return the information that looks contain about the legs, with cameras and marks unknown: rows (., legs).
 
-    `jacobian` is that of the pixels in standard deviations, (n, 2, size).
+    `jacobian` contains the derivatives of the pixels in standard deviations, (n, 2, size).
     """
     rows = jacobian.reshape(-1, model.size)
     legs, others = rows[:, : model.legs], rows[:, model.legs :]
@@ -130,7 +130,7 @@ def _minimise(
 ) -> Floats:
     from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
-    # Drawings count as one more observation of each correction: otherwise few looks would explain their noise by legs.
+    # Drawings count as one more observation of each correction. Otherwise, legs would explain the noise of few looks.
     prior = np.eye(model.legs, model.size) @ basis
 
     def residuals(step: Floats) -> Floats:

@@ -1,17 +1,17 @@
 """Model of everything that a look depends on: legs, encoder scales, cameras and marks, with its derivatives.
 
-The sliders read m; leg i stands at (1 + k_i) m_i. Forward kinematics give the platform's pose (t, phi), a mark at q on
+If the sliders read m, leg i is at (1 + k_i) m_i. Forward kinematics give the platform's pose (t, phi). A mark at q on
 the platform is at w = t + R(phi) q, and its camera shows it at the pixel u(w) (trirail.alignment.images).
 
 Pixels alone do not determine everything, wherever the stage looks. Three kinds of change are invisible:
 
 - the base frame moves with the rails and the cameras, or the platform's frame with its edges or pivots and the marks;
-- all lengths grow by one factor, since a pixel has no size of its own;
-- two parameters of a leg compensate each other exactly, as the rail's angle and the encoder's scale of a 3-PPR leg.
+- all lengths grow by one factor, because a pixel has no size of its own;
+- two parameters of a leg compensate each other exactly, such as the rail angle and the encoder scale of a 3-PPR leg.
 
-So the frames are those in which the corrections to the configured legs are least (root mean square, 0.2 mm
-counted as much as 0.5 mrad or 500 ppm of scale), the length is that of the three encoders' mean, and the third kind
-stays as configured.
+The model therefore uses the frames in which the corrections to the configured legs are least (root mean square, with
+0.2 mm counted as much as 0.5 mrad or 500 ppm of scale). The unit of length is the mean of the three encoders. The third
+kind of change keeps the configured values.
 """
 
 from __future__ import annotations
@@ -31,20 +31,21 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import forward, inverse, jacobians
 
 LENGTH_DOUBT_M, ANGLE_DOUBT_RAD, SCALE_DOUBT = 2e-4, 5e-4, 5e-4
-"""Standard deviations beyond which drawings and data sheets are as good as the looks."""
+"""Standard deviations above which drawings and data sheets are as good as the looks."""
 INVISIBLE = 1e-9
-"""Singular value, as a share of the greatest, below which a change shows in no look."""
+"""Singular value, as a share of the greatest one, below which no look shows a change."""
 LENS_NUMBERS = {"affine": 0, "perspective": 2, "radial": 3}
-"""Numbers of a lens beside its affine map: g of a perspective; k and the centre of a radial lens."""
+"""Number of parameters of a lens in addition to its affine map: g of a perspective; k and the centre of a radial
+lens."""
 
 
 class StageLook(NamedTuple):
-    """Marks seen at readings of the sliders."""
+    """Marks that were seen, and the readings of the sliders."""
 
     sliders: tuple[float, float, float]
-    """Positions by the configured encoder scales, A, B, C [m]."""
+    """Positions according to the configured encoder scales, A, B, C [m]."""
     pose: tuple[float, float, float]
-    """Pose by the configured geometry: x, y [m], phi [rad]."""
+    """Pose according to the configured geometry: x, y [m], phi [rad]."""
     marks: Marks
 
 
@@ -61,16 +62,16 @@ class StageState(NamedTuple):
 
 
 class StageModel:
-    """Pixels of marks as a function of the unknowns: a basis of the legs' corrections, views and places of marks.
+    """Pixels of marks as a function of the unknowns: corrections of the legs in a basis, views and mark positions.
 
     Parameters
     ----------
     start
-        Geometry as configured, without a correction map.
+        Configured geometry, without a correction map.
     samples
-        Poses in the stage's travel, (N, 3) [m, rad], which show the invisible changes.
+        Poses in the stage's travel, (N, 3) [m, rad], from which the invisible changes are determined.
     views, places
-        First estimates of the cameras and of the marks' places on the platform.
+        First estimates of the cameras and of the positions of the marks on the platform.
     view_of
         Name of the view of each mark.
     """
@@ -101,16 +102,16 @@ class StageModel:
 
     @property
     def legs(self) -> int:
-        """Number of unknowns of the legs and encoders: the first ones."""
+        """Number of unknowns that belong to the legs and encoders. They come first."""
         return int(self.basis.shape[1])
 
     def view_unknowns(self, name: str) -> slice:
-        """Return which unknowns are a view's: b, M by rows, lens."""
+        """Return the slice of the unknowns that belongs to a view: b, M by rows, lens."""
         at = self._view_at[name]
         return slice(at, at + 6 + LENS_NUMBERS[self.views[name].lens])
 
     def mark_unknowns(self, name: str) -> slice:
-        """Return which unknowns are a mark's place."""
+        """Return the slice of the unknowns that is the position of a mark."""
         return slice(self._mark_at[name], self._mark_at[name] + 2)
 
     def initial(self) -> Floats:
@@ -124,22 +125,22 @@ class StageModel:
         return unknowns
 
     def state(self, unknowns: Floats) -> StageState:
-        """Return the unknowns as values of legs, views and marks."""
+        """Convert the unknowns to values for legs, views and marks."""
         legs = (self.doubts * (self.basis @ unknowns[: self.legs])).reshape(3, 6)
         views = {name: self._view(name, unknowns) for name in self.views}
         places = {name: _pair(unknowns[self.mark_unknowns(name)]) for name in self.places}
         return StageState(legs[:, :5], legs[:, 5], views, places)
 
     def geometry(self, unknowns: Floats) -> Geometry:
-        """Return the geometry. Raises KinematicsError for an impossible one."""
+        """Return the geometry for given unknowns. Raises KinematicsError if it is impossible."""
         return corrected(self.start, self.state(unknowns).corrections)
 
     def poses(self, unknowns: Floats, looks: Sequence[StageLook]) -> Floats:
-        """Return the platform's poses at looks, (L, 3) [m, rad]. Raises KinematicsError."""
+        """Return the poses of the platform at looks, (L, 3) [m, rad]. Raises KinematicsError."""
         return _poses(self.geometry(unknowns), self.state(unknowns), looks)
 
     def residuals(self, unknowns: Floats, looks: Sequence[StageLook]) -> Floats:
-        """Return seen less computed pixels, (n, 2), in the order of `list_marks`. Raises KinematicsError."""
+        """Return observed minus computed pixels, (n, 2), in the order of `list_marks`. Raises KinematicsError."""
         poses, state = self.poses(unknowns, looks), self.state(unknowns)
         result = np.empty((sum(len(look.marks) for look in looks), 2))
         for rows, at, name, seen in _groups(looks):
@@ -148,7 +149,9 @@ class StageModel:
         return result
 
     def jacobian(self, unknowns: Floats, looks: Sequence[StageLook]) -> Floats:
-        """Return the derivatives of the computed pixels by the unknowns, (n, 2, size). Raises KinematicsError."""
+        """Return the derivatives of the computed pixels with respect to the unknowns, (n, 2, size). Raises
+        KinematicsError.
+        """
         state, geometry = self.state(unknowns), self.geometry(unknowns)
         poses = _poses(geometry, state, looks)
         changes = _pose_changes(geometry, self.start, poses, np.array([look.sliders for look in looks]))
@@ -177,12 +180,12 @@ class StageModel:
 
 
 def list_marks(looks: Sequence[StageLook]) -> list[tuple[int, str]]:
-    """Return look and name of each seen mark, the order of residuals."""
+    """Return the look and the name of each observed mark. The residuals have this order."""
     return [(number, name) for number, look in enumerate(looks) for name in look.marks]
 
 
 def _groups(looks: Sequence[StageLook]) -> list[tuple[NDArray[np.int64], NDArray[np.int64], str, Floats]]:
-    """Return rows, looks and pixels of each mark."""
+    """Return the rows, looks and pixels of each mark."""
     rows_of: dict[str, list[tuple[int, int, Pair]]] = {}
     for row, (look, name) in enumerate(list_marks(looks)):
         rows_of.setdefault(name, []).append((row, look, looks[look].marks[name]))
@@ -204,7 +207,7 @@ def _doubt(parameter: str) -> float:
 
 
 def _pose_changes(geometry: Geometry, start: Geometry, poses: Floats, sliders: Floats) -> Floats:
-    """Return how corrections of legs and encoder scales move the platform, (N, 3, 18): leg by leg, scale last."""
+    """Return the pose changes caused by corrections of legs and encoder scales, (N, 3, 18): leg by leg, scale last."""
     by_legs = pose_derivatives(geometry, start, poses)
     J1, J2 = jacobians(geometry, poses)
     by_scales = np.linalg.solve(J2, J1) * sliders[:, None, :]
@@ -214,7 +217,7 @@ def _pose_changes(geometry: Geometry, start: Geometry, poses: Floats, sliders: F
 def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Floats]:
     """Return orthonormal bases of the corrections that looks can determine, and of those that change no pose at all.
 
-    `rows` are pose changes by corrections in units of `doubts`, (N, 3, 18).
+    `rows` are the pose changes for corrections in units of `doubts`, (N, 3, 18).
     """
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     zero, one = np.zeros(len(poses)), np.ones(len(poses))
@@ -233,7 +236,7 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
     unit = np.abs(moved).max()
     null = _null_space(np.concatenate([moved / unit, frames], axis=1))[:, : rows.shape[2]]
     held = _null_space(moved / unit)
-    # The common scale: that of the three encoders' mean, exactly.
+    # The common scale is exactly the mean of the three encoders.
     common = np.zeros(rows.shape[2])
     common[5::6] = 1.0 / doubts[5::6]
     null = np.concatenate([null, common[None] / np.linalg.norm(common)])
@@ -243,21 +246,21 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
 
 
 def _null_space(matrix: Floats) -> Floats:
-    """Return an orthonormal basis of the vectors that a matrix takes to zero, in rows."""
+    """Return an orthonormal basis of the vectors that a matrix maps to zero, in rows."""
     _, values, directions = np.linalg.svd(np.linalg.qr(matrix, mode="r"))
     values = np.append(values, np.zeros(len(directions) - len(values)))
     return np.asarray(directions[values <= INVISIBLE * values[0]])
 
 
 def carry(poses: Floats, place: Floats) -> tuple[Floats, Floats]:
-    """Return a mark's positions in the base frame, (n, 2) [m], and their derivatives by phi."""
+    """Return the positions of a mark in the base frame, (n, 2) [m], and their derivatives with respect to phi."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     arm = np.stack([c * place[0] - s * place[1], s * place[0] + c * place[1]], axis=1)
     return poses[:, :2] + arm, np.stack([-arm[:, 1], arm[:, 0]], axis=1)
 
 
 def _projection_derivatives(view: CameraView, points: Floats) -> tuple[Floats, Floats]:
-    """Return the derivatives of pixels by the view's numbers b, M by rows, lens, (n, 2, 6 ...), and by the points."""
+    """Return the derivatives of pixels by the view's b, M by rows and lens, (n, 2, 6 ...), and by the points."""
     M, away = np.array(view.matrix), points - view.origin
     n = len(points)
     by_b = np.broadcast_to(np.eye(2), (n, 2, 2))

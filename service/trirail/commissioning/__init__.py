@@ -1,1 +1,1 @@
-"""Commissioning of real drives: one drive at a time, slowly, each step judged, and a corrected configuration."""
+"""Commissioning of real drives: one drive at a time, slowly, with each step judged and the configuration corrected."""

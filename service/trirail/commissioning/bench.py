@@ -1,4 +1,4 @@
-"""Drive cycle of a commissioning: power for one drive alone, slow motions, and the conditions that stop everything."""
+"""Drive cycle of a commissioning: power for a single drive, slow motions, and the conditions that stop all drives."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from trirail.config import Config
 from trirail.kinematics.arrays import Array
 
 MAX_FOLLOWING_ERROR_M: Final = 0.0003
-"""Following error of a powered slider that stops all drives [m]: at 5 mm/s a drive without velocity feed-forward and
-with a position loop of 20 /s lags 0.25 mm."""
+"""Following error of a powered slider that stops all drives [m]. At 5 mm/s, a drive without velocity feed-forward
+and with a position loop of 20 /s lags by 0.25 mm."""
 SETTLE_TIME_S: Final = 0.3
-"""Time for a slider to settle after a motion [s]."""
+"""Time that a slider has to settle after a motion [s]."""
 INTERRUPTED: Final = "stopped by Ctrl-C"
 FAULT_WINDOW_S: Final = 0.05
 """Time within which drives that missed the same heartbeat all report it [s]."""
 REST_CHECK_S: Final = 0.05
 """Time for which the sliders are observed before power is applied [s]."""
 RESET_TIMEOUT_S: Final = 1.0
-"""Time for a fault to clear after a reset [s]."""
+"""Time that a fault has to clear after a reset [s]."""
 FEEDBACK_DELAY_CYCLES: Final = 2
-"""SYNCs from writing a setpoint to the position that answers it: one applies the setpoint, the next samples."""
+"""SYNCs between writing a setpoint and the position that answers it: one to apply the setpoint, and one to sample."""
 
 _HISTORY_CYCLES: Final = FEEDBACK_DELAY_CYCLES + 8
 _POWERED_STATES: Final = (
@@ -42,7 +42,7 @@ _ZERO_VELOCITY: Final = (0.0, 0.0, 0.0)
 
 
 class DrivesStoppedError(Exception):
-    """All drives were stopped and have no power; the text gives the reason."""
+    """All drives were stopped and have no power. The text gives the reason."""
 
 
 class MeasuredMotion(NamedTuple):
@@ -60,15 +60,15 @@ class WatchdogReaction(NamedTuple):
     seconds: float | None
     """Time until the drive switched its power off [s]; None if it did not."""
     drive: str
-    """Drive that reported the loss, "" if none did."""
+    """Drive that reported the loss; "" if none did."""
     message: str
-    """Message of that drive, "" if there was none."""
+    """Message of that drive; "" if there was none."""
     code: int = 0
     """EMCY error code; 0 for none."""
 
 
 class Bench:
-    """Runs the drives' cycle. Any problem while a drive has power stops all drives in the same cycle."""
+    """Runner of the drives' cycle. Any problem while a drive has power stops all drives in the same cycle."""
 
     def __init__(
         self,
@@ -144,12 +144,12 @@ class Bench:
 
     @contextmanager
     def power(self, alone: str | None = None) -> Iterator[None]:
-        """Enable all drives, or the one named `alone`, and disable them at the end.
+        """Enable all drives, or only the drive named `alone`, and disable them on exit.
 
         Raises
         ------
         DrivesStoppedError
-            If a slider moves before, or a drive is not enabled within `watchdogs.enable_timeout`.
+            If a slider moves before power is applied, or a drive is not enabled within `watchdogs.enable_timeout`.
         """
         self.clear_fault()
         before = self.feedback.position
@@ -184,7 +184,7 @@ class Bench:
             raise DrivesStoppedError(fault.message)
 
     def play(self, move: SlowMove) -> MeasuredMotion:
-        """Move the powered sliders from their targets along `move`, and let them settle."""
+        """Move the powered sliders along `move` from their targets, and let them settle."""
         start = tuple(self._target)
         measured = []
         for offset, rate in zip(move.position.tolist(), move.velocity.tolist(), strict=True):
@@ -196,7 +196,7 @@ class Bench:
         return MeasuredMotion(np.array(measured), (a, b, c))
 
     def home(self, timeout: float) -> None:
-        """Home the one powered drive within `timeout` [s]. Raises DrivesStoppedError."""
+        """Home the only powered drive within `timeout` [s]. Raises DrivesStoppedError."""
         self._drives.home()
         for _ in range(round(timeout / self.period)):
             self.cycle()
@@ -205,7 +205,7 @@ class Bench:
         self._stop_and_raise(f"not homed within {timeout:g} s")
 
     def provoke_watchdog(self, seconds: float) -> WatchdogReaction:
-        """Send neither SYNC nor heartbeat for `seconds` [s], or until the powered drive switches its power off."""
+        """Send neither SYNC nor heartbeat for `seconds` [s], or until the powered drive switches off its power."""
         (index,) = self._powered
         for number in range(1, round(seconds / self.period) + 1):
             feedback = self._read_without_sync()
@@ -289,7 +289,7 @@ class Bench:
         self._wait_without_power()
 
     def _wait_without_power(self) -> None:
-        """Run cycles until no drive has power, for `drives.stop_timeout` and the settle time at most."""
+        """Run cycles until no drive has power, at most for `drives.stop_timeout` plus the settling time."""
         self._powered = ()
         for _ in range(round((self.config.drives.stop_timeout + SETTLE_TIME_S) / self.period)):
             self._tick()

@@ -18,7 +18,7 @@ from trirail.kinematics.geometry import Geometry
 
 
 def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
-    """Return a configuration's text with new values for the keys in `changes`, each by its whole path.
+    """Return the text of a configuration with new values for the keys in `changes`, which are full paths.
 
     Raises ConfigError if the result is not a valid configuration, or differs in any other value.
     """
@@ -33,17 +33,17 @@ def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
         else:
             table.add(key, value)
     result = tomlkit.dumps(document)
-    # tomlkit edits text: only the parsed result shows that nothing else has changed with it.
+    # tomlkit edits the text; only the parsed result shows that nothing else has changed.
     if parse(result) != replace_values(parse(text), changes):
         raise ConfigError(f"changes {dict(changes)}: cannot be written into this file; edit it by hand")
     return result
 
 
 def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | None) -> str:
-    """Return a configuration's text with the legs of `robot`, encoder scales corrected by `scales`, and another map.
+    """Return a configuration's text with the legs of `robot`, corrected encoder scales, and another correction map.
 
-    A slider moves by 1 + scale for a metre by its encoder. A correction map of the old geometry is left out; `map_file`
-    names the one that takes its place, or None. Raises ConfigError if the result is not a valid configuration, or
+    A slider moves by 1 + scale for each metre of its encoder. A correction map of the old geometry is removed.
+    `map_file` names its replacement, or is None. Raises ConfigError if the result is not a valid configuration, or
     differs in any other value.
     """
     document = tomlkit.parse(text)
@@ -81,7 +81,7 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
 
 
 def _rounded(value: object) -> object:
-    """Return numbers rounded to a nanometre or nanoradian, which is all that a checksum of the geometry tells."""
+    """Return numbers rounded to a nanometre or nanoradian, the resolution of a checksum of the geometry."""
     if isinstance(value, tuple):
         return [round(each, 9) for each in value]
     return round(value, 9) if isinstance(value, float) else value
@@ -100,7 +100,7 @@ def replace_values(config: Config, changes: Mapping[str, int | float]) -> Config
 def add_simulated_build(text: str, drives: Drives) -> str:
     """Return a configuration's text with `can.simulated.built` set to the node, scale and direction of `drives`.
 
-    A fault on demand is relative to the simulated robot: a correction in [drives] must not move that reference.
+    Simulated faults are relative to the simulated robot, so a correction in [drives] must not move that reference.
     """
     document = tomlkit.parse(text)
     rows = tomlkit.array().multiline(True)
@@ -116,7 +116,7 @@ def add_simulated_build(text: str, drives: Drives) -> str:
 
 
 def resolve_eds_paths(text: str, folder: Path) -> str:
-    """Return a configuration's text with the drives' EDS paths, relative to `folder`, made absolute."""
+    """Return a configuration's text with the EDS paths of the drives made absolute. They are relative to `folder`."""
     document = tomlkit.parse(text)
     for name in NAMES:
         drive = document["drives"][name]
@@ -126,7 +126,7 @@ def resolve_eds_paths(text: str, folder: Path) -> str:
 
 
 def find_free_path(path: Path, word: str = "commissioned") -> Path:
-    """Return an unused path beside a configuration, with a `word` in its name, for the corrected one."""
+    """Return an unused path beside a configuration for the corrected one. Its name contains `word`."""
     number, free = 1, path.with_name(f"{path.stem}-{word}.toml")
     while free.exists():
         number += 1
@@ -135,7 +135,7 @@ def find_free_path(path: Path, word: str = "commissioned") -> Path:
 
 
 def write_new_file(path: Path, text: str) -> None:
-    """Write a new file. Raises ConfigError if it exists."""
+    """Write a new file. Raises ConfigError if the file exists."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

@@ -12,11 +12,11 @@ from trirail.commissioning.judgement import Changes, Judgement, format_mm
 from trirail.naming import Labels, label
 
 SCALE_TOLERANCE: Final = 0.02
-"""Relative difference of drive and rule above which the scale is wrong, over a stroke by hand."""
+"""Relative difference between drive and rule above which the scale is wrong, for a stroke by hand."""
 MAX_RULE_UNCERTAINTY: Final = 0.5
-"""Uncertainty of the rule, relative to the stroke, above which it shows no scale."""
+"""Uncertainty of the rule, relative to the stroke, above which the rule shows no scale."""
 PLAY_TOLERANCE: Final = 0.1
-"""The same tolerance over 1 mm under power: play in screw or belt is a larger share of that."""
+"""The same tolerance for 1 mm under power. Play in screw or belt is a larger share of such a short stroke."""
 MAX_BACKLASH_M: Final = 0.0004
 """Loss in both directions that may be backlash [m]: over 1 mm it looks like a wrong scale."""
 MIN_COUNTED_SHARE: Final = 0.2
@@ -29,7 +29,7 @@ LOOSE_ENCODER_REMEDY: Final = "fasten the encoder of drive {} on its shaft, and 
 
 
 class MoveObservation(NamedTuple):
-    """Observation of one drive that moved its slider out and back, alone under power. Lengths are signed [m]."""
+    """Observation of a single powered drive that moved its slider out and back. Lengths are signed [m]."""
 
     drive: str
     commanded: float
@@ -80,7 +80,7 @@ class _Stroke(NamedTuple):
 
 
 def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
-    """Judge which slider a drive moved, in which direction, how far, and whether its encoder follows."""
+    """Determine which slider a drive moved, in which direction and how far, and whether its encoder follows."""
     name, slider = seen.drive, seen.slider
     by_encoder = (
         f"drive {name} counted {format_mm(seen.out)} of {format_mm(seen.commanded)}, "
@@ -140,7 +140,7 @@ def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
 
 
 def judge_push(seen: PushObservation, drives: Drives) -> Judgement:
-    """Judge which drive's encoder is on the pushed slider, its direction and its scale."""
+    """Determine which drive has its encoder on the pushed slider, and its direction and scale."""
     at = NAMES.index(seen.slider)
     sizes = [max(abs(out), abs(back)) for out, back in zip(seen.counted, seen.counted_back, strict=True)]
     largest = sizes.index(max(sizes))

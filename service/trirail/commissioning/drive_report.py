@@ -1,4 +1,4 @@
-"""Lines for people about an inspected drive: its identity, and what its set-up changes."""
+"""Text lines that describe an inspected drive: its identity, and the values that its set-up changes."""
 
 from __future__ import annotations
 

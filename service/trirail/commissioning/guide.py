@@ -1,4 +1,4 @@
-"""Guide through the steps in order: each can be skipped and repeated, and requires earlier ones."""
+"""Guide through the steps in order. Each step can be skipped and repeated, and may require earlier steps."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from trirail.config import Config
 
 
 def merge_changes(proposals: Sequence[Changes], drives: Drives) -> tuple[dict[str, int | float], str]:
-    """Return the changes of all steps together, and why node ids cannot be exchanged, "" if they can.
+    """Return the changes of all steps together, and the reason why node ids cannot be exchanged; "" if they can.
 
-    A node id that moves to another slider leaves its own slider without one: the two are exchanged unless another step
-    contradicts that.
+    If a node id moves to another slider, its own slider has none. The two node ids are therefore exchanged, unless
+    another step contradicts this.
     """
     changes = {key: value for each in proposals for key, value in each.items()}
     nodes = {name: drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
@@ -53,16 +53,16 @@ class GuideStep(NamedTuple):
     drive: str
     title: str
     description: str
-    """Line for the person about the motion or power, and their task."""
+    """Line that announces motion or power to the person, and describes their task."""
     run: Callable[[], StepOutcome]
     needs: tuple[tuple[str, str], ...] = ()
-    """Steps that must be ok before this one."""
+    """Steps that must be ok before this step."""
     not_after: tuple[tuple[str, str], ...] = ()
-    """Steps that must not have found a defect before this one."""
+    """Steps that must not have found a defect before this step."""
 
 
 def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
-    """Return the steps of the guide in their order."""
+    """Return the steps of the guide in order."""
 
     def named(name: str) -> str:
         return naming.drive(name, config.geometry.labels)
@@ -184,10 +184,10 @@ def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
 
 
 class Guide:
-    """Runs the steps with a person, and records their judgements."""
+    """Guide that runs the steps with a person and records the judgements."""
 
     def __init__(self, config: Config, path: Path, steps: Steps, operator: Operator, report_file: ReportFile) -> None:
-        """`path` is the path of the configuration."""
+        """Create the guide. `path` is the path of the configuration."""
         self._config = config
         self._path = path
         self._steps = steps
@@ -218,7 +218,7 @@ class Guide:
     def write(self, out: Path | None) -> Path | None:
         """Write the corrected configuration to `out`, or to an unused path beside the original.
 
-        Return its path, None if nothing needs a correction.
+        Returns the path of the file; None if nothing needs a correction.
         """
         latest = self._report_file.report.latest.values()
         changes, conflict = merge_changes([entry.changes for entry in latest], self._config.drives)
@@ -246,7 +246,7 @@ class Guide:
         return written
 
     def _run_step(self, step: GuideStep, at: int) -> int:
-        """Run, skip or leave a step, as the person chooses; return the index of the next one."""
+        """Run a step, skip it or go back, as the person chooses. Return the index of the next step."""
         choices = {"y": "run it", "s": "skip it", "b": "previous step"}
         choice = self._ask("  Run it? Enter or y, s skip, b back, q quit:", "y", choices)
         if choice == "s" and (step.name, step.drive) not in self._report_file.report.latest:

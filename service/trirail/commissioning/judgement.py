@@ -11,7 +11,7 @@ from trirail_drivers.interface import NAMES
 from trirail.naming import Labels, label
 
 Verdict = Literal["ok", "wrong", "failed", "skipped"]
-"""Correct; a defect was found; the step could not be carried out; the step was left out."""
+"""The step is correct; it found a defect; it could not be carried out; it was skipped."""
 Changes = Mapping[str, int | float]
 """New values of configuration keys, each by its whole path, as `drives.A.node`."""
 
@@ -33,7 +33,7 @@ class Judgement(NamedTuple):
 
 
 def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judgement:
-    """Judge a drive that was enabled alone for `seconds` [s] and drifted by `drift` [m]."""
+    """Evaluate the power test of a drive that was enabled on its own for `seconds` [s] and moved by `drift` [m]."""
     if stopped:
         return Judgement(
             "failed",
@@ -46,7 +46,7 @@ def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judge
 
 
 def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: Labels = NAMES) -> Judgement:
-    """Judge a slider's switches.
+    """Evaluate the test of a slider's switches.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: 
     changed
         Bits that changed when the person pressed each switch.
     confirmed
-        True if the person agrees that these are all the slider's switches.
+        True if the person agrees that these are all switches of the slider.
     """
     states = [f"{switch} {'changed' if changed & bit else 'never changed'}" for bit, switch in SWITCHES.items()]
     words = (f"drive {name} reported: {', '.join(states)}",)
@@ -79,7 +79,7 @@ def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: 
 def judge_homing(
     drive: str, travel: float, position: float, confirmed: bool, stopped: str, labels: Labels = NAMES
 ) -> Judgement:
-    """Judge a homing that ended at `position` [m] after `travel` [m]; the person confirms the home switch."""
+    """Evaluate a homing that ended at `position` [m] after `travel` [m]. The person confirms the home switch."""
     slider = f"slider {label(drive, labels)}"
     if stopped:
         return Judgement(
@@ -98,7 +98,7 @@ def judge_homing(
 
 
 def judge_watchdog(drive: str, seconds: float | None, reporter: str, message: str, code: int) -> Judgement:
-    """Judge a powered drive's reaction to missing SYNCs and heartbeats, as in `WatchdogReaction`."""
+    """Evaluate a powered drive's reaction to missing SYNCs and heartbeats, as in `WatchdogReaction`."""
     if seconds is not None:
         words = (f"drive {drive} switched its power off {seconds * 1e3:.0f} ms after the last SYNC: {message}",)
         if code == HEARTBEAT_MISSING:
@@ -117,12 +117,12 @@ def judge_watchdog(drive: str, seconds: float | None, reporter: str, message: st
 def judge_square(
     deviation: float, following: Sequence[float], confirmed: bool, stopped: str, labels: Labels = NAMES
 ) -> Judgement:
-    """Judge a square of the platform.
+    """Evaluate the motion of the platform around a square.
 
     Parameters
     ----------
     deviation
-        Maximum distance of the measured from the commanded pose [m].
+        Maximum distance of the measured pose from the commanded pose [m].
     following
         Maximum following error of each slider [m].
     confirmed

@@ -1,4 +1,4 @@
-"""Step that identifies the mechanism's kind: all three drives move, a person reads an instrument beside a mark."""
+"""Step that identifies the kind of mechanism: all three drives move, and a person reads an instrument beside a mark."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ REMEDY = "move the sliders, by hand or by homing, until the platform is well wit
 
 
 class KindStep:
-    """A turn and a straight motion, whose middle part is measured from outside."""
+    """Turn of the platform and a straight motion. The middle part of the motion is measured from outside."""
 
     def __init__(self, session: Session, observer: Observer) -> None:
         self._session = session

@@ -22,7 +22,7 @@ from trirail.kinematics.robot import forward, inverse
 MIN_SEPARATION: Final = 8.0
 """Minimum separation of both predictions, in multiples of the instrument's resolution."""
 AMPLE_SEPARATION: Final = 24.0
-"""Separation that is enough, in the same multiples: the search for a larger motion ends there."""
+"""Separation at which the search for a larger motion ends, in the same multiples."""
 MARK_RADIUS_M: Final = 0.005
 """Maximum distance of the mark from the platform's centre [m]."""
 SHARES: Final = tuple(np.linspace(0.05, 1.0, 20).tolist())
@@ -33,7 +33,7 @@ AXES: Final = ("x", "y")
 
 
 class KindTestMove(NamedTuple):
-    """Slider positions of the test, (3,) each [m], and the axis of the measurement, 0 for x and 1 for y."""
+    """Slider positions of the test, (3,) each [m], and the axis of the measurement: 0 for x, 1 for y."""
 
     first: Array
     second: Array
@@ -73,7 +73,7 @@ def predict_mark(robot: Geometry, other: Geometry, first: Array, second: Array, 
 def find_test_move(
     config: Config, robot: Geometry, other: Geometry, sliders: Array, resolution: float
 ) -> tuple[KindTestMove, MarkPrediction] | None:
-    """Return the smallest test motion with ample separation, else the one with the largest; None for none.
+    """Return the smallest test motion with ample separation, else the one with the largest; None if there is none.
 
     The motion starts and ends at `sliders`. Both kinds stay within all limits.
     """
@@ -130,14 +130,14 @@ def _stays_within_limits(config: Config, robots: tuple[Geometry, Geometry], slid
 def judge_kind(
     kinds: tuple[str, str], move: KindTestMove, expected: MarkPrediction, moved: float | None, resolution: float
 ) -> Judgement:
-    """Judge the mechanism's kind by the travel of the mark.
+    """Determine the kind of mechanism from the travel of the mark.
 
     Parameters
     ----------
     kinds
-        Configured kind and the other one.
+        Configured kind and the other kind.
     moved
-        Measured travel of the mark [m]; None if the motion was not carried out for lack of separation.
+        Measured travel of the mark [m]; None if the motion was not run because the separation is too small.
     resolution
         Resolution of the instrument [m].
     """

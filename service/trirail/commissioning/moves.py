@@ -24,7 +24,7 @@ MAX_JERK = 1.0
 """Jerk limit [m/s³]."""
 
 MIN_DISTANCE_M = 1e-9
-"""Shorter travels count as none [m]: Ruckig needs a distance to share out."""
+"""Travel below which a motion counts as none [m], because Ruckig cannot plan it."""
 
 
 class SlowMove(NamedTuple):
@@ -71,14 +71,14 @@ def plan_slider_move(index: int, distance: float, limits: SliderLimits, period: 
 
 
 def plan_square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMove, Array]:
-    """Return the sliders' motion for a square of the platform from its current pose, and the poses, (N, 3).
+    """Return the slider motion that moves the platform around a square from its current pose, and the poses, (N, 3).
 
-    The platform moves along x, along y, and back, `TEST_DISTANCE_M` each.
+    The platform moves by `TEST_DISTANCE_M` along x, along y, back along x, and back along y.
 
     Raises
     ------
     KinematicsError
-        If the slider positions belong to no pose.
+        If no pose matches the slider positions.
     ValueError
         If the square leaves a limit.
     """

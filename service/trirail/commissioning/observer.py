@@ -32,12 +32,12 @@ def subtract(after: Reading, before: Reading) -> Reading:
 
 
 class Observer:
-    """Asks a person for what no encoder measures."""
+    """Questions to a person about quantities that no encoder measures."""
 
     def __init__(
         self, operator: Operator, simulated: Carriages | None, idle: Callable[[], object], labels: Labels = NAMES
     ) -> None:
-        """`idle` is called while the person thinks."""
+        """Create the observer. `idle` is called while the person thinks."""
         self._operator = operator
         self._simulated = simulated
         self._idle = idle
@@ -95,7 +95,7 @@ class Observer:
         return self._ask_mm(text, now[index] - was[index] if now and was else None)
 
     def ask_moved_slider(self, before: RuleReadings | None, now: RuleReadings | None) -> str | None:
-        """Ask which slider has moved; simulated rules, `before` and `now`, propose the answer."""
+        """Ask which slider has moved. The simulated rules, `before` and `now`, propose the answer."""
         default, text = None, f"Which slider moved: {', '.join(self._labels)}, or n for none?"
         if before is not None and now is not None:
             travels = [abs(after - was) for after, was in zip(now, before, strict=True)]

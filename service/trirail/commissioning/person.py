@@ -1,4 +1,4 @@
-"""Interface to the person beside the robot: lines to show, questions to ask."""
+"""Interface to the person beside the robot: lines to show and questions to ask."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail.wire.units import LENGTH, quantity
 
 
 class QuitRequest(Exception):
-    """The person ends the commissioning."""
+    """Raised when the person ends the commissioning."""
 
 
 class Question(NamedTuple):

@@ -1,4 +1,4 @@
-"""Report of a commissioning: saved after every step, as JSON for programs and as text for people."""
+"""Report of a commissioning. It is saved after every step, as JSON for programs and as text for people."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ Number = float | int | str | bool | None
 
 
 class StepReport(Struct, frozen=True):
-    """Entry of a step, carried out or left out."""
+    """Entry for a step that was carried out or skipped."""
 
     step: str
     drive: str
-    """A, B or C; "" for a step of all three."""
+    """Drive A, B or C; "" for a step with all three drives."""
     verdict: Verdict
     words: tuple[str, ...]
     remedy: str
     measured: dict[str, Number]
-    """Lengths in m, times in s, signed."""
+    """Measured lengths [m] and times [s], with sign."""
     changes: dict[str, int | float]
     """Proposed values of configuration keys."""
     at: str
-    """Wall-clock time of its end (ISO 8601)."""
+    """Wall-clock time at the end of the step (ISO 8601)."""
 
 
 class CommissioningReport(Struct):
-    """Report of all steps in the order of their execution; of a repeated step the last run counts."""
+    """Report of all steps in the order in which they were run. The last run of a repeated step counts."""
 
     robot: str
     config: str
@@ -44,7 +44,7 @@ class CommissioningReport(Struct):
     """All steps of the guide, each with its drive."""
     steps: list[StepReport] = []
     changes: dict[str, int | float] = {}
-    """Proposed values of configuration keys, all steps together."""
+    """Proposed values of configuration keys, from all steps together."""
     written: str | None = None
     """Path of the corrected configuration."""
 
@@ -78,7 +78,7 @@ class ReportFile:
     """A report's JSON file, and the text file for people beside it."""
 
     def __init__(self, report: CommissioningReport, path: Path) -> None:
-        """Raises FileError if the file exists, or cannot be created."""
+        """Create the report files. Raises FileError if the file exists or cannot be created."""
         self.report = report
         self.path = path
         try:
@@ -118,7 +118,7 @@ def content(report: CommissioningReport) -> dict[str, object]:
 
 
 def format_lines(report: CommissioningReport) -> list[str]:
-    """Return a report as lines for people."""
+    """Return a report as human-readable lines."""
     lines = [f"Commissioning of robot {report.robot}, {report.config}", f"started {report.began}, {report.software}"]
     if report.simulated:
         lines.append("simulated drives")

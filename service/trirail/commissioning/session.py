@@ -19,30 +19,31 @@ from trirail.commissioning.report import Number
 from trirail.config import Config
 
 SETUP_CHECK_S = 0.5
-"""Time for which drives are observed after their set-up [s]."""
+"""Time for which drives are observed after they are set up [s]."""
 POLL_INTERVAL_S = 0.01
-"""Interval at which an answer is looked for before the drives' set-up [s]."""
+"""Interval between checks for an answer before the drives are set up [s]."""
 
 StepOutcome = tuple[Judgement, dict[str, Number]]
 """Judgement of a step, and its measurements by name."""
 
 
 class Environment(NamedTuple):
-    """Everything that a commissioning works with."""
+    """Everything that a commissioning needs from its surroundings."""
 
     config: Config
     bus: can.BusABC
     make_bench: Callable[[], Bench]
-    """Configures the drives and starts their cycle."""
+    """Function that configures the drives and starts their cycle."""
     rules: Carriages | None
-    """Rules beside simulated sliders; None beside real ones."""
+    """Rules beside simulated sliders; None for real ones."""
     operator: Operator
     interrupted: Callable[[], bool]
-    """True once Ctrl-C was pressed."""
+    """Function that returns True once Ctrl-C was pressed."""
     inputs: Callable[[str], int | None] | None = None
-    """Reads a drive's digital inputs, object 60FDh, None if it has none; None for protocols without."""
+    """Function that reads a drive's digital inputs (object 60FDh), or None if it has none; None without such a
+    protocol."""
     press: Callable[[int, int], None] | None = None
-    """Presses switches of a simulated drive, given its index and bits of 60FDh."""
+    """Function that presses switches of a simulated drive, given its index and bits of 60FDh."""
 
 
 class Session:
@@ -107,7 +108,7 @@ class Session:
         return Judgement("ok", words), {"written": written}
 
     def describe_setup(self) -> list[str]:
-        """Return the changes of the set-up as lines; a change that several drives share is one line."""
+        """Return the changes made by the set-up as lines. A change that several drives share takes one line."""
         drives: dict[str, list[str]] = {}
         for each in self._inspected:
             for line in drive_report.format_differences(each, applied=False):

@@ -30,7 +30,7 @@ from trirail.errors import KinematicsError
 from trirail.kinematics.robot import forward
 
 HOLD_TIME_S = 1.0
-"""Time for which a drive holds its slider when it is first enabled [s]."""
+"""Time for which a drive holds its slider when it is enabled for the first time [s]."""
 PUSH_DISTANCE_M = 0.010
 """Recommended travel of a slider by hand [m]."""
 INPUT_POLL_S = 0.05
@@ -38,7 +38,7 @@ INPUT_POLL_S = 0.05
 
 
 class Steps:
-    """Steps with drives that have been set up, callable in any order."""
+    """Steps for drives that have been set up. They can be called in any order."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -55,7 +55,7 @@ class Steps:
     # Without power.
 
     def push(self, name: str) -> StepOutcome:
-        """Have a slider pushed out and back by hand, without power."""
+        """Ask the person to push a slider out and back by hand, without power."""
         bench, index = self.session.bench(), NAMES.index(name)
         resolution = self._observer.ask_rule_resolution()
         label = self.slider_label(name)
@@ -80,7 +80,7 @@ class Steps:
         return judge_push(seen, self._config.drives), measured
 
     def _observe_push(self, index: int, by: float, text: str) -> Reading:
-        """Have a slider pushed `by` a distance [m], and return its readings afterwards."""
+        """Ask the person to push a slider by a distance `by` [m], and return the readings afterwards."""
         bench = self.session.bench()
         if self._environment.rules is None:
             self._operator.show(f"  {text}")
@@ -91,7 +91,7 @@ class Steps:
         return self._observer.ask_rule(index), bench.position
 
     def switches(self, name: str) -> StepOutcome:
-        """Have the switches of a slider pressed by hand, without power."""
+        """Ask the person to press the switches of a slider by hand, without power."""
         bench, read = self.session.bench(), self._environment.inputs
         rest = read(name) if read is not None else None
         if read is None or rest is None:
@@ -138,7 +138,7 @@ class Steps:
         return judge_power(name, drift, HOLD_TIME_S, stopped), {"drift": drift}
 
     def move(self, name: str) -> StepOutcome:
-        """Move one slider out and back, its drive enabled alone; a person reports which slider moved, and how far."""
+        """Move one slider out and back with only its drive enabled. The person reports which one moved, and how far."""
         index, drives = NAMES.index(name), self._config.drives
         resolution = self._observer.ask_rule_resolution()
         commanded = self._choose_distance(index)
@@ -179,7 +179,7 @@ class Steps:
         return judge_move(seen, drives), measured
 
     def home(self, name: str) -> StepOutcome:
-        """Home one drive, enabled alone."""
+        """Home one drive while only this drive is enabled."""
         bench, index = self.session.bench(), NAMES.index(name)
         homing = self._config.drives.each[index].homing
         if homing is None:
@@ -201,7 +201,7 @@ class Steps:
         return judgement, {"way": travel, "position": position, "stopped": stopped}
 
     def watchdog(self, name: str) -> StepOutcome:
-        """Stop SYNC and heartbeat while one drive is enabled: it must switch its power off."""
+        """Stop SYNC and heartbeat while one drive is enabled. The drive must switch off its power."""
         bench, heartbeat = self.session.bench(), self._config.drives.heartbeat
         try:
             with bench.power(name):
@@ -248,7 +248,7 @@ class Steps:
         return KindStep(self.session, self._observer).run()
 
     def _move_slider(self, index: int, distance: float) -> _SliderMotion:
-        """Move one slider over `distance` [m], its drive enabled alone and disabled afterwards."""
+        """Move one slider over `distance` [m]. Only its drive is enabled, and it is disabled afterwards."""
         bench, stopped = self.session.bench(), ""
         before = bench.position[index]
         try:
@@ -260,7 +260,7 @@ class Steps:
         return _SliderMotion(bench.position[index] - before, bench.max_errors[index], stopped)
 
     def _choose_distance(self, index: int) -> float:
-        """Return the signed test distance of a slider [m], away from a limit that is near if its position is known."""
+        """Return the signed test distance of a slider [m]. It leads away from a near limit if the position is known."""
         bench = self.session.bench()
         is_near_end = (
             bench.position[index] + 2.0 * moves.TEST_DISTANCE_M > self._config.limits.slider.positions[index][1]

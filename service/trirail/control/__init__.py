@@ -1,1 +1,1 @@
-"""The robot's control, one cycle at a time: modes, goals, feedback, setpoints; no input or output."""
+"""Control of the robot, one cycle at a time: modes, goals, feedback and setpoints. It does no input or output."""

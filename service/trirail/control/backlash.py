@@ -1,11 +1,12 @@
-"""Backlash compensation when a slider reverses; compiled, one cycle at a time.
+"""Backlash compensation for sliders that reverse. It is compiled and runs one cycle at a time.
 
-A slider with backlash lags its motor by half the backlash. The setpoint of a drive is therefore the slider's position
-plus half the backlash in the direction of the last motion, and the slider's position is the drive's measurement less
-that offset. The offset changes sides over the time given by trirail.motion.backlash_reserve. Only one change runs at a
-time: a slider that reverses during a change waits for its end. After two reversals during a change the offset first
-goes to the other side, since the slider may be anywhere in its backlash. While the last direction of a slider is
-unknown, as after power-on, its offset is zero.
+A slider with backlash lags its motor by half the backlash. The setpoint of a drive is therefore the position of the
+slider plus an offset: half the backlash in the direction of the last motion. The position of the slider is the drive's
+measurement minus that offset. After a reversal, the offset changes to the other side over the time given by
+trirail.motion.backlash_reserve. Only one change runs at a time: a slider that reverses during a change waits until the
+change is complete. After two reversals during a change, the offset first changes to the other side, because the slider
+may be anywhere within its backlash. While the last direction of a slider is unknown, for example after power-on, the
+offset is zero.
 """
 
 from __future__ import annotations
@@ -32,23 +33,23 @@ __all__ = [
 ]
 
 MIN_REVERSAL_M = 5e-7
-"""Shortest motion that counts as a reversal [m]: compensating shorter ones has no benefit, and wears the drive."""
+"""Shortest motion that counts as a reversal [m]. Compensating shorter ones has no benefit and wears the drive."""
 OFFSETS_KEPT = 5
-"""Number of past setpoints whose offsets are kept, for trirail.control.feedback."""
+"""Number of past setpoints whose offsets are kept for trirail.control.feedback."""
 
 BACKLASH = np.dtype(
     [
-        ("half", "<f8", 3),  # of the backlash [m]
-        ("step", "<f8"),  # share of a change per cycle; zero without backlash
-        ("period", "<f8"),  # of a cycle [s]
-        ("offset", "<f8", 3),  # in the newest setpoints [m]
-        ("begin", "<f8", 3),  # offset at the beginning and at the end of the change [m]
+        ("half", "<f8", 3),  # half the backlash [m]
+        ("step", "<f8"),  # share of a change that is made per cycle; zero without backlash
+        ("period", "<f8"),  # duration of a cycle [s]
+        ("offset", "<f8", 3),  # offset in the latest setpoints [m]
+        ("begin", "<f8", 3),  # offsets at the beginning and at the end of the change [m]
         ("end", "<f8", 3),
-        ("done", "<f8", 3),  # share of the change that is done; one when complete
-        ("turns", "<i8", 3),  # reversals of a slider since the change began
-        ("heading", "<f8", 3),  # direction in which a slider last moved: 1 or -1; 0 while unknown
+        ("done", "<f8", 3),  # completed share of the change; one when it is complete
+        ("turns", "<i8", 3),  # number of reversals since the change began
+        ("heading", "<f8", 3),  # direction in which a slider last moved: 1 or -1; 0 if unknown
         ("farthest", "<f8", 3),  # farthest position in that direction [m]; NaN before the first command
-        ("offsets", "<f8", (OFFSETS_KEPT, 3)),  # in the setpoints of the cycles before, the newest last
+        ("offsets", "<f8", (OFFSETS_KEPT, 3)),  # offsets in the setpoints of previous cycles, the latest last
     ],
     align=True,
 )
@@ -56,7 +57,7 @@ BACKLASH = np.dtype(
 
 
 def backlash(take_up: TakeUp, period: float) -> NDArray[np.void]:
-    """Return the initial state, (2,): the current one, and room for a tentative one."""
+    """Return the initial state, (2,): the current state, and space for a tentative one."""
     state = np.zeros(2, BACKLASH)
     state["half"] = np.array(take_up.widths) / 2.0
     state["step"] = 1.0 / math.ceil(take_up.duration / period) if take_up.duration > 0.0 else 0.0
@@ -67,16 +68,17 @@ def backlash(take_up: TakeUp, period: float) -> NDArray[np.void]:
 
 @compiled()
 def add_offset(states: NDArray[np.void], sliders: Array) -> None:
-    """Add the offset of the next cycle to solved sliders, and write the new state to states[1].
+    """Add the offset of the next cycle to the solved slider positions, and write the new state to states[1].
 
-    The caller accepts the setpoints by `states[0] = states[1]`; without that, the next call begins from the same state.
+    To accept the setpoints, the caller assigns `states[0] = states[1]`. Otherwise, the next call starts from the same
+    state.
 
     Parameters
     ----------
     states : (2,)
-        Current and tentative state, of BACKLASH.
+        Current and tentative state, of dtype BACKLASH.
     sliders : (6, 3)
-        Rows lambda_10, v_10, gamma_10, then those of the cross slides.
+        Rows lambda_10, v_10, gamma_10 of the sliders, then the same rows of the cross slides.
 
     """
     if states[0].step == 0.0:
@@ -113,21 +115,21 @@ def taking_up(states: NDArray[np.void]) -> bool:
 
 @compiled()
 def keep_offset(states: NDArray[np.void]) -> None:
-    """Append the offset of the setpoints of the previous cycle to the past offsets."""
+    """Append the offset of the previous cycle's setpoints to the past offsets."""
     states[0].offsets[:-1] = states[0].offsets[1:]
     states[0].offsets[-1] = states[0].offset
 
 
 @compiled()
 def due_offset(states: NDArray[np.void], age: int, i: int) -> float:
-    """Return the offset [m] in the setpoint that was in force for slider i when it was measured, `age` SYNCs ago."""
+    """Return the offset [m] in the setpoint that was active when slider i was measured, `age` SYNCs ago."""
     due: float = states[0].offsets[OFFSETS_KEPT - 2 - age, i]
     return due
 
 
 @compiled()
 def release_offsets(states: NDArray[np.void]) -> None:
-    """Freeze the offsets while the sliders move freely, so that holding them again causes no motion."""
+    """Freeze the offsets while the sliders move freely, so that nothing moves when they are held again."""
     for i in range(3):
         if states[0].done[i] < 1.0:
             states[0].end[i], states[0].done[i], states[0].heading[i] = states[0].offset[i], 1.0, 0.0

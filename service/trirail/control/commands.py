@@ -1,4 +1,4 @@
-"""Commands of clients: the check before each one, its effect, and the rule for its completion."""
+"""Commands from clients: the check before a command starts, its effect, and the rule for its completion."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
 class CommandProgress(NamedTuple):
-    """State of the robot by which a rule decides whether a command is complete."""
+    """State of the robot from which a rule decides whether a command is complete."""
 
     mode: Mode
     latched: str | None
-    """Reason of the latched fault, if any."""
+    """Reason for the latched fault, if any."""
     measured: MeasuredState
     settled: bool
     """Whether the drives have had enough time to leave their fault state."""
 
 
 Rule = Callable[[CommandProgress], str | None]
-"""Function that returns "" for a completed command, None for one in progress, else the reason of its failure."""
+"""Function that returns "" if a command is complete, None if it is in progress, or the reason why it has failed."""
 
 
 def completed_on_arrival(_: CommandProgress) -> str:
-    """Return "": the command is complete on arrival."""
+    """Return "" because the command is complete when it arrives."""
     return ""
 
 
@@ -52,7 +52,7 @@ def standing(now: CommandProgress) -> str | None:
 
 
 def powered_up(now: CommandProgress) -> str | None:
-    """Return "" once the drives have power and the robot holds."""
+    """Return "" once the drives have power and the robot holds its position."""
     if now.mode is Mode.ENABLING:
         return None
     return "" if now.mode not in (Mode.FAULT, Mode.DISABLED) else now.latched or "disabled while powering up"
@@ -83,24 +83,24 @@ def cleared(now: CommandProgress) -> str | None:
 
 
 def _timed_out(now: CommandProgress) -> str:
-    """Return the message of a drive that has timed out; else ""."""
+    """Return the fault message of a drive that has timed out; "" if there is none."""
     fault = now.measured.feedback.fault
     return fault.message if fault is not None and fault.cause == "timeout" else ""
 
 
 def powered_message(measured: MeasuredState, latched: str | None) -> str:
-    """Return the refusal of a reset that names the drives that can still move."""
+    """Return the message that refuses a reset and names the drives that can still move."""
     states = zip(NAMES, measured.feedback.state, strict=True)
     drives = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
     return f"{drives} by its last statusword: send reset again when the drives are at rest (fault: {latched})"
 
 
 SETTLE = 0.1
-"""Time for the drives to leave their fault state after a reset [s]."""
+"""Time that the drives have to leave their fault state after a reset [s]."""
 
 
 class Commands:
-    """Executor of commands: each begins in the cycle of its arrival, and is answered when complete."""
+    """Executor of commands. A command starts in the cycle in which it arrives, and is answered when it is complete."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ class Commands:
         self._settle_cycles = max(3, round(SETTLE / config.period))
 
     def carry_out(self, request: CommandRequest) -> None:
-        """Begin a command. Raises RefusedError if it is not allowed."""
+        """Start a command. Raises RefusedError if it is not allowed."""
         if not request.name.ignores_lease:
             self._lease.check(request.user)
         EFFECTS[request.name].begin(self, request)
@@ -137,17 +137,17 @@ class Commands:
         self._ledger.settle(self._verdict, self._modes.state.mode, self._modes.cycle + 1)
 
     def end_silent_lease(self) -> None:
-        """End a lease that has not been renewed in time."""
+        """End the lease if it was not renewed in time."""
         if (over := self._lease.expire(self._modes.cycle)) is not None:
             self._change_lease(over)
 
     def _change_mode(self, request: CommandRequest) -> None:
-        """Apply the mode event of the command's name."""
+        """Apply the mode event that has the same name as the command."""
         event, reason = ModeEvent[request.name.name], _reason(request)
         action = self._modes.check(event).action
         goal = self._ledger.goal
         if event is ModeEvent.PAUSE and goal is not None and goal.kind.renewed:
-            event = ModeEvent.STOP  # a jog or a track cannot be resumed: its key is released, its target has moved on
+            event = ModeEvent.STOP  # neither can resume: a jog's key has been released, a track's target has moved on
         if action is Action.POWER_UP:
             self._setpoints.check_rest()
             if self._measured.homed and (outside := self._setpoints.check_start()) is not None:
@@ -163,7 +163,7 @@ class Commands:
             self._modes.withdraw(event, reason)
 
     def _stop(self, request: CommandRequest) -> None:
-        """Stop the robot, or only the named goal if it has not begun."""
+        """Stop the robot. If the command names a goal that has not begun, stop only that goal."""
         goal = request.content.goal
         if goal is None or not self._goal_queue.stop_alone(goal, _reason(request)):
             self._change_mode(request)
@@ -174,7 +174,7 @@ class Commands:
         self._change_mode(request)
 
     def _override(self, request: CommandRequest) -> None:
-        """Set the speed override of this motion and of later ones."""
+        """Set the speed override for the current motion and all later ones."""
         rate = self._planner.override = request.content.percent / 100.0
         self._planner.update_rate()
         words = f"override {rate:.0%} by {request.user}"
@@ -182,7 +182,7 @@ class Commands:
         self._ledger.notices.append(Notice("service", "info", text.text, user=request.user, **text.fields))
 
     def _set_output(self, request: CommandRequest) -> None:
-        """Set an output; it switches with the next setpoints."""
+        """Set an output. It switches together with the next setpoints."""
         name, value = request.content.output, request.content.value
         self._outputs.set(name, value, self._modes.state.mode)
         words = f"output {name} {'on' if value else 'off'} by {request.user}"
@@ -190,7 +190,7 @@ class Commands:
         self._ledger.notices.append(Notice("output", "info", text.text, user=request.user, **text.fields))
 
     def _acquire(self, request: CommandRequest) -> None:
-        """Give a user the lease, or renew it."""
+        """Grant a user the lease, or renew it."""
         change = self._lease.acquire(request.user, request.content, self._modes.cycle)
         if change is not None:
             self._change_lease(change)
@@ -199,7 +199,7 @@ class Commands:
         self._change_lease(self._lease.release(request.user, request.content))
 
     def _change_lease(self, change: LeaseChange) -> None:
-        """Report the new holder of the lease; stop other users' motion, and withdraw their waiting goals."""
+        """Report the new holder of the lease, stop other users' motion, and withdraw their waiting goals."""
         user = self._lease.user
         text = change.message
         self._ledger.notices.append(Notice("lease", change.level, text.text, user=user, **text.fields))
@@ -208,7 +208,7 @@ class Commands:
             self._modes.withdraw(ModeEvent.STOP, text)
 
     def _verdict(self, name: Command, since: int) -> str | None:
-        """Return the result of the rule for a command that arrived in cycle `since`."""
+        """Return the result of the completion rule for a command that arrived in cycle `since`."""
         settled = self._modes.cycle - since >= self._settle_cycles
         return EFFECTS[name].rule(CommandProgress(self._modes.state.mode, self._modes.fault, self._measured, settled))
 

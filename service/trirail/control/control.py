@@ -1,8 +1,9 @@
-"""Control of the robot, one cycle at a time, without a clock, a socket or a file.
+"""Control of the robot, one cycle at a time. It uses no clock, socket or file.
 
-A cycle executes three steps: `observe` the drives' feedback, `solve` the sliders, and `write` the setpoints accepted by
-the last gate. Between two cycles, `conclude` evaluates the previous one, and `decide` handles requests and so chooses
-the motion of the next one. Answers and notices wait in the `ledger`.
+A cycle has three steps: `observe` evaluates the drives' feedback, `solve` computes the slider positions, and `write`
+sends the setpoints that the last gate has accepted. Between two cycles, `conclude` evaluates the cycle that has ended,
+and `decide` handles requests and chooses the motion of the next cycle. Answers and notices are collected in the
+`ledger`.
 """
 
 from __future__ import annotations
@@ -50,26 +51,26 @@ from trirail.wire.records import Part
 from trirail.wire.vocabulary import FaultCause, Mode
 
 TimedInput = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
-"""Input of the control in a cycle, and its time by the monotonic clock [ns]."""
+"""Input of the control in a cycle, and the time at which it was received, on the monotonic clock [ns]."""
 
 
 class SteadyState(NamedTuple):
-    """State of the control while cycles only continue, so that the compiled call can run them."""
+    """State of the control in which the compiled call can run cycles without Python."""
 
     run: Run | None
-    """Motion under way, if setpoints come from one."""
+    """Motion that supplies the setpoints; None if no motion is under way."""
     follows: bool
-    """Whether setpoints follow the measured sliders; otherwise, without a run, they stay unchanged."""
+    """Whether the setpoints follow the measured sliders. If False and there is no run, the setpoints do not change."""
     held: bool
-    """Argument of trirail.control.cycle.follow."""
+    """Argument `held` of trirail.control.cycle.follow."""
     at_rest: bool
-    """Argument of trirail.control.cycle.observe."""
+    """Argument `at_rest` of trirail.control.cycle.observe."""
     code: int
-    """Result of trirail.control.cycle.command in the newest cycle."""
+    """Result of trirail.control.cycle.command in the latest cycle."""
     until: float
-    """Last cycle before Python is needed."""
+    """Last cycle that can run without Python."""
     settles_by: int | None
-    """Cycle of the time-out of a goal that waits for the robot to be in position; None for no such goal."""
+    """Cycle in which the settling time-out of the current goal ends; None if no goal is settling."""
 
 
 class Control:
@@ -111,7 +112,7 @@ class Control:
         self._enable_cycles = round(config.watchdogs.enable_timeout / config.period)
         self._solve_code = 0
         self._concluding = False
-        """Whether the setpoints of the present cycle have been sent."""
+        """Whether the setpoints of the current cycle have been sent."""
 
     @property
     def cycles(self) -> int:
@@ -120,16 +121,16 @@ class Control:
 
     @property
     def state(self) -> ModeState:
-        """Mode, and the action that follows once the robot is at rest."""
+        """Current mode, and the action that follows once the robot is at rest."""
         return self.modes.state
 
     @property
     def fault(self) -> str | None:
-        """Reason of the latched fault; None without a fault."""
+        """Reason for the latched fault; None if there is no fault."""
         return self.modes.fault
 
     def steady_state(self) -> SteadyState | None:
-        """Return the state in which cycles only continue; None if Python must run the next cycle."""
+        """Return the state for running cycles without Python; None if Python must run the next cycle."""
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
@@ -152,11 +153,11 @@ class Control:
 
     @property
     def _follows(self) -> bool:
-        """Whether setpoints follow the measured sliders."""
+        """Whether the setpoints follow the measured sliders."""
         return self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
 
     def _waits(self, run: Run | None) -> bool:
-        """Return whether a motion has ended and its goal waits, to settle or to be renewed."""
+        """Return whether the motion has ended and its goal is waiting, either to settle or to be renewed."""
         if run is None or not run.arrived:
             return False
         goal = self.ledger.goal
@@ -164,16 +165,16 @@ class Control:
         return self.state.mode is Mode.MOVING and (self.measured.settling.under_way or target)
 
     def resume(self, newest: int, time: float, code: int | None) -> None:
-        """Continue after cycles that the compiled call has run.
+        """Update the control after the compiled call has run cycles.
 
         Parameters
         ----------
         newest
-            Number of the newest cycle.
+            Number of the last cycle that the compiled call has run.
         time
             Time of the run's law in that cycle [s].
         code
-            Result of the compiled call in that cycle if it must be handled, else None.
+            Result of the compiled call in that cycle if the control must handle it, else None.
 
         """
         self.schedule.cycle += newest - self.cycles
@@ -185,7 +186,7 @@ class Control:
             self.conclude()
 
     def cycle(self, read: Callable[[], Feedback], inputs: Iterable[TimedInput] = ()) -> None:
-        """Run a whole cycle: handle the inputs, `read` the feedback, execute, and conclude."""
+        """Run one complete cycle: handle the inputs, `read` the feedback, execute the cycle, and conclude it."""
         self.decide(inputs)
         self.execute(read())
         self.conclude()
@@ -198,14 +199,15 @@ class Control:
         behind: int | None = None,
         code: int | None = None,
     ) -> None:
-        """Run one cycle on the drives' feedback at its SYNC. An exception in it stops the robot.
+        """Run the steps of one cycle, given the drives' feedback at its SYNC. Any exception stops the robot.
 
         Parameters
         ----------
         mark
-            Called at the end of each part of the cycle.
+            Function called at the end of each part of the cycle.
         behind, code
-            Results of the compiled `observe`, and of `command` or `hold`, if the compiled call has begun this cycle.
+            If the compiled call has already begun this cycle: the result of `observe`, and the result of `command` or
+            `hold`.
 
         """
         try:
@@ -230,7 +232,7 @@ class Control:
     # ------------------------------------------------------------------ the cycle, in its order
 
     def start(self, feedback: Feedback) -> None:
-        """Begin with the measured sliders as the commanded ones, before the first cycle."""
+        """Start the control before the first cycle, with the measured slider positions as the commanded ones."""
         if self.outputs.any:
             self.outputs.allow_paths(self._drives.path_outputs)
         self.measured.start(feedback)
@@ -240,9 +242,9 @@ class Control:
         self._report_warnings(feedback)
 
     def observe(self, feedback: Feedback, behind: int | None = None) -> None:
-        """Evaluate the drives' feedback at this SYNC; trip on a fault or a following error.
+        """Evaluate the drives' feedback at this SYNC; trip on a drive fault or an excessive following error.
 
-        `behind` is the result of the compiled `observe`, if it has been called.
+        `behind` is the result of the compiled `observe` if that has been called already.
         """
         before = self.measured.feedback
         if behind is None:
@@ -254,7 +256,7 @@ class Control:
             drive, cause, code, message = feedback.fault
             text = coded(message, EventCode.DRIVE_FAULT, cause=cause, drive=drive, code=code)
             if mode is Mode.FAULT and feedback.fault != before.fault:
-                # The first fault stays latched; this one followed from it.
+                # The first fault stays latched; this one is a consequence of it.
                 detail = FaultDetail(cause, drive, code)
                 self.ledger.notices.append(Notice("fault", "error", message, fault=detail, **text.fields))
             self.modes.trip(text, cause, drive, code)
@@ -271,7 +273,7 @@ class Control:
                 self._end_homing()
 
     def _report_warnings(self, feedback: Feedback) -> None:
-        """Report the drives' warnings; each is in a single feedback."""
+        """Report the drives' warnings. A warning appears in the feedback of one cycle only."""
         for warning in feedback.warnings:
             text = coded(warning, EventCode.DRIVE_WARNING, warning=warning)
             self.ledger.notices.append(Notice("service", "warning", warning, **text.fields))
@@ -279,7 +281,7 @@ class Control:
             self.ledger.notices.append(Notice("service", level, text.text, **text.fields))
 
     def solve(self) -> None:
-        """Advance the commanded motion by one period, and solve the sliders for it, in one compiled call."""
+        """Advance the commanded motion by one period and solve the slider positions for it, in one compiled call."""
         run = self.schedule.begin_cycle()
         if self._follows:
             self._solve_code = 0
@@ -296,7 +298,7 @@ class Control:
             self.modes.trip(coded(refused, EventCode.BAD_SETPOINT), FaultCause.LIMIT)
 
     def _switch_outputs(self) -> None:
-        """Switch the outputs that are due with the setpoints of this cycle."""
+        """Switch the outputs that are due together with the setpoints of this cycle."""
         if not self.outputs.any:
             return
         self.outputs.follow_mode(self.state.mode)
@@ -307,7 +309,7 @@ class Control:
         self._drives.set_outputs(self.outputs.words.tolist())
 
     def _goal_ended(self, goal: str, outcome: Outcome) -> None:
-        """Switch back the outputs that a goal has open, and report its switches before its end."""
+        """Switch back the outputs that an ended goal still holds, and report its switches before its end."""
         self.outputs.close(goal, outcome, self.modes.cycle + self._concluding, self.measured.record)
         self._report_switches(all_=True)
 
@@ -318,7 +320,7 @@ class Control:
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
     def _handle_edges(self, before: Feedback, now: Feedback) -> None:
-        """Report the inputs that have changed; stop a goal that ends at such an edge."""
+        """Report the inputs that have changed, and stop the current goal if it ends at one of these edges."""
         goal, pose = self.ledger.goal, self.measured.pose
         x, y, phi = pose
         for name, value in self.outputs.edges(before.inputs, now.inputs):
@@ -335,13 +337,13 @@ class Control:
                 self.modes.apply_event(ModeEvent.INPUT_EDGE, reached)
 
     def write(self) -> None:
-        """Send the setpoints."""
+        """Send the setpoints to the drives."""
         self._drives.write(*self.setpoints.sent)
 
     # ------------------------------------------------------------------ between two cycles
 
     def conclude(self) -> None:
-        """Evaluate the cycle: end goals or the motion, and answer commands that are complete."""
+        """Evaluate the cycle that has ended: end goals or the motion, and answer completed commands."""
         self._concluding = True
         try:
             schedule, code = self.schedule, self._solve_code
@@ -363,7 +365,8 @@ class Control:
     def decide(self, inputs: Iterable[TimedInput]) -> None:
         """Prepare the next cycle.
 
-        Handle inputs, end a lease or jog that is not renewed, begin a planned motion, and request a check.
+        Handle the inputs, end a lease or a jog that was not renewed in time, start a motion that has been planned, and
+        request the next check.
         """
         try:
             for each, now_ns in inputs:
@@ -384,7 +387,7 @@ class Control:
             self._trip_for(error)
 
     def handle(self, received: Request | Disturbance | PlanAnswer | PlannerLost, now_ns: int) -> None:
-        """Handle a request, a disturbance or a plan, received at a time of the monotonic clock [ns]."""
+        """Handle a request, a disturbance or a plan that was received at a time on the monotonic clock [ns]."""
         try:
             match received:
                 case Disturbance():
@@ -407,7 +410,7 @@ class Control:
             self._trip_for(error)
 
     def _answer(self, request: GoalRequest | CommandRequest, now_ns: int) -> None:
-        """Begin a command, or enqueue a goal; answer a refusal."""
+        """Start a command or enqueue a goal. Reply with a refusal if it is not accepted."""
         try:
             if isinstance(request, GoalRequest):
                 self.goal_queue.enqueue(request, now_ns, self.modes.cycle)
@@ -425,12 +428,12 @@ class Control:
 
     @property
     def override(self) -> float:
-        """Speed override, as a factor."""
+        """Speed override as a factor."""
         return self._planner.override
 
     @property
     def target(self) -> Triple | None:
-        """End pose of the goal under way, or the last reported pose of its target; None for a jog."""
+        """End pose of the current goal; for a track, the last reported pose of its target; None for a jog."""
         last, goal = self.schedule.last, self.ledger.goal
         if goal is None or last is None:
             return None
@@ -442,7 +445,7 @@ class Control:
     # ------------------------------------------------------------------ requests
 
     def _admit(self) -> bool:
-        """Return whether the robot is moving to a goal. Raises RefusedError if it accepts no goal now."""
+        """Return whether the robot is moving to a goal. Raises RefusedError if the robot cannot accept a goal now."""
         self.modes.check(ModeEvent.GOAL)
         self._check_homed()
         return self.state.mode is Mode.MOVING
@@ -452,10 +455,10 @@ class Control:
             raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
 
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
-        """Return the pose from which a move begins: the end of the goals before it, or the measured pose.
+        """Return the pose from which a relative move begins: the end of the earlier goals, or the measured pose.
 
-        Raises RefusedError while a goal is stopped on its path, paused or at override 0: the user would expect a move
-        from there.
+        Raises RefusedError if a goal has stopped on its path, because it is paused or the override is 0. The user would
+        then expect the move to begin where the robot stands.
         """
         if origin == "measured":
             return self.measured.pose
@@ -468,13 +471,16 @@ class Control:
         return self._end_pose
 
     def _place_of_check(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
-        """Return the pose from which a check plans: as `_place`, but of a goal that waits on its path, the end."""
+        """Return the pose from which a check is planned.
+
+        It is the pose that `_place` returns. If a goal is waiting on its path, it is the end of that path.
+        """
         self._check_homed()
         return self.measured.pose if origin == "measured" else self._end_pose
 
     @property
     def _end_pose(self) -> Sequence[float]:
-        """Pose at the end of the goals under way; the commanded one without such an end."""
+        """Pose at the end of the goals under way; the commanded pose if they have no fixed end."""
         last, goal = self.schedule.last, self.ledger.goal
         if last is None or goal is None or goal.kind.renewed:
             return self.commanded.pose
@@ -488,15 +494,15 @@ class Control:
         return (self.state.mode is Mode.HOLDING and self.measured.homed) or self.measured.settling.under_way
 
     def _end_motion(self, run: Run) -> None:
-        """Handle the end of the motion, at its target or at a standstill on the way.
+        """Handle the end of the motion, which is at its target or at a standstill on the way.
 
-        A goal whose path has ended stays under way until the robot is in position.
+        A goal whose path has ended remains under way until the robot is in position.
         """
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
             self.modes.apply_event(ModeEvent.STANDSTILL, coded("standstill", EventCode.STANDSTILL))
         elif self.state.mode is Mode.MOVING and goal is not None and goal.kind.waits_at_end:
-            return  # the goal waits for its renewal
+            return  # the goal is waiting to be renewed
         elif goal is None or not goal.settles:
             self.modes.apply_event(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
         elif not settling.under_way:
@@ -513,7 +519,7 @@ class Control:
         self.modes.apply_event(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
 
     def _power_up(self) -> None:
-        """Continue once all drives are enabled; trip after the time-out."""
+        """Continue once all drives are enabled; trip if they are not enabled within the time-out."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
             if not self.measured.homed:
                 words = "all drives are enabled; the positions of the sliders are unknown: send home"
@@ -537,9 +543,9 @@ class Control:
             self.modes.trip(text, FaultCause.ENABLE)
 
     def _end_homing(self) -> None:
-        """Hold the position once homing has ended or was stopped."""
+        """Hold the position once homing is complete or has been stopped."""
         if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self.schedule.runs:
-            return  # no homing was under way
+            return  # the robot was not homing
         if self.measured.homed:
             try:
                 outside = self.setpoints.check_start()
@@ -557,7 +563,7 @@ class Control:
             self.modes.apply_event(ModeEvent.HOMED, coded("all drives are homed", EventCode.HOMED))
 
     def _rest_at_setpoints(self) -> bool:
-        """Command the pose of the setpoints, at rest; trip and return False if they belong to no pose."""
+        """Command the pose that matches the setpoints, at rest. If no pose matches, trip and return False."""
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
@@ -569,7 +575,7 @@ class Control:
         return True
 
     def _follow_measured(self) -> None:
-        """Command the measured pose, and the measured positions of the sliders."""
+        """Command the measured pose and the measured slider positions."""
         held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
         stopped_now = self.state.mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         self.setpoints.follow(self.schedule, held=held, stopped_now=stopped_now)

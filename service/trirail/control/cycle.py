@@ -1,32 +1,34 @@
-"""Compiled arithmetic of one cycle: the robot's measured state, and the next setpoints of the sliders.
+"""Compiled computations of one cycle: the measured state of the robot, and the next setpoints of the sliders.
 
-`observe` evaluates the drives' feedback at a SYNC. `command` moves the platform along its path by one period, and
-solves the sliders for it, if the last gate accepts them; `hold` does the same for a platform at rest, and `follow`
-leads the setpoints to the measured sliders. Each function works on preallocated arrays, allocates nothing, and writes
-the cycle's record. Between the two calls of a cycle the control decides on changes of mode.
+`observe` evaluates the drives' feedback at a SYNC. `command` moves the platform along its path by one period and solves
+the slider positions; they are used only if the last gate accepts them. `hold` does the same for a platform at rest.
+`follow` moves the setpoints towards the measured sliders. All functions work on preallocated arrays, allocate no
+memory, and write to the record of the cycle. The control decides on changes of mode between `observe` and the other
+functions.
 
-Arrays common to these functions:
+The functions share these arrays:
 
 legs
     Geometry.packed().
 bounds
     Bounds.packed.
 feedback : (2,)
-    Newest and previous feedback, of FEEDBACK.
+    Latest and previous feedback, of dtype FEEDBACK.
 written : (5, 3)
-    Setpoints of the previous cycles, the newest last [m].
+    Setpoints of the previous cycles, the latest last [m].
 motion : (2, 3, 3)
-    Commanded motion of the platform in this cycle and in the previous one: rows pose, velocity, acceleration.
+    Commanded motion of the platform in this cycle and in the previous one; rows are pose, velocity, acceleration.
 sliders : (2, 6, 3)
-    Accepted and tentative sliders: rows position, velocity, acceleration, then those of the cross slides.
+    Accepted and tentative sliders; rows are position, velocity and acceleration of the sliders, then of the cross
+    slides.
 backlash : (2,)
-    Accepted and tentative state of backlash compensation, of BACKLASH.
+    Accepted and tentative state of the backlash compensation, of dtype BACKLASH.
 refused_values : (2,)
     Values that the last gate has refused.
 record : (1,)
-    The cycle's record, of trirail.wire.records.DTYPE.
+    Record of the cycle, of dtype trirail.wire.records.DTYPE.
 
-Positions of sliders, commanded or measured, include the offset that compensates backlash.
+Commanded and measured slider positions include the offset of the backlash compensation.
 """
 
 from __future__ import annotations
@@ -68,25 +70,25 @@ __all__ = [
 ]
 
 MAX_AGE = 3
-"""Greatest age of a position that is compared with its setpoint [SYNCs]; an older one means a silent drive."""
+"""Greatest age at which a position is compared with its setpoint [SYNCs]. A drive with an older position is silent."""
 PASSED, AT_REST = 1, 2
-"""Bits in the result of `command`: the goal under way has ended on the path; the motion is at rest."""
+"""Bits in the result of `command`: the current goal has ended on the path, and the motion is at rest."""
 MAX_DISTANCE_STEPS = 1000
-"""Greatest plausible distance of a setpoint from its slider, in steps; beyond it the setpoint has followed a wrong
-position."""
+"""Greatest plausible distance of a setpoint from its slider [steps]. Beyond this distance, the setpoint has followed a
+wrong position."""
 BACKWARDS = -1
 """Refusal of `command`: the time along the path would decrease."""
 DRIFTING = -2
-"""Refusal of `command` and `hold`: the platform would move in a mode of standstill."""
+"""Refusal of `command` and `hold`: the platform would move although the mode requires a standstill."""
 NOT_BRAKING = -3
-"""Refusal of `command`: a braking motion would continue."""
+"""Refusal of `command`: the motion would continue although it must brake."""
 MAX_DRIFT = 1e-12
-"""Greatest change of a pose per cycle that counts as rounding [m, rad]: at 1 kHz a drift of 1 nm/s is refused."""
+"""Greatest change of a pose per cycle that is treated as rounding [m, rad]. At 1 kHz, a drift of 1 nm/s is refused."""
 MAX_DRIFT_VELOCITY = 1e-9
-"""Greatest velocity that counts as rounding [m/s, rad/s]."""
+"""Greatest velocity that is treated as rounding [m/s, rad/s]."""
 _ANY, _BRAKING, _BRAKED, _NONE = (int(allowed) for allowed in AllowedMotion)
 MAX_RECORDED_AGE = 255
-"""Greatest age of feedback in a record [SYNCs]; a greater one is recorded as this."""
+"""Greatest age of feedback in a record [SYNCs]; greater ages are recorded as this value."""
 
 FEEDBACK = np.dtype(
     [
@@ -99,9 +101,9 @@ FEEDBACK = np.dtype(
     ],
     align=True,
 )
-"""Numeric fields of trirail_drivers.interface.Feedback."""
+"""Layout of the numeric fields of trirail_drivers.interface.Feedback."""
 FEEDBACK_STRUCT = struct.Struct("<3d3q10B")
-"""Struct with the layout of FEEDBACK."""
+"""Struct with the same layout as FEEDBACK."""
 
 LEGS = typeof(Geometry.symmetric().packed())  # type: ignore[no-untyped-call]
 BOUND, FEEDBACKS, RECORD = from_dtype(BOUNDS)[::1], from_dtype(FEEDBACK)[::1], from_dtype(DTYPE)[::1]
@@ -126,27 +128,27 @@ def observe(
     monitored: NDArray[np.void],
     record: NDArray[np.void],
 ) -> int:
-    """Compute pose, velocities and following errors from feedback[0], and keep it as feedback[1].
+    """Compute pose, velocities and following errors from feedback[0], then copy it to feedback[1].
 
-    The pose stays unchanged if a slider jumps, or the sliders belong to no pose.
+    The pose does not change if a slider position jumps, or if no pose matches the slider positions.
 
     Parameters
     ----------
     fastest
-        Velocity above which a slider jumps [m/s].
+        Velocity above which a slider position counts as jumping [m/s].
     limit
-        Limit of following errors [m].
+        Limit of the following errors [m].
     at_rest
-        Whether the commanded motion is at rest; then `monitored` records whether the robot is in position.
+        Whether the commanded motion is at rest. If so, `monitored` records whether the robot is in position.
     jumps : (3,)
-        Whether each slider jumps; written here.
+        Output: whether the position of each slider jumps.
     scratch : (2, 3)
         Scratch space.
 
     Returns
     -------
     int
-        0, or 1 + i if slider i is the first with a following error beyond the limit.
+        0 if all following errors are within the limit; 1 + i if slider i is the first that exceeds it.
 
     """
     now, before, row = feedback[0], feedback[1], record[0]
@@ -158,12 +160,12 @@ def observe(
         cycles = 1 + before.age[i] - now.age[i]
         if cycles > 0:  # otherwise there is no newer position
             row.velocity[i] = (now.position[i] - before.position[i]) / (cycles * period)
-        # At a SYNC a drive reaches the setpoint that it has accepted one SYNC ago, which was written a cycle earlier.
+        # At a SYNC, a drive reaches the setpoint that it accepted one SYNC earlier and that was written a cycle before.
         age = min(now.age[i], MAX_AGE)
         row.backlash[i] = due_offset(backlash, age, i)
         if not now.follows[i]:
             row.following_error[i] = 0.0
-        elif now.age[i] <= MAX_AGE:  # otherwise its setpoint is no longer known, and the error stays unchanged
+        elif now.age[i] <= MAX_AGE:  # otherwise the setpoint is unknown, and the error stays unchanged
             row.following_error[i] = written[len(written) - 2 - age, i] - now.position[i]
         if beyond == 0 and not abs(row.following_error[i]) <= limit:
             beyond = 1 + i
@@ -183,7 +185,7 @@ def observe(
 
 @compiled()
 def _record_command(motion: Array, sliders: Array, progress: float, remaining: float, record: NDArray[np.void]) -> None:
-    """Write the commanded values into the record."""
+    """Write the commanded values to the record."""
     row = record[0]
     for i in range(3):
         row.commanded_pose[i] = motion[0, 0, i]
@@ -198,7 +200,7 @@ def _record_command(motion: Array, sliders: Array, progress: float, remaining: f
 
 @compiled()
 def _is_drifting(motion: Array, refused_values: Array) -> bool:
-    """Return whether the platform moves; if so, write its change and velocity to `refused_values`."""
+    """Return whether the platform moves. If it does, write its change and velocity to `refused_values`."""
     for n in range(3):
         change = motion[0, 0, n] - motion[1, 0, n]
         if not (abs(change) <= MAX_DRIFT and abs(motion[0, 1, n]) <= MAX_DRIFT_VELOCITY):
@@ -216,7 +218,7 @@ def _solve(
     backlash: NDArray[np.void],
     refused_values: Array,
 ) -> int:
-    """Solve the sliders for the platform's motion; leave them unchanged if the last gate refuses the result.
+    """Solve the slider positions for the platform's motion. They stay unchanged if the last gate refuses the result.
 
     Returns 0, 1 + i if leg i is singular or a number is not finite, 3 + a code of trirail.motion.limits.gate, or
     DRIFTING.
@@ -261,22 +263,22 @@ def command(
     refused_values: Array,
     record: NDArray[np.void],
 ) -> int:
-    """Move the platform along its path to a time of its law, and solve the sliders for it.
+    """Move the platform along its path to a time of its law, and solve the slider positions.
 
     Parameters
     ----------
     knots, pieces, in_sliders, tools
-        Path.
+        The path.
     law_knots, law_pieces
-        Law of time along the path.
+        The law, which gives the time along the path.
     time
         Time of the law [s].
     target
-        Rate to which the law leads.
+        Rate at which the law ends.
     furthest : (1,)
-        Greatest time along the path until now [s]; less is refused.
+        Greatest time along the path up to now [s]. An earlier time is refused.
     begun, end, arrival
-        Begin and end of the goal under way, as times along the path, and time of the law at its end [s].
+        Times along the path at which the current goal begins and ends, and time of the law at which it ends [s].
 
     Returns
     -------
@@ -318,7 +320,7 @@ def hold(
     refused_values: Array,
     record: NDArray[np.void],
 ) -> int:
-    """Solve the sliders for a platform at rest; return a code as `command` does."""
+    """Solve the slider positions for a platform at rest. The result is coded as that of `command`."""
     motion[1] = motion[0]
     refused = _solve(legs, bounds, motion, sliders, backlash, refused_values)
     _record_command(motion, sliders, 0.0, 0.0, record)
@@ -326,10 +328,10 @@ def hold(
 
 
 def refusal(code: int) -> int:
-    """Return the refusal in a result of `command` or `hold`.
+    """Return the refusal contained in a result of `command` or `hold`.
 
-    It is 0 for none, BACKWARDS, DRIFTING, NOT_BRAKING, 1 + i if leg i is singular or a number is not finite, or 3 + a
-    code for Bounds.violation.
+    The refusal is 0 for none, BACKWARDS, DRIFTING, NOT_BRAKING, 1 + i if leg i is singular or a number is not finite,
+    or 3 + a code for Bounds.violation.
     """
     return code >> 2
 
@@ -347,18 +349,18 @@ def follow(
     backlash: NDArray[np.void],
     record: NDArray[np.void],
 ) -> None:
-    """Command the measured pose, at rest, and lead each setpoint towards its slider.
+    """Command the measured pose at rest, and move each setpoint towards the position of its slider.
 
-    A position that jumps is not followed. A drive that moves by itself gets its own position immediately. So does a
-    drive without power whose setpoint is more than MAX_DISTANCE_STEPS away, since that setpoint has followed a wrong
-    position.
+    A setpoint changes by at most `step` per cycle, and does not follow a position that jumps. For a drive that moves by
+    itself, the setpoint is set to the measured position immediately. The same applies to a drive without power whose
+    setpoint is more than MAX_DISTANCE_STEPS away, because that setpoint has followed a wrong position.
 
     Parameters
     ----------
     held
         Whether enabled drives keep their setpoints.
     stopped_now
-        Whether all drives were stopped in this cycle, so that all keep their setpoints.
+        Whether all drives were stopped in this cycle, so that all of them keep their setpoints.
     step
         Greatest change of a setpoint per cycle [m].
 

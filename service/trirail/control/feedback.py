@@ -1,4 +1,4 @@
-"""Measured state of the robot from the drives' feedback: pose, velocities and following errors."""
+"""Measured state of the robot, computed from the drives' feedback: pose, velocities and following errors."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerSta
 
 
 class MeasuredState:
-    """Measured state by the newest feedback, kept in the cycle's record.
+    """Measured state according to the latest feedback, stored in the record of the cycle.
 
     Parameters
     ----------
     step
-        Greatest travel of a slider in a cycle [m].
+        Greatest travel of a slider in one cycle [m].
     limit
-        Limit of following errors [m].
+        Limit of the following errors [m].
     windows
-        Limits of residuals at rest.
+        Limits of the residuals at rest.
     take_up
-        Take-up of the sliders' backlash.
+        Motion that takes up the sliders' backlash.
 
     """
 
@@ -47,18 +47,18 @@ class MeasuredState:
     ) -> None:
         self.feedback = Feedback(ZERO_RATES, (PowerState.NOT_READY_TO_SWITCH_ON,) * 3, None)
         self.record = np.zeros(1, DTYPE)
-        """The cycle's record, (1,); this class writes the measured values, Setpoints the commanded ones."""
+        """Record of the cycle, (1,). This class writes the measured values, and Setpoints writes the commanded ones."""
         self.numbers = np.zeros(2, cycle.FEEDBACK)
-        """Newest and previous feedback, as numbers."""
+        """Latest and previous feedback as numbers."""
         self.jumping = np.zeros(3, np.bool)
-        """Whether each slider's position has changed faster than the slider can move."""
+        """Whether the position of each slider has changed faster than the slider can move."""
         self.settling = Settling(windows, period)
-        """Whether the robot is in position."""
+        """Monitor of whether the robot is in position."""
         self.backlash = backlash(take_up, period)
-        """Backlash compensation of the setpoints, (2,) of trirail.control.backlash.BACKLASH."""
+        """State of the backlash compensation, (2,) of dtype trirail.control.backlash.BACKLASH."""
         self.legs = legs
         self._period = period
-        self.fastest = 2.0 * step / period  # the age may be wrong by one, which doubles a step
+        self.fastest = 2.0 * step / period  # the age may be wrong by one cycle, which doubles a step
         self.limit = limit
         self._packed = self.numbers.view(np.uint8).data
         self.written = np.zeros((2 + cycle.MAX_AGE, 3))
@@ -66,13 +66,13 @@ class MeasuredState:
 
     @property
     def position(self) -> Triple:
-        """Newest positions of the sliders [m]; `feedback` is not updated by the compiled call."""
+        """Latest positions of the sliders [m]. Unlike `feedback`, they are also updated by the compiled call."""
         x, y, z = self.numbers["position"][0].tolist()
         return x, y, z
 
     @property
     def pose(self) -> Triple:
-        """Newest measured pose: that of the last measured sliders that close the loops."""
+        """Latest measured pose. It is computed from the last slider positions for which the loops could be closed."""
         return self._recorded("pose")
 
     @property
@@ -82,12 +82,12 @@ class MeasuredState:
 
     @property
     def following_error(self) -> Triple:
-        """Setpoint in force less position [m]; zero for a drive that moves by itself."""
+        """Active setpoint minus position [m]; zero for a drive that moves by itself."""
         return self._recorded("following_error")
 
     @property
     def jumps(self) -> tuple[bool, bool, bool]:
-        """Whether each slider's position has changed faster than the slider can move."""
+        """Whether the position of each slider has changed faster than the slider can move."""
         a, b, c = self.jumping.tolist()
         return a, b, c
 
@@ -98,7 +98,7 @@ class MeasuredState:
 
     @property
     def unready(self) -> tuple[str, ...]:
-        """Reasons why drives cannot be reset yet, one line each, without repetitions."""
+        """Reasons why drives cannot be reset yet. Each reason is one line and is listed once."""
         return tuple(dict.fromkeys(str(each) for each in self.feedback.unready if each is not None))
 
     @property
@@ -107,15 +107,15 @@ class MeasuredState:
         return all(self.feedback.homed)
 
     def start(self, feedback: Feedback) -> None:
-        """Begin with the first feedback, and use its positions as past setpoints."""
+        """Start with the first feedback, and use its positions as the past setpoints."""
         self._pack(feedback)
         self.numbers[1] = self.numbers[0]
         self.written[:] = self.record["commanded_position"] = feedback.position
 
     def update(self, feedback: Feedback, at_rest: bool = False) -> int:
-        """Evaluate the feedback of the next cycle; return 0, or 1 + i for a following error of slider i.
+        """Evaluate the feedback of the next cycle; return 0, or 1 + i if slider i exceeds its following error limit.
 
-        `at_rest` is whether the commanded motion is at rest.
+        `at_rest` states whether the commanded motion is at rest.
         """
         self._pack(feedback)
         return cycle.observe(
@@ -134,7 +134,7 @@ class MeasuredState:
         )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
-        """Return the pose of slider setpoints that is nearest to the newest pose; None if they belong to no pose."""
+        """Return the pose for slider setpoints that is closest to the latest pose; None if no pose matches them."""
         self.scratch[:] = sliders, self.pose
         self.scratch[0] -= self.backlash[0]["offset"]
         if forward_into(self.legs, self.scratch[0], self.scratch[1], self.scratch[1]):

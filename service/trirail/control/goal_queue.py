@@ -1,4 +1,4 @@
-"""Queue of received goals: the one being planned, those that wait, and those that have expired."""
+"""Queue of received goals: the goal being planned, those waiting to be planned, and the check for expired ones."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from trirail.wire.messages import Notice, Outcome
 from trirail.wire.packets import GoalRequest
 
 MAX_PASSES = 8
-"""Number of other users' goals that may overtake a goal with lengthy planning."""
+"""Number of goals from other users that may overtake a goal whose planning takes long."""
 MAX_TARGET_AGE_S = 0.5
-"""Greatest difference between the time of a track's target and now [s]; beyond it the report is useless."""
+"""Greatest difference between the time of a track's target and the present [s]. An older or later report is useless."""
 
 
 class _ReceivedGoal(NamedTuple):
-    """Received goal, with the time of its arrival at the gateway, as a cycle."""
+    """Received goal, and the time at which the gateway received it, expressed as a cycle number."""
 
     request: GoalRequest
     cycle: float
     passes: int = 0
-    """Number of other users' goals that have overtaken it."""
+    """Number of goals from other users that have overtaken this goal."""
 
     def known_since(self, period: float) -> float:
-        """Return the time of a track's target, as a cycle."""
+        """Return the time of a track's target, expressed as a cycle number."""
         return self.cycle - self.request.age / period
 
 
 class GoalQueue:
-    """Queue that passes goals to the planner, users in turn, and reports their outcomes to the ledger."""
+    """Queue that passes goals to the planner, taking users in turn, and reports the outcomes to the ledger."""
 
     def __init__(
         self,
@@ -64,17 +64,17 @@ class GoalQueue:
         self._outputs = outputs
         self._waiting: deque[_ReceivedGoal] = deque()
         self._served: dict[str, int] = {}
-        """Sequence number of each user's last served goal, since the queue was idle."""
+        """Sequence number of each user's latest goal that was planned since the queue was last idle."""
         self._planned: _ReceivedGoal | None = None
         self._busy_reported = False
 
     @property
     def idle(self) -> bool:
-        """Whether no goal is being planned and none waits."""
+        """Whether no goal is being planned and none is waiting."""
         return not self._waiting and not self._planner.busy
 
     def due(self, cycle: int) -> float:
-        """Return the cycle, `cycle` or a later one, before which `step` is due if nothing is received."""
+        """Return the cycle, not earlier than `cycle`, before which `step` must be called if nothing is received."""
         expiring = min((goal.expires for number, goal in enumerate(self._ledger.goals) if number), default=math.inf)
         if self._planner.busy and self._planned is not None:
             request, sent, _ = self._planned
@@ -86,12 +86,12 @@ class GoalQueue:
         return min(math.floor(expiring) + 1 if math.isfinite(expiring) else math.inf, cycle + self._planner.due)
 
     def enqueue(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Enqueue a goal; a frequent renewal replaces an earlier one that still waits.
+        """Add a goal to the queue. A frequent renewal replaces an earlier one that is still waiting.
 
         Parameters
         ----------
         now_ns
-            Present time of the monotonic clock [ns].
+            Current time of the monotonic clock [ns].
         cycle
             Number of the next cycle.
 
@@ -109,14 +109,14 @@ class GoalQueue:
         self._ledger.keep_alive(request, self._alive_until(sent))
 
     def step(self, cycle: int, admit: Callable[[], bool], place: PoseSource) -> GoalRequest | None:
-        """Request the plan of the next goal, or accept a finished plan; return the goal that begins, if any.
+        """Request a plan for the next goal, or accept a finished plan. Return the goal that begins, if any.
 
         Parameters
         ----------
         admit
-            Function that returns whether the robot is moving to a goal, and raises RefusedError if it accepts none.
+            Function that returns whether the robot is moving to a goal, and raises RefusedError if no goal is accepted.
         place
-            Function that returns the pose from which a move begins.
+            Function that returns the pose from which a relative move begins.
 
         """
         if self._planned is not None and self._is_passed(self._planned):
@@ -131,7 +131,7 @@ class GoalQueue:
         try:
             if self._planner.busy and self._planned is not None:
                 self._report_busy(self._planned.request)
-                # While it was being planned, a renewed goal may have ended, and the lease may have changed hands.
+                # During planning, a renewed goal may have ended, and the lease may have passed to another user.
                 self._ledger.check_id(self._planned.request)
                 self._lease.check(self._planned.request.user)
                 self._check_age(self._planned, cycle)
@@ -152,7 +152,7 @@ class GoalQueue:
         return request
 
     def withdraw(self, outcome: Withdrawal, reason: str) -> None:
-        """End all goals that have been received but not begun."""
+        """End all goals that have been received but have not begun."""
         requests = [sent.request for sent in self._waiting]
         if self._planner.busy and self._planned is not None:
             requests.insert(0, self._planned.request)
@@ -181,27 +181,27 @@ class GoalQueue:
         raise RefusedError(RefusalCode.NO_GOAL, f"goal {goal_id!r} is not under way: it has ended, or never was")
 
     def expire(self, cycle: int) -> None:
-        """End planned goals that can no longer begin in time, and those behind them."""
+        """End planned goals that can no longer begin in time, together with the goals that follow them."""
         for number, goal in enumerate(self._ledger.goals):
             if number and cycle > goal.expires:
                 self._drop(number, goal.id, "expired", coded("it did not begin in time", EventCode.TOO_LATE))
                 return
 
     def _next(self) -> _ReceivedGoal:
-        """Remove and return the oldest goal of the user served longest ago."""
+        """Remove and return the oldest goal of the user whose turn is next, the one served longest ago."""
         sent = min(self._waiting, key=lambda sent: self._served.get(sent.request.user, 0))
         self._waiting.remove(sent)
         self._served[sent.request.user] = max(self._served.values(), default=0) + 1
         return sent
 
     def _is_passed(self, planned: _ReceivedGoal) -> bool:
-        """Return whether another user's goal may overtake the one being planned."""
+        """Return whether another user's goal may overtake the goal being planned."""
         if not self._planner.awaits_answer or not planned.request.goal.lengthy or planned.passes >= MAX_PASSES:
             return False
         return any(sent.request.user != planned.request.user for sent in self._waiting)
 
     def _consider(self, sent: _ReceivedGoal, cycle: int, admit: Callable[[], bool], place: PoseSource) -> None:
-        """Check a goal and request its plan. Raises RefusedError."""
+        """Check a goal and request its plan. Raises RefusedError if the goal is not accepted."""
         ledger, request, goal = self._ledger, sent.request, sent.request.goal
         ledger.check_id(request)
         if request.withdrawn is not None:
@@ -223,11 +223,11 @@ class GoalQueue:
         self._planner.plan(planned, blend, request.id)
 
     def _timed(self, planned: Goal, sent: _ReceivedGoal, cycle: int) -> Goal:
-        """Return a goal with the time of its target as a time of the schedule.
+        """Return the goal with the time of its target converted to the time of the schedule.
 
-        Raises RefusedError if the time is too far from now.
+        Raises RefusedError if that time is too far from the present.
         """
-        # Now is the SYNC of this cycle, at which the drives accept the setpoints of the schedule's present cycle.
+        # "Now" is the SYNC of this cycle, at which the drives accept the setpoints of the schedule's current cycle.
         if not planned.timed:
             return planned
         ago = (cycle - sent.known_since(self._period)) * self._period
@@ -248,7 +248,7 @@ class GoalQueue:
         return planned.at(self._schedule.cycle * self._period - ago)
 
     def _report_busy(self, request: GoalRequest) -> None:
-        """Report that a goal waits for a busy planner, once per request."""
+        """Report that a goal is waiting for a busy planner. This is reported once per busy period."""
         busy = self._planner.busy_message
         if busy and not self._busy_reported:
             words, silence = f"{busy}: goal {request.id} waits", self._planner.silence
@@ -257,7 +257,7 @@ class GoalQueue:
         self._busy_reported = bool(busy)
 
     def _check_age(self, sent: _ReceivedGoal, cycle: int) -> None:
-        """Raise RefusedError for a goal that can no longer begin in time."""
+        """Raise RefusedError if the goal can no longer begin in time."""
         valid = sent.request.goal.valid_for
         why = f"; {self._planner.busy_message}" if self._planner.busy_message else ""
         if valid is not None and cycle - sent.cycle > valid / self._period:
@@ -268,11 +268,11 @@ class GoalQueue:
             )
 
     def _alive_until(self, sent: _ReceivedGoal) -> float:
-        """Return the cycle in which a goal ends unless renewed; infinite for a goal that needs no renewal."""
+        """Return the cycle in which the goal ends unless renewed; infinite if the goal needs no renewal."""
         return sent.cycle + sent.request.goal.timeout / self._period
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: EventText) -> None:
-        """End a planned goal and those behind it."""
+        """End a planned goal and the goals that follow it."""
         words = f"goal {goal_id} before it {outcome}"
         before = coded(words, EventCode.EARLIER_GOAL_ENDED, goal=goal_id, outcome=outcome)
         self._ledger.end("stopped", before, but=number + 1)

@@ -1,7 +1,7 @@
-"""Detection of "in position": windows, dwell and time-out.
+"""Detection of "in position", with windows, a dwell time and a time-out.
 
 While the commanded motion is at rest, each cycle compares the measured sliders and pose with the commanded ones. The
-robot is in position if all six values have been inside their windows in every cycle of the dwell.
+robot is in position once all six values have stayed inside their windows for every cycle of the dwell time.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from trirail.wire.messages import Residual
 __all__ = ["MONITOR", "Settling", "SettlingResult", "monitor"]
 
 MIN_VELOCITY = 1e-9
-"""Velocity of setpoints above which a slider counts as moving [m/s]; a lower one is rounding."""
+"""Setpoint velocity above which a slider counts as moving [m/s]. Lower velocities are rounding."""
 
 MONITOR = np.dtype(
     [
-        ("window", "<f8", (2, 3)),  # of the sliders [m]; of x, y [m] and phi [rad]
-        ("residual", "<f8", (2, 3)),  # commanded less measured, in the same order
+        ("window", "<f8", (2, 3)),  # for the sliders [m]; for x, y [m] and phi [rad]
+        ("residual", "<f8", (2, 3)),  # commanded minus measured, in the same order
         ("heading", "<f8", 3),  # 1 or -1: direction in which a slider was last commanded to move; 0 for no motion
-        ("overshoot", "<f8", 3),  # of the sliders, since the end of the path [m]
-        ("dwell", "<i8"),  # cycles
-        ("inside", "<i8"),  # cycles in a row until now
-        ("moved", "u1"),  # whether the commanded motion moved in the previous cycle
+        ("overshoot", "<f8", 3),  # of each slider, since the end of the path [m]
+        ("dwell", "<i8"),  # required number of cycles
+        ("inside", "<i8"),  # number of successive cycles inside the windows until now
+        ("moved", "u1"),  # whether the commanded motion was moving in the previous cycle
     ],
     align=True,
 )
@@ -40,18 +40,18 @@ MONITOR = np.dtype(
 
 
 class SettlingResult(NamedTuple):
-    """Result of settling, with the fields of the event of the goal's end."""
+    """Result of settling. Its fields are also fields of the event that reports the end of the goal."""
 
     settle: float | None
-    """Time from the end of the path to the first cycle of the dwell [s]; None if it did not settle in time."""
+    """Time from the end of the path to the first cycle of the dwell [s]; None if the robot did not settle in time."""
     residual: Residual
-    """Commanded less measured values at the end."""
+    """Commanded minus measured values at the end."""
     overshoot: Triple
     """Greatest distance of each slider beyond its target since the end of the path [m]."""
 
 
 class Settling:
-    """Monitor of a goal whose path has ended; `monitored` is its state in the compiled cycle."""
+    """Monitor for a goal whose path has ended. `monitored` is the part of its state that compiled code updates."""
 
     def __init__(self, limits: InPosition, period: float) -> None:
         self.monitored = np.zeros(1, MONITOR)
@@ -64,16 +64,16 @@ class Settling:
 
     @property
     def under_way(self) -> bool:
-        """Whether a goal's path has ended but the goal has not."""
+        """Whether the path of a goal has ended but the goal has not."""
         return self._since is not None
 
     @property
     def ends(self) -> int | None:
-        """Cycle of the time-out; None while no goal settles."""
+        """Cycle of the time-out; None if no goal is settling."""
         return self._since + self._timeout if self._since is not None else None
 
     def begin(self, cycle: int) -> None:
-        """Begin to monitor a goal whose path has ended with the setpoints of this cycle."""
+        """Start monitoring a goal whose path ends with the setpoints of this cycle."""
         self._since = cycle
         self.monitored["inside"] = 0
         self.monitored["overshoot"] = 0.0
@@ -83,7 +83,7 @@ class Settling:
         self._since = None
 
     def result(self, cycle: int) -> SettlingResult | None:
-        """Return the result after this cycle; None while undecided."""
+        """Return the result after this cycle; None if the goal is still settling."""
         if self._since is None:
             return None
         inside = int(self.monitored["inside"][0])
@@ -92,14 +92,14 @@ class Settling:
         return self.now(None) if cycle - self._since >= self._timeout else None
 
     def now(self, settle: float | None) -> SettlingResult:
-        """Return a result with the present residuals and overshoot."""
+        """Return a result with the current residuals and overshoot."""
         sliders, pose, overshoot = map(
             tuple, (*self.monitored["residual"][0].tolist(), *self.monitored["overshoot"].tolist())
         )
         return SettlingResult(settle, Residual(sliders, pose), overshoot)
 
     def describe(self, settled: SettlingResult, labels: Labels = NAMES) -> EventText:
-        """Return a result as text, with the settling time or the residuals."""
+        """Return a result as text, with the settling time or with the residuals."""
         if settled.settle is not None:
             x, y, phi = map(abs, settled.residual.pose)
             residual = (
@@ -125,9 +125,9 @@ def monitor(record: NDArray[np.void], known: bool, at_rest: bool, monitored: NDA
     Parameters
     ----------
     record : (1,)
-        The cycle's record.
+        Record of the cycle.
     known
-        Whether the measured sliders belong to a pose.
+        Whether a pose matches the measured sliders.
     at_rest
         Whether the commanded motion is at rest.
     monitored : (1,)

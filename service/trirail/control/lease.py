@@ -1,7 +1,7 @@
-"""Lease: the exclusive right of one user to move the robot, as long as the user's client renews it.
+"""Lease: the exclusive right of one user to move the robot, for as long as the user's client renews it.
 
-The control keeps the lease, and not the gateway, so that the loss of any link to the holder ends it: program, network
-or gateway. Its time-out counts cycles, so that recorded sessions can be replayed.
+The control keeps the lease, not the gateway. The lease therefore ends when any link to its holder is lost: the program,
+the network or the gateway. The time-out counts cycles, so that recorded sessions can be replayed.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from trirail.wire.messages import Level
 from trirail.wire.vocabulary import AcquireLease, LeasePolicy, ReleaseLease
 
 REMEMBERED_IDS = 1000
-"""Number of ended leases that are remembered, so that a late renewal cannot revive them."""
+"""Number of ended leases that are remembered, so that a late renewal does not revive one of them."""
 
 
 class LeaseChange(NamedTuple):
-    """Change of the lease's holder, to be announced."""
+    """Change of the lease holder, to be announced."""
 
     level: Level
     message: EventText
@@ -30,31 +30,31 @@ class _Lease(NamedTuple):
     id: str | None
     timeout: float
     alive_until: int
-    """Last cycle of the lease unless renewed."""
+    """Last cycle of the lease unless it is renewed."""
 
 
 class LeaseArbiter:
-    """Rules of the lease, and its present holder; `check` raises for a user who must not move the robot."""
+    """Rules of the lease, and its current holder. `check` raises an error for a user who must not move the robot."""
 
     def __init__(self, policy: LeasePolicy, period: float) -> None:
         self._required = policy == "required"
         self._period = period
         self._held: _Lease | None = None
         self._ended: dict[tuple[str, str], str] = {}
-        """Reason of the end of each ended lease, by user and id."""
+        """Reason why each ended lease ended, by user and id."""
 
     @property
     def user(self) -> str | None:
-        """Holder of the lease; None for nobody."""
+        """Holder of the lease; None if there is none."""
         return self._held.user if self._held is not None else None
 
     @property
     def alive_until(self) -> float:
-        """Last cycle of the lease unless renewed; infinite if nobody holds it."""
+        """Last cycle of the lease unless it is renewed; infinite if nobody holds the lease."""
         return self._held.alive_until if self._held is not None else math.inf
 
     def check(self, user: str) -> None:
-        """Raise RefusedError if a user must not move the robot now."""
+        """Raise RefusedError if the user must not move the robot now."""
         if self._held is None:
             if self._required:
                 raise RefusedError(
@@ -89,7 +89,7 @@ class LeaseArbiter:
         return change
 
     def release(self, user: str, lease: ReleaseLease) -> LeaseChange:
-        """Release a user's lease. Raises RefusedError if the user does not hold this lease."""
+        """Release a user's lease. Raises RefusedError if the user does not hold it."""
         held = self._held
         if held is not None and held.user == user and lease.id in (None, held.id):
             return self._end("info", coded(f"lease released by {user}", EventCode.LEASE_RELEASED, user=user))
@@ -101,7 +101,7 @@ class LeaseArbiter:
         raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease, and only its holder can release it")
 
     def expire(self, cycle: int) -> LeaseChange | None:
-        """End the lease if it has not been renewed in time; return None if it has."""
+        """End the lease if it was not renewed in time; return None if it continues."""
         held = self._held
         if held is None or cycle <= held.alive_until:
             return None

@@ -1,4 +1,4 @@
-"""Ledger of goals and commands: every goal ends exactly once, and every command is answered exactly once."""
+"""Ledger of goals and commands. Every goal ends exactly once, and every command is answered exactly once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from trirail.wire.packets import (
 from trirail.wire.vocabulary import Command
 
 Withdrawal = Literal["stopped", "faulted"]
-"""Outcome of a goal that ends before it begins: in its event, and as the code of its refusal."""
+"""Outcome of a goal that ends before it begins. It is used in the event and as the code of the refusal."""
 _LEVELS: dict[Outcome, Level] = {
     "faulted": "error",
     "rejected": "warning",
@@ -38,33 +38,33 @@ _LEVELS: dict[Outcome, Level] = {
 
 
 class ActiveGoal(NamedTuple):
-    """Goal under way, or a queued one."""
+    """Goal that is under way or queued."""
 
     id: str
     user: str
     kind: type[Goal]
     blend: float | None
-    """Distance from its end at which the next goal may begin [m]; None if the next goal preempts it."""
+    """Distance from the end of this goal at which the next may begin [m]; None if the next goal preempts this one."""
     expires: float
-    """Last cycle in which it may begin."""
+    """Last cycle in which the goal may begin."""
     alive_until: float
-    """Cycle in which it ends unless renewed."""
+    """Cycle in which the goal ends unless it is renewed."""
     released: bool = False
-    """Whether that cycle has passed, so that a late renewal does not revive the goal."""
+    """Whether that cycle has passed. A late renewal then does not revive the goal."""
     bound: str | None = None
-    """Limit at which a jog stops, or beyond which the target of a track is."""
+    """Limit at which a jog stops, or which the target of a track exceeds."""
     settles: bool = True
-    """Whether the goal is done only once the robot is in position."""
+    """Whether the goal is done only when the robot is in position."""
     target: Triple | None = None
     """Last reported pose of a track's target."""
     stop_at: StopAt | None = None
-    """Edge of an input at which it ends."""
+    """Edge of an input at which the goal ends."""
     lag: float | None = None
-    """Last lag of a track: trirail.wire.messages.GoalReply."""
+    """Last lag of a track, as in trirail.wire.messages.GoalReply."""
 
 
 class _GoalEnd(NamedTuple):
-    """End of a goal; `bound` is the limit at which a jog has ended."""
+    """Information about a goal that has ended. `bound` is the limit at which a jog has ended."""
 
     user: str
     kind: type[Goal]
@@ -73,7 +73,7 @@ class _GoalEnd(NamedTuple):
     bound: str | None
 
     def renewal_error(self, goal_id: str) -> RefusedError:
-        """Return the refusal of a renewal of the ended goal."""
+        """Return the error that refuses a renewal of this goal."""
         if self.bound is not None:
             text = f"jog {goal_id!r} has ended at the limit of {self.bound}: begin a new one, away from it"
             return RefusedError(RefusalCode.AT_LIMIT, text)
@@ -84,19 +84,19 @@ class _GoalEnd(NamedTuple):
 
 
 class Ledger:
-    """Ledger of goals and commands under way; outgoing messages wait in `answers` and `notices`."""
+    """Ledger of the goals and commands under way. Outgoing messages are collected in `answers` and `notices`."""
 
     def __init__(self, on_end: Callable[[str, Outcome], None] = lambda _goal, _outcome: None) -> None:
-        """`on_end` is called with the id and outcome of each goal that ends, before that is announced."""
+        """Create an empty ledger. `on_end` receives the id and outcome of each goal before its end is announced."""
         self._on_end = on_end
         self.goals: deque[ActiveGoal] = deque()
-        """Goal that the robot is moving to, and the queued ones."""
+        """Goal that the robot is moving to, followed by the queued goals."""
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
         self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, _GoalEnd] = {}
         self._refused: tuple[str, RefusalCode] | None = None
-        """Id of the last refused frequent goal, and the code of the refusal."""
+        """Id of the last frequent goal that was refused, and the code of that refusal."""
 
     # ------------------------------------------------------------------ goals
 
@@ -106,7 +106,7 @@ class Ledger:
         return self.goals[0] if self.goals else None
 
     def check_id(self, request: GoalRequest) -> None:
-        """Raise RefusedError if the id of a goal has been used, unless the goal renews the one under way."""
+        """Raise RefusedError if the id has already been used, unless the request renews the goal under way."""
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
         ended = self._ended.get(goal_id)
@@ -118,16 +118,16 @@ class Ledger:
             raise _not_renewed(goal_id)
 
     def pass_over(self, request: GoalRequest) -> None:
-        """Accept a renewal that a newer one has replaced."""
+        """Accept a renewal that was replaced by a newer one."""
         self.answers.append(Accepted(request.ticket, GoalReply(request.id, None)))
 
     def keep_alive(self, request: GoalRequest, until: float) -> None:
-        """Extend the goal under way until a cycle, if the request renews it and the goal is not ending."""
+        """Extend the goal under way until the cycle `until`, if the request renews it and the goal is not ending."""
         if self.renewed_by(request) and self.goals[0].alive_until > -math.inf:
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> ActiveGoal | None:
-        """Return the goal under way, once, if it has not been renewed in time."""
+        """Return the goal under way if it was not renewed in time. Each goal is returned only once."""
         goal = self.goal
         if goal is None or goal.released or cycle <= goal.alive_until:
             return None
@@ -137,16 +137,16 @@ class Ledger:
     def begin(
         self, request: GoalRequest, plan: AcceptedPlan, expires: float, alive_until: float, *, at_end: bool = False
     ) -> None:
-        """Accept a goal; it preempts those before it, unless it follows them or renews the one under way.
+        """Accept a goal. It preempts the goals before it, unless it follows them or renews the goal under way.
 
         Parameters
         ----------
         expires
             Last cycle in which the goal may begin.
         alive_until
-            Cycle in which the goal ends unless renewed.
+            Cycle in which the goal ends unless it is renewed.
         at_end
-            Whether the previous motion has ended; a previous goal with a blend is then done.
+            Whether the previous motion has ended. If so, a previous goal with a blend is done.
 
         """
         self.answers.append(Accepted(request.ticket, structs.replace(plan.reply, id=request.id)))
@@ -178,7 +178,7 @@ class Ledger:
             self.notices.append(Notice("output", "info", text.text, goal=request.id, planned=marks, **text.fields))
 
     def _renew(self, request: GoalRequest, plan: AcceptedPlan) -> None:
-        """Update the goal under way by a renewal; announce a target that is out of reach."""
+        """Apply a renewal to the goal under way, and announce a target that is out of reach."""
         goal, goal_under_way = request.goal, self.goals[0]
         if goal.target is not None and plan.bound not in (None, goal_under_way.bound):
             words = (
@@ -187,18 +187,18 @@ class Ledger:
             )
             text = coded(words, EventCode.BEYOND_LIMIT, goal=goal_under_way.id)
             self.notices.append(Notice("service", "warning", text.text, user=goal_under_way.user, **text.fields))
-        bound = plan.bound or (goal_under_way.bound if goal.target is not None else None)  # a limit is reported once
+        bound = plan.bound or (goal_under_way.bound if goal.target is not None else None)  # report a limit once
         self.goals[0] = goal_under_way._replace(bound=bound, target=goal.target, lag=plan.reply.lag)
 
     def pass_on(self) -> None:
-        """End the first goal as done, since the next one has begun."""
+        """End the first goal as done, because the next goal has begun."""
         goal = self.goals.popleft()
         following = self.goals[0].id
         reason = coded(f"passed on the way to goal {following}", EventCode.PASSED, goal=following)
         self._end_goal(goal.id, goal.user, goal.kind, "done", reason)
 
     def end(self, outcome: Outcome, reason: EventText, but: int = 0, settled: SettlingResult | None = None) -> None:
-        """End all goals except the first `but`."""
+        """End all goals except the first `but` goals."""
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
             goal = self.goals.popleft()
@@ -219,16 +219,16 @@ class Ledger:
             self._end_goal(request.id, request.user, type(request.goal), outcome, ended, refusal=refusal)
 
     def is_all_of(self, user: str | None) -> bool:
-        """Return whether all goals and commands under way that need the lease belong to a user."""
+        """Return whether all active goals and commands that need the lease belong to one user."""
         commands = (request for under_way in self._commands.values() for request, _ in under_way)
         senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.ignores_lease]
         return all(sender == user for sender in senders)
 
     def refuse(self, request: GoalRequest | CommandRequest, refusal: RefusedError) -> None:
-        """Refuse a request, and announce that. A refused goal has ended, unless its id was in use.
+        """Refuse a request and announce the refusal. A refused goal has ended, unless its id was already in use.
 
-        Of frequent renewals only the first refusal is announced: hundreds may follow before the answer reaches their
-        sender.
+        If a goal is renewed frequently, only the first refusal is announced, because hundreds of renewals may follow
+        before the answer reaches their sender.
         """
         text = answered = str(refusal)
         if isinstance(request, GoalRequest) and request.goal.frequent and not self.renewed_by(request):
@@ -250,14 +250,14 @@ class Ledger:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
                 self.notices.append(_refused(text, request.user, refusal))
-                if not request.goal.frequent:  # a refused renewal also ends the goal that it would renew
+                if not request.goal.frequent:  # a refused renewal also ends the goal that it was meant to renew
                     self.keep_alive(request, -math.inf)
             else:
                 reason = coded(text, EventCode.REFUSED)
                 self._end_goal(request.id, request.user, type(request.goal), outcome, reason, refusal=refusal)
 
     def renewed_by(self, request: GoalRequest) -> bool:
-        """Return whether a request renews the goal under way: same id, user and kind."""
+        """Return whether a request renews the goal under way, which must have the same id, user and kind."""
         goal = self.goal
         return (
             goal is not None
@@ -277,7 +277,7 @@ class Ledger:
         settled: SettlingResult | None = None,
         refusal: RefusedError | None = None,
     ) -> None:
-        if goal_id in self._ended:  # the event that has ended the goal also withdraws its renewals
+        if goal_id in self._ended:  # the event that ended the goal also withdraws its renewals
             return
         self._on_end(goal_id, outcome)
         level = _LEVELS.get(outcome, "info")
@@ -294,7 +294,7 @@ class Ledger:
     # ------------------------------------------------------------------ commands
 
     def undertake(self, request: CommandRequest, cycle: int) -> None:
-        """Add a command, to be answered once it is complete."""
+        """Add a command, which is answered once it is complete."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
     @property
@@ -310,11 +310,12 @@ class Ledger:
         Parameters
         ----------
         verdict
-            Function of a command's name and the cycle of its arrival, with the result of a Rule.
+            Function that takes the name of a command and the cycle in which it arrived, and returns the result of its
+            Rule.
         mode
             Mode after the command.
         cycle
-            First cycle that shows the effect.
+            First cycle that shows the effect of the command.
 
         """
         for name, under_way in self._commands.items():
@@ -331,7 +332,7 @@ def _refused(text: str, user: str, refusal: RefusedError) -> Notice:
 
 
 def _with_code(notice: Notice, refusal: RefusedError) -> Notice:
-    """Return a notice with the fields of a refusal."""
+    """Return the notice with the fields of the refusal added."""
     about = {name: getattr(refusal, name) for name in ("code", "slider", "value", "limit")}
     return structs.replace(notice, **about)
 

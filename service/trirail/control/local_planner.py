@@ -1,4 +1,4 @@
-"""Planner in the calling process, for replays, tests and tools, which answers after a fixed number of cycles."""
+"""Planner that runs in the calling process, for replays, tests and tools. It answers after a fixed number of cycles."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 
 
 class LocalPlanner:
-    """Planner that implements trirail.control.plan_requests.PlannerPort by a direct call."""
+    """Implementation of trirail.control.plan_requests.PlannerPort that calls the planner directly."""
 
     def __init__(self, config: Config, delay: int = 1) -> None:
         self.delay = delay
-        """Cycles from the request to the answer."""
+        """Number of cycles between a request and its answer."""
         self._planner = MotionPlanner(config)
         self._answers: deque[tuple[int, PlanAnswer]] = deque()
         self._turns = 0
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Compute the plan now, and answer later."""
+        """Compute the plan now, and keep it as an answer for a later cycle."""
         self._answers.append((self._turns + self.delay, self._planner.plan(request)))
 
     def answers(self) -> list[PlanAnswer]:
-        """Return the answers that are due; call once in each cycle."""
+        """Return the answers that are due. Call this once per cycle."""
         self._turns += 1
         due = []
         while self._answers and self._answers[0][0] <= self._turns:

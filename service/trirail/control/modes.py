@@ -1,4 +1,4 @@
-"""Modes of the service as a pure state machine: the effect of each event in each mode."""
+"""Modes of the service as a pure state machine that defines the effect of each event in each mode."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail.wire.vocabulary import Mode
 
 
 class ModeEvent(Enum):
-    """Event of the state machine: a request, a report of motion or drives, or a failure."""
+    """Event of the state machine: a request, a report about the motion or the drives, or a failure."""
 
     ENABLE = auto()
     DISABLE = auto()
@@ -20,21 +20,21 @@ class ModeEvent(Enum):
     RESET = auto()
     PAUSE = auto()
     RESUME = auto()
-    NOT_RENEWED = auto()  # the jog or the track is no longer renewed
-    INPUT_EDGE = auto()  # an input at which the goal under way ends has changed
+    NOT_RENEWED = auto()  # the jog or track was not renewed in time
+    INPUT_EDGE = auto()  # an input at which the current goal ends has changed
     HOME = auto()
-    POWERED = auto()  # all drives reached operation enabled
-    HOMED = auto()  # all drives know their position, and follow setpoints again
+    POWERED = auto()  # all drives have reached the state operation enabled
+    HOMED = auto()  # all drives know their positions and follow setpoints again
     STANDSTILL = auto()  # the commanded motion is at rest
     ARRIVED = auto()  # the commanded motion is at rest at the end of its path
-    FAULT = auto()  # a drive, the bus or a setpoint is bad
+    FAULT = auto()  # a drive, the bus or a setpoint is faulty
     GATEWAY_LOST = auto()
-    LATE = auto()  # too many ticks missed in a row
+    LATE = auto()  # too many ticks were missed in a row
     SHUTDOWN = auto()
 
 
 class Action(Enum):
-    """Action of the loop on a change of state, in the same cycle."""
+    """Action that the loop takes when the state changes, in the same cycle."""
 
     NOTHING = auto()
     POWER_UP = auto()
@@ -49,9 +49,10 @@ class Action(Enum):
 
 
 class ModeState(NamedTuple):
-    """Mode, and what follows once the robot is at rest.
+    """Mode, and what happens once the robot is at rest.
 
-    `disable_after` disables the drives, `paused` keeps the goal to be resumed, and `released` ends a jog or track.
+    With `disable_after` the drives are then disabled, with `paused` the goal is kept to be resumed, and with `released`
+    the jog or track ends.
     """
 
     mode: Mode
@@ -61,19 +62,19 @@ class ModeState(NamedTuple):
 
     @property
     def has_goal(self) -> bool:
-        """Whether a goal can be under way."""
+        """Whether there can be a goal under way in this state."""
         return self.mode is Mode.MOVING or self.paused or self.released
 
 
 class Step(NamedTuple):
-    """Next state, and the action on the way to it."""
+    """Next state, and the action to take on the transition."""
 
     state: ModeState
     action: Action = Action.NOTHING
 
 
 class Refusal(NamedTuple):
-    """Refusal of an event that is not allowed in a mode; the state stays."""
+    """Refusal of an event that is not allowed in a mode. The state does not change."""
 
     code: RefusalCode
     message: str
@@ -233,9 +234,9 @@ STATES = tuple(_TABLE)
 
 
 def step(state: ModeState, event: ModeEvent) -> Step | Refusal:
-    """Return the effect of `event` in `state`; an event without an entry in the table changes nothing.
+    """Return the effect of `event` in `state`. An event without an entry in the table changes nothing.
 
-    Requests that are fulfilled already are confirmed and not refused, such as stopping a robot at rest. The first fault
-    stays latched until a reset, which leads to disabled.
+    A request whose result already holds is confirmed, not refused: an example is stopping a robot that is at rest. The
+    first fault stays latched until a reset, after which the robot is disabled.
     """
     return _TABLE[state].get(event, Step(state))

@@ -1,8 +1,8 @@
-"""Digital outputs: their values, and the marks at which they switch while a goal's path is run.
+"""Digital outputs: their values, and the marks on a goal's path at which they switch.
 
-A switch belongs to the cycle whose setpoints are nearest to its mark on the commanded path; the drives take up both at
-the same SYNC. So its error is half a cycle at most. The commanded path is known ahead: with the delay of an output, the
-place is taken that will be commanded when the delay has passed.
+An output switches in the cycle whose setpoints are nearest to its mark on the commanded path, because the drives take
+up the setpoints and the outputs at the same SYNC. The error is therefore at most half a cycle. If an output has a
+delay, it switches earlier by that delay; this is possible because the commanded path is known in advance.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from trirail.wire.vocabulary import Mode
 OUTPUT: Final = np.dtype(
     [
         ("axis", "<i8"),
-        ("bit", "<i8"),  # its bit in the drive's word, as a mask
-        ("delay", "<f8"),  # delay of the device that is switched [s]
-        ("next", "<i8"),  # its next planned switch in the table, and the end of its part of the table
+        ("bit", "<i8"),  # mask of the output's bit in the drive's word
+        ("delay", "<f8"),  # delay of the device that the output switches [s]
+        ("next", "<i8"),  # index of the next planned switch, and end of this output's rows in the table
         ("end", "<i8"),
-        ("goal", "<i8"),  # number of the goal whose pulse or stretch has it open; 0 for none
-        ("mark", "<i8"),  # the mark of that
-        ("opened", "<i8"),  # the value that it has meanwhile
+        ("goal", "<i8"),  # number of the goal whose pulse or stretch holds the output; 0 for none
+        ("mark", "<i8"),  # the mark that has switched it
+        ("opened", "<i8"),  # value of the output while the goal holds it
         ("until", "<i8"),  # cycle in which a pulse ends; 0 for none
     ],
     align=True,
@@ -47,14 +47,14 @@ PLANNED: Final = np.dtype(
     [
         ("s", "<f8"),  # time along the path [s]
         ("on", "<i8"),
-        ("cycles", "<i8"),  # duration of a pulse; 0 for a value that stays
-        ("opens", "<i8"),  # whether another switch, or the end of a pulse, closes it
+        ("cycles", "<i8"),  # duration of a pulse; 0 if the value stays
+        ("opens", "<i8"),  # whether a later switch or the end of a pulse switches it back
         ("goal", "<i8"),
         ("mark", "<i8"),
     ],
     align=True,
 )
-"""A switch to come, in a table that is sorted by output and time along the path."""
+"""Planned switch. The table is sorted by output and by time along the path."""
 SWITCHED: Final = np.dtype(
     [
         ("cycle", "<i8"),
@@ -63,19 +63,19 @@ SWITCHED: Final = np.dtype(
         ("goal", "<i8"),
         ("mark", "<i8"),
         ("closed", "<i8"),
-        ("deadline_ns", "<i8"),  # of the cycle, on the monotonic clock; 0 until its record is made
+        ("deadline_ns", "<i8"),  # deadline of the cycle on the monotonic clock; 0 until the record of the cycle exists
         ("commanded", "<f8", 3),
         ("measured", "<f8", 3),
     ],
     align=True,
 )
-"""A switch that has happened."""
+"""Switch that has taken place."""
 LOG_LENGTH = 512
-"""Room for switches until Python reads them."""
+"""Number of switches that the log can hold until Python reads them."""
 TABLE_DELAY = 0.1
-"""Time after which switches are reported that do not fill a message [s]."""
+"""Time after which switches are reported even if they do not fill a message [s]."""
 TABLE_LENGTH = 50
-"""Switches in one message."""
+"""Greatest number of switches in one message."""
 
 _AT_REST = constant_law(0.0)
 OUTPUTS, PLAN, LOG = from_dtype(OUTPUT)[::1], from_dtype(PLANNED)[::1], from_dtype(SWITCHED)[::1]
@@ -84,7 +84,7 @@ RECORDS = from_dtype(DTYPE)[::1]
 
 @compiled()
 def _set(words: NDArray[np.int64], output: NDArray[np.void], on: int) -> None:
-    """Set an output's bit in the word of its drive."""
+    """Set the bit of an output in the word of its drive."""
     if on:
         words[output.axis] |= output.bit  # type: ignore[attr-defined]
     else:
@@ -103,7 +103,7 @@ def _note(
     mark: int,
     record: NDArray[np.void],
 ) -> int:
-    """Append a switch to the log; return the number of its rows. A full log keeps its first rows."""
+    """Append a switch to the log and return the new number of rows. A full log ignores further switches."""
     if number < len(log):
         row = log[number]
         row.cycle, row.output, row.on, row.goal, row.mark, row.closed = cycle, output, on, goal, mark, 0
@@ -129,22 +129,23 @@ def switch(
     deadline_ns: int,
     record: NDArray[np.void],
 ) -> int:
-    """Switch the outputs that are due in a cycle; return the number of rows in the log.
+    """Switch the outputs that are due in this cycle, and return the number of rows in the log.
 
     Parameters
     ----------
     outputs, planned
         State of the outputs, and table of their planned switches.
     words : (3,)
-        Wanted values of the drives' output words.
+        Requested values of the drives' output words.
     log, number
-        Room for the switches that happen, and the number of its rows in use.
+        Log for the switches that take place, and the number of rows in use.
     law_knots, law_pieces, moves, time
-        Law of the motion under way, whether there is one, and the time of the law in this cycle [s].
+        Law of the motion, whether there is a motion, and the time of the law in this cycle [s].
     period, cycle, deadline_ns
-        Period [s], number of the cycle, and its deadline on the monotonic clock [ns], 0 where it is not known yet.
+        Period [s], number of the cycle, and its deadline on the monotonic clock [ns]; 0 if the deadline is not known
+        yet.
     record
-        The cycle's record, with the commanded and measured pose.
+        Record of the cycle, with the commanded and the measured pose.
     """
     for k in range(len(outputs)):
         output = outputs[k]
@@ -154,8 +155,9 @@ def switch(
             output.until, output.goal = 0, 0
         if not moves or output.next >= output.end:
             continue
-        # The nearer of two setpoints takes the switch: one whose mark is before the middle between this one and the
-        # next. The law tells both, also while it brakes; nothing that a later decision changes is farther than that.
+        # Switch with the nearer of two setpoints: this one if the mark is before the middle between this setpoint and
+        # the next. The law gives both, also while it brakes, and no later decision can change the motion within one
+        # period.
         here = law_at(law_knots, law_pieces, time + output.delay)[0]
         there = law_at(law_knots, law_pieces, time + period + output.delay)[0]
         while output.next < output.end and planned[output.next].s <= (here + there) / 2.0:
@@ -169,7 +171,7 @@ def switch(
 
 
 class Outputs:
-    """Outputs and inputs of a robot, by their names in the configuration."""
+    """Outputs and inputs of a robot. Their names are those in the configuration."""
 
     def __init__(self, outputs: Mapping[str, Output], inputs: Mapping[str, Input], period: float) -> None:
         self._named = dict(outputs)
@@ -178,20 +180,20 @@ class Outputs:
         self._period = period
         self._path_allowed = (True, True, True)
         self.words = np.zeros(3, np.int64)
-        """Wanted values of the drives' output words, (3,)."""
+        """Requested values of the drives' output words, (3,)."""
         self.state = np.zeros(len(self._names), OUTPUT)
         self.planned = np.zeros(0, PLANNED)
         self.log = np.zeros(LOG_LENGTH, SWITCHED)
         self.logged = 0
-        """Rows of the log in use."""
+        """Number of rows of the log in use."""
         for row, output in zip(self.state, self._named.values(), strict=True):
             row["axis"], row["bit"], row["delay"] = NAMES.index(output.drive), 1 << output.bit, output.delay
         self.make_safe()
         self._goals: dict[str, int] = {}
-        """Numbers of goals in the tables, by their ids; 0 is none."""
+        """Numbers of the goals in the tables, by goal id; 0 means no goal."""
         self._number = 0
         self._over: set[str] = set()
-        """Goals that have ended, whose last switches are not reported."""
+        """Goals that have ended but whose last switches are not yet reported."""
         self._table: list[GoalMarks] = []
         """Goals whose switches are in the table."""
         self._built_for: tuple[Run | None, int, int] = (None, -1, 0)
@@ -199,28 +201,28 @@ class Outputs:
         """First row of the table for each output."""
         self._safe_in: Mode | None = None
         self._reported = 0
-        """Cycle of the newest report."""
+        """Cycle of the latest report."""
 
     @property
     def any(self) -> bool:
-        """Whether there are outputs."""
+        """Whether the robot has outputs."""
         return bool(self._names)
 
     def allow_paths(self, allowed: tuple[bool, bool, bool]) -> None:
-        """Note of which drives outputs may switch on a path: of those that take them with a setpoint."""
+        """Set for each drive whether it takes outputs together with setpoints, as switching along a path requires."""
         self._path_allowed = allowed
 
     # ------------------------------------------------------------------ values
 
     def values(self) -> dict[str, bool]:
-        """Return the wanted value of each output."""
+        """Return the requested value of each output."""
         words = self.words.tolist()
         return {
             name: bool(words[row["axis"]] & int(row["bit"])) for name, row in zip(self._names, self.state, strict=True)
         }
 
     def set(self, name: str, value: bool, mode: Mode) -> None:
-        """Set an output now. Raises RefusedError for an unknown one, and where the mode does not allow it."""
+        """Set an output now. Raises RefusedError if the output is unknown or the mode does not allow the change."""
         output = self._find(name)
         if mode in (Mode.DISABLED, Mode.FAULT) and not output.always:
             code = RefusalCode.FAULT if mode is Mode.FAULT else RefusalCode.NOT_ENABLED
@@ -235,14 +237,14 @@ class Outputs:
         self._write(self._names.index(name), value)
 
     def follow_mode(self, mode: Mode) -> None:
-        """Set all outputs to their safe values where the robot has become disabled, or is in fault."""
+        """Set all outputs to their safe values if the robot has just become disabled or gone into fault."""
         if mode is not self._safe_in:
             self._safe_in = mode
             if mode in (Mode.DISABLED, Mode.FAULT):
                 self.make_safe()
 
     def make_safe(self) -> None:
-        """Set all outputs to their safe values; planned switches are over."""
+        """Set all outputs to their safe values. Pulses and stretches that are in progress end."""
         self.state["until"] = self.state["goal"] = 0
         for number, output in enumerate(self._named.values()):
             self._write(number, output.safe)
@@ -260,11 +262,11 @@ class Outputs:
     # ------------------------------------------------------------------ inputs
 
     def input_values(self, words: Sequence[int]) -> dict[str, bool]:
-        """Return the value of each input, from the drives' words."""
+        """Return the value of each input, given the drives' input words."""
         return {name: bool(words[axis] & bit) for name, (axis, bit) in self._inputs.items()}
 
     def edges(self, before: Sequence[int], now: Sequence[int]) -> list[tuple[str, bool]]:
-        """Return the inputs that have changed between two readings of the drives' words, with their new values."""
+        """Return the inputs that differ between two readings of the drives' words, with their new values."""
         return [
             (name, bool(now[axis] & bit))
             for name, (axis, bit) in self._inputs.items()
@@ -272,7 +274,7 @@ class Outputs:
         ]
 
     def check_input(self, name: str) -> None:
-        """Raise RefusedError for an unknown input."""
+        """Raise RefusedError if the input is unknown."""
         if name not in self._inputs:
             known = f"the robot has {', '.join(self._inputs)}" if self._inputs else "the configuration has no [inputs]"
             raise RefusedError(RefusalCode.UNKNOWN_OUTPUT, f"there is no input {name!r}: {known}")
@@ -280,7 +282,7 @@ class Outputs:
     # ------------------------------------------------------------------ marks
 
     def check_marks(self, marks: Sequence[Mark]) -> None:
-        """Raise RefusedError for a mark of an unknown output, or of one that cannot switch on a path."""
+        """Raise RefusedError if a mark names an unknown output or one that cannot be switched along a path."""
         for mark in marks:
             drive = self._find(mark.output).drive
             if not self._path_allowed[NAMES.index(drive)]:
@@ -291,7 +293,7 @@ class Outputs:
                 )
 
     def prepare(self, run: Run | None, version: int) -> None:
-        """Make the table of planned switches for a motion, if it is not that already."""
+        """Build the table of planned switches for a motion, unless the table is already up to date."""
         goals = list(run.marks) if run is not None else []
         key = run, version, len(goals)
         if key == self._built_for:
@@ -320,14 +322,14 @@ class Outputs:
         return self._goals[goal]
 
     def _note_passed(self) -> None:
-        """Note for each goal of the table which of its switches have happened."""
+        """Record which switches of each goal in the table have taken place."""
         for number, name in enumerate(self._names):
             passed = self.planned["goal"][self._first[number] : int(self.state[number]["next"])]
             for goal in (goal for goal in self._table if goal.goal in self._goals):
                 goal.note_passed(name, int(np.count_nonzero(passed == self._number_of(goal.goal))))
 
     def step(self, run: Run | None, time: float, version: int, cycle: int, record: NDArray[np.void]) -> None:
-        """Switch what is due in a cycle."""
+        """Switch the outputs that are due in this cycle."""
         if not self._names:
             return
         self.prepare(run, version)
@@ -338,26 +340,26 @@ class Outputs:
         )
 
     def stamp(self, deadline_ns: int) -> None:
-        """Note the deadline of the newest cycle for its switches."""
+        """Store the deadline of the latest cycle as the time of the switches in that cycle [ns]."""
         for row in self.log[: self.logged]:
             row["deadline_ns"] = row["deadline_ns"] or deadline_ns
 
     @property
     def report_after(self) -> int:
-        """Cycles from the last one without a switch to report to the one behind which switches are reported."""
+        """Number of cycles for which switches are collected before they are reported."""
         return math.ceil(TABLE_DELAY / self._period)
 
     @property
     def report_due(self) -> int:
-        """Cycle behind which switches are reported."""
+        """Cycle after which the collected switches are reported."""
         return self._reported + self.report_after
 
     def update_log(self, logged: int, report_due: int) -> None:
-        """Continue from compiled cycles, with the rows of the log and the cycle behind which they are reported."""
+        """Update the log after compiled cycles: its number of rows, and the cycle after which it is reported."""
         self.logged, self._reported = logged, report_due - self.report_after
 
     def close(self, goal: str, outcome: Outcome, cycle: int, record: NDArray[np.void]) -> None:
-        """Switch back what a goal has open at its end; the pulses of one that is done last as long as they should."""
+        """Switch back the outputs that an ended goal still holds. Pulses of a goal that is done run to their end."""
         if goal not in self._goals:
             return
         number = self._goals[goal]
@@ -374,9 +376,9 @@ class Outputs:
             row["goal"] = row["until"] = 0
 
     def pop_switches(self, cycle: int, *, all_: bool = False) -> list[tuple[Switch, ...]]:
-        """Return the switches to report now, in tables for one message each.
+        """Return the switches to report now, grouped into one table per message.
 
-        Their times are of the monotonic clock, or NaN where the record of the cycle is not made yet.
+        Their times are on the monotonic clock, or NaN if the record of the cycle does not exist yet.
         """
         due = all_ or self.logged >= TABLE_LENGTH or (cycle - self._reported) * self._period >= TABLE_DELAY
         if self.logged and not due:

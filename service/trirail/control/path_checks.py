@@ -1,6 +1,7 @@
-"""Checks of goals: each is planned from rest at the end of the motion under way, only to answer the request.
+"""Checks of goals. A goal is planned from rest at the end of the current motion, only to answer the request.
 
-Nothing moves, no event is published, and mode and lease do not matter. Goals take precedence over checks.
+A check moves nothing and publishes no event. It does not depend on the mode or on the lease. Goals take precedence over
+checks.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ NO_MOTION = (0.0, 0.0, 0.0)
 
 
 class PathChecks:
-    """Queue of checks; the planner gets one at a time, while it plans no goal."""
+    """Queue of checks. The planner receives one check at a time, while it is not planning a goal."""
 
     def __init__(
         self,
@@ -47,13 +48,14 @@ class PathChecks:
         self._outputs = outputs
         self._waiting: deque[CheckRequest] = deque()
         self._number = 0
-        """Number of the last request: negative, since those of goals are positive."""
+        """Number of the last request. It is negative, because the numbers of goal requests are positive."""
         self._asked_before: int | None = None
-        """Number of requests for goals before the pending one; a later one overtakes it at the planner."""
+        """Number of goal requests sent before the pending check. A later goal request replaces the check at the
+        planner."""
 
     @property
     def due(self) -> bool:
-        """Whether a check waits and can be requested from the planner now."""
+        """Whether a check is waiting and can be sent to the planner now."""
         return bool(self._waiting) and not self._planner.busy and not self._under_way
 
     @property
@@ -61,11 +63,11 @@ class PathChecks:
         return self._asked_before == self._planner.requests
 
     def enqueue(self, request: CheckRequest) -> None:
-        """Enqueue a check behind the others."""
+        """Add a check at the end of the queue."""
         self._waiting.append(request)
 
     def step(self, place: PoseSource) -> None:
-        """Request the next check from the planner if it is due; `place` returns the pose from which it begins."""
+        """Send the next check to the planner if it is due. `place` returns the pose from which the check begins."""
         while self.due:
             request = self._waiting[0]
             try:
@@ -74,7 +76,7 @@ class PathChecks:
                 self._refuse(refusal)
 
     def receive(self, answer: PlanAnswer) -> None:
-        """Answer the check that the planner was last asked for; ignore every other answer."""
+        """Answer the check that was last sent to the planner; ignore every other answer."""
         if self._asked_before is None or answer.number != self._number:
             return
         if isinstance(answer, NotPlanned):
@@ -85,12 +87,12 @@ class PathChecks:
         self._ledger.answers.append(Checked(request.ticket, reply))
 
     def fail(self, reason: str) -> None:
-        """Refuse the pending check: the planner will not answer its request."""
+        """Refuse the pending check, because the planner will not answer it."""
         if self._under_way:
             self._refuse(RefusedError(RefusalCode.PLANNER_LOST, f"{reason}: send the check again"))
 
     def withdraw(self, reason: str) -> None:
-        """Refuse every check: nobody waits for the answers."""
+        """Refuse all checks, because no client is waiting for the answers any more."""
         while self._waiting:
             self._refuse(RefusedError(RefusalCode.BUSY, f"{reason}: send the check again"))
 

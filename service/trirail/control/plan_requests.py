@@ -1,7 +1,7 @@
-"""Requests to the planner, one goal at a time, and application of its answers to the motion under way.
+"""Requests to the planner, for one goal at a time, and application of its answers to the motion under way.
 
-The planner is another process: its answer may arrive late, twice, for a motion that is no longer under way, or never.
-Nothing that stops the robot waits for it.
+The planner is a separate process. Its answer may arrive late, twice, for a motion that is no longer under way, or
+never. Nothing that stops the robot waits for the planner.
 """
 
 from __future__ import annotations
@@ -32,44 +32,45 @@ from trirail.wire.messages import GoalReply
 from trirail.wire.plan_packets import NotPlanned, PathExtension, PlanAnswer, PlanRequest, PreemptingMotion
 
 LEADS = (0.003, 0.012, 0.048)
-"""Time between the request and the begin of a motion that starts from motion [s], for the first request and each
-repetition."""
+"""Time between the request for a motion that starts from motion and the start of that motion [s]: for the first
+request and for each repetition."""
 MIN_LEAD_CYCLES = 2
-"""Shortest such time in cycles: an answer arrives in the next cycle at the earliest."""
+"""Shortest time between request and start [cycles], because an answer arrives in the next cycle at the earliest."""
 PLANNING_TIMEOUT_S = 8.0
-"""Longest wait for the planner's answer [s]; a dead planner is reported immediately."""
+"""Longest wait for the planner's answer [s]. A dead planner is reported immediately."""
 BUSY_AFTER_S = 0.5
-"""Silence after which the planner is reported as busy [s]."""
+"""Time without an answer after which the planner is reported as busy [s]."""
 LEAD_FACTOR = 2
-"""Time between a repeated request and the begin of its motion, in multiples of the last answer's delay."""
+"""Time between a repeated request and the start of its motion, in multiples of the delay of the last answer."""
 MAX_RATE_CHANGE_CYCLES = 12
-"""Longest wait for a change of rate before a goal is planned regardless [cycles]."""
+"""Longest wait for a change of rate before a goal is planned anyway [cycles]."""
 ROUNDING = (1e-9, 1e-7, 1e-5)
-"""Greatest step from the commanded motion to a new one, in position, velocity and acceleration [m, rad, …]."""
+"""Greatest differences in position, velocity and acceleration between the commanded motion and the start of a new
+one [m, rad, …]."""
 
 
 class PlannerPort(Protocol):
-    """Port for requests to the planner."""
+    """Port through which requests are sent to the planner."""
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Send a request without waiting; the planner's answer reaches the control in a later cycle."""
+        """Send a request without waiting. The control receives the planner's answer in a later cycle."""
 
 
 class AcceptedPlan(NamedTuple):
-    """Accepted plan of a goal."""
+    """Plan that has been accepted for a goal."""
 
     reply: GoalReply
-    """Reply to the goal's sender, without the goal's id."""
+    """Reply to the sender of the goal, without the goal's id."""
     bound: str | None = None
-    """Limit at which a jog stops, or beyond which the target of a track is."""
+    """Limit at which a jog stops, or which the target of a track exceeds."""
 
 
 class PlanRequests:
-    """Updates of the schedule of motions: changes of rate computed here, and goals planned by the planner."""
+    """Updates of the motion schedule: rate changes, which are computed here, and goals, which the planner plans."""
 
     def __init__(self, config: Config, port: PlannerPort, schedule: Schedule) -> None:
         self.override = 1.0
-        """Speed override of motions, as a factor."""
+        """Speed override of all motions, as a factor."""
         self._running = False
         robot, self._period = corrected_geometry(config), config.period
         limits = planned_limits(config.limits, config.correction.backlash)
@@ -93,7 +94,7 @@ class PlanRequests:
         self._since: int | None = None
         self._change: RateChange | None = None
         self._greatest_rate = math.inf
-        """Greatest rate of the goal under way."""
+        """Greatest rate that the current goal allows."""
 
     @property
     def busy(self) -> bool:
@@ -107,12 +108,12 @@ class PlanRequests:
 
     @property
     def awaits_answer(self) -> bool:
-        """Whether the planner has not answered the present request."""
+        """Whether the planner has yet to answer the current request."""
         return self._goal is not None and self._request is not None and self._answer is None
 
     @property
     def due(self) -> float:
-        """Number of cycles until `step` is due if nothing is received; 0 for now."""
+        """Number of cycles until `step` must be called if nothing is received; 0 if it must be called now."""
         if self._goal is None:
             return math.inf if self._change is None else 0
         asked, answer, now = self._request, self._answer, self._schedule.cycle
@@ -126,29 +127,30 @@ class PlanRequests:
 
     @property
     def silence(self) -> float:
-        """Time since the first unanswered request for the present goal [s]."""
+        """Time since the first unanswered request for the current goal [s]."""
         return (self._schedule.cycle - self._since) * self._period if self._since is not None else 0.0
 
     @property
     def busy_message(self) -> str:
-        """Message that the planner is busy, for people; empty while it is not."""
+        """Message for the user that the planner is busy; empty if it is not."""
         silence = self.silence
         return f"the planner is busy, no answer for {silence:.1f} s" if silence > BUSY_AFTER_S else ""
 
     def warm_up(self) -> None:
-        """Run the code once on a schedule that is not executed, since the first run of code is slow."""
+        """Run the code once on a schedule that is never executed, because the first run is slow."""
         nowhere = Schedule(rest(ZERO_RATES), self._period)
         path = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
         nowhere.replace_runs(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant_law(1.0), 1.0)))]))
         RateChange(self._scaling, nowhere, 0.0, self._period).step()
 
     def plan(self, goal: Goal, blend: float | None = None, name: str = "") -> None:
-        """Begin to plan a goal.
+        """Start planning a goal.
 
         Parameters
         ----------
         blend
-            Distance from the end of the motion under way at which the goal may begin [m]; None to preempt that motion.
+            Distance from the end of the current motion at which the goal may begin [m]; None to preempt the current
+            motion.
         name
             Id of the goal.
 
@@ -158,25 +160,25 @@ class PlanRequests:
         self._request = self._answer = self._lost = None
 
     def cancel(self) -> None:
-        """Stop planning the goal; ignore later answers."""
+        """Stop planning the goal, and ignore answers that arrive later."""
         self._goal = self._request = self._answer = self._lost = self._since = None
 
     def set_running(self, running: bool) -> None:
-        """Run the motion under way at the speed override, or brake it."""
+        """Run the current motion at the speed override, or brake it."""
         self._running = running
         self._start_rate_change()
 
     def update_rate(self) -> None:
-        """Apply a new override or a changed path to the motion under way, unless it is braking."""
+        """Apply a new override or a changed path to the current motion, unless it is braking."""
         if self._running:
             self._start_rate_change()
 
     def discard_rate_change(self) -> None:
-        """Discard the change of rate, since no motion is under way."""
+        """Discard the rate change, because no motion is under way."""
         self._running, self._change = False, None
 
     def receive(self, answer: PlanAnswer) -> None:
-        """Store the first answer to the last request; ignore all others."""
+        """Store the first answer to the latest request; ignore all other answers."""
         asked = self._request
         if asked is not None and (answer.number, answer.version) == (asked.number, asked.version) and not self._answer:
             self._answer, self._since = answer, None
@@ -188,11 +190,11 @@ class PlanRequests:
             self._lost = reason
 
     def step(self) -> AcceptedPlan | None:
-        """Continue a change of rate, then request or apply the goal's motion; return the accepted plan, if any.
+        """Advance a rate change, then request or apply the motion of the goal. Return the plan if one is accepted.
 
-        A change of rate has priority. If the sliders do not allow it yet, the goal is planned from the present motion.
-        While a request is pending, only a lower rate changes the motion. Raises RefusedError if the goal cannot be
-        reached.
+        A rate change takes precedence over a request. If the sliders do not allow the change within
+        MAX_RATE_CHANGE_CYCLES, the goal is planned from the current motion anyway. While a request is pending, only a
+        change to a lower rate is made. Raises RefusedError if the goal cannot be reached.
         """
         self._change_rate()
         if self._goal is None:
@@ -215,11 +217,11 @@ class PlanRequests:
 
     @property
     def _rate(self) -> float:
-        """Target rate of the motion under way."""
+        """Target rate of the current motion."""
         return min(self.override, self._greatest_rate) if self._running else 0.0
 
     def _start_rate_change(self) -> None:
-        """Begin to change the rate of the motion under way to its target."""
+        """Start changing the rate of the current motion to its target."""
         self._change = RateChange(self._scaling, self._schedule, self._rate, self._period)
 
     def _change_rate(self) -> None:
@@ -228,7 +230,7 @@ class PlanRequests:
             self._change = None
 
     def _request_plan(self, goal: Goal) -> None:
-        """Request the goal's motion from the one under way. Raises RefusedError after too many requests."""
+        """Request a motion to the goal from the current one. Raises RefusedError after too many requests."""
         if self._attempts == len(self._leads):
             text = f"{self._attempts} plans came too late, or the motion under way changed: send the goal again"
             raise RefusedError(RefusalCode.NO_PLAN, text)
@@ -252,14 +254,14 @@ class PlanRequests:
         self._port.request_plan(self._request)
 
     def _lead(self, goal: Goal) -> int:
-        """Return the number of cycles between a request and the begin of its motion."""
+        """Return the number of cycles between a request and the start of the requested motion."""
         lead = self._leads[self._attempts]
         if self._attempts:
             return max(lead, LEAD_FACTOR * self._answer_cycles)
         return max(lead, self._answer_cycles + 1) if goal.frequent else lead
 
     def _apply(self, answer: PlanAnswer) -> AcceptedPlan | None:
-        """Apply the planner's answer once it is due; drop it if the motion has changed, to request another."""
+        """Apply the planner's answer once it is due; drop it and request another if the motion has changed."""
         if isinstance(answer, NotPlanned):
             raise answer.error()
         try:
@@ -283,7 +285,7 @@ class PlanRequests:
             self._request = None
             return None
         schedule.replace_runs(runs)
-        # The goal begins in this cycle, which changes the mode to moving.
+        # The goal begins in this cycle, and the mode changes to moving.
         self._running, self._change = True, None
         self._greatest_rate = self._goal.greatest_rate if self._goal else math.inf
         if run.target != self._rate:
@@ -291,7 +293,7 @@ class PlanRequests:
         return AcceptedPlan(planned.reply, planned.bound)
 
     def _stopping(self, under_way: Run, planned: PreemptingMotion) -> Run:
-        """Return the motion under way with a law that stops it, and without goals on its path."""
+        """Return the current motion with a law that stops it. The goals on its path are removed."""
         run = under_way.copy()
         run.seams.clear()
         run.marks.clear()
@@ -300,8 +302,8 @@ class PlanRequests:
         return run
 
     def _continues(self, runs: Iterable[Run]) -> bool:
-        """Return whether the runs begin with the commanded motion, and each begins where the previous one ends."""
-        # From rest a trajectory may begin with an acceleration; the planner has checked that jerk.
+        """Return whether the runs continue the commanded motion and each begins where the one before it ends."""
+        # From rest, a trajectory may begin with an acceleration; the planner has checked the resulting jerk.
         state = self._schedule.commanded
         for run in runs:
             begins = run.state(0.0, state.pose)
@@ -313,7 +315,7 @@ class PlanRequests:
         return True
 
     def _marks(self, switches: bytes) -> GoalMarks:
-        """Return the marks of the planned goal. Raises ValueError if the switches do not match them."""
+        """Return the marks of the goal being planned. Raises ValueError if the switches do not match the marks."""
         return GoalMarks(self._goal_id, self._goal.marks if self._goal is not None else (), switches)
 
     def _extend(self, extended: PathExtension) -> AcceptedPlan | None:
@@ -332,7 +334,7 @@ class PlanRequests:
 
 
 def _same(one: MotionState, other: MotionState) -> bool:
-    """Return whether two states of motion are equal except for rounding; False for NaN."""
+    """Return whether two states of motion agree within rounding. The result is False for NaN."""
     return all(
         abs(a - b) <= allowed
         for allowed, here, there in zip(ROUNDING, one, other, strict=True)

@@ -1,4 +1,4 @@
-"""Events about drives that restart or disappear, and about their sliders when they return."""
+"""Events for drives that restart or disappear, and for sliders that have moved when their drives return."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from trirail.wire.messages import Level
 
 
 class ReturningDrives:
-    """Detector of drives that are lost or configured again, by comparing each feedback with the previous one."""
+    """Detector of drives that are lost or configured again. It compares each feedback with the previous one."""
 
     def __init__(self, labels: tuple[str, str, str], windows: Triple) -> None:
-        """Set the labels, and the `windows`: greatest changes of the sliders' positions that are not reported [m]."""
+        """Set the labels of the drives. `windows` are the greatest position changes that are not reported [m]."""
         self._labels = labels
         self._windows = windows
         self._before: tuple[Unready | None, ...] = (None, None, None)
@@ -22,7 +22,7 @@ class ReturningDrives:
         """Position of each drive when it was lost [m]; None if it was not homed."""
 
     def update(self, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
-        """Yield messages about changes, with their levels."""
+        """Yield the messages about changes, each with its level."""
         if feedback.unready == self._before:
             return
         reported = {feedback.fault.message} if feedback.fault is not None else set()
@@ -30,7 +30,7 @@ class ReturningDrives:
             if now is not None and before is None:
                 self._last[i] = feedback.position[i] if feedback.homed[i] else None
             if now is not None and (before is None or now.reason != before.reason):
-                if now.reason not in reported:  # a lost bus is the same reason for all drives
+                if now.reason not in reported:  # a lost bus gives all drives the same reason
                     name = self._labels[i]
                     yield "warning", coded(now.reason, EventCode.DRIVE_NOT_READY, drive=name, reason=now.reason)
                 reported.add(now.reason)
@@ -39,7 +39,7 @@ class ReturningDrives:
         self._before = feedback.unready
 
     def _back(self, i: int, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
-        """Yield messages about a drive that is configured again, and whether its slider has moved."""
+        """Yield messages that a drive is configured again, and whether its slider has moved."""
         label, position, last = self._labels[i], feedback.position[i], self._last[i]
         waiting = any(each is not None for each in feedback.unready)
         if waiting:

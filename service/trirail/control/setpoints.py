@@ -1,4 +1,4 @@
-"""Setpoints of the sliders: solved for the commanded motion and checked by the last gate, or following the sliders."""
+"""Setpoints of the sliders. They are either solved and checked by the last gate, or follow the measured sliders."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.vocabulary import Mode
 
 _ALLOWED = {Mode.HOLDING: AllowedMotion.NONE, Mode.STOPPING: AllowedMotion.BRAKING}
-"""Motion allowed by mode; the gate is not used in modes in which the commanded motion follows the measured one."""
+"""Motion that each mode allows. The gate is not used in modes in which the commanded motion follows the measured
+one."""
 
 
 class Setpoints:
-    """Setpoints of the next SYNC.
+    """Setpoints for the next SYNC.
 
     Parameters
     ----------
     tolerance
         Result of trirail.motion.limits.standing_tolerance.
     step
-        Greatest travel of a slider in a cycle [m].
+        Greatest travel of a slider in one cycle [m].
 
     """
 
@@ -50,7 +51,7 @@ class Setpoints:
 
     @property
     def bounds(self) -> NDArray[np.void]:
-        """Bounds of the last gate, (1,) of trirail.motion.limits.BOUNDS."""
+        """Bounds of the last gate, (1,) of dtype trirail.motion.limits.BOUNDS."""
         return self._bounds.packed
 
     @property
@@ -60,7 +61,7 @@ class Setpoints:
 
     @property
     def rows(self) -> list[list[float]]:
-        """Rows position, velocity and acceleration of the sliders, then those of the cross slides."""
+        """Position, velocity and acceleration of the sliders, then of the cross slides; one row each."""
         return self.sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not annotate the type of its lists
 
     @property
@@ -70,17 +71,18 @@ class Setpoints:
         return (a, b, c), (u, v, w)
 
     def start(self) -> None:
-        """Begin at the sliders' measured positions."""
+        """Start with setpoints equal to the measured slider positions."""
         self.sliders[0, 0] = self._measured.position
 
     def allow(self, mode: Mode) -> None:
-        """Set the motion that the last gate allows, for a new mode."""
+        """Set the motion that the last gate allows in a new mode."""
         self.bounds[0]["allowed"] = _ALLOWED.get(mode, AllowedMotion.ANY)
 
     def solve(self, schedule: Schedule, run: Run | None) -> int:
-        """Advance the commanded motion by one period of the run, and solve the sliders.
+        """Advance the commanded motion by one period of the run, and solve the slider positions for it.
 
-        They stay unchanged if the last gate refuses the result. Returns the code of trirail.control.cycle.command.
+        The slider positions do not change if the last gate refuses the result. Returns the code of
+        trirail.control.cycle.command.
         """
         legs, bounds, refused_values = self._legs, self._bounds.packed, self._bounds.last_violation
         motion, sliders, record = schedule.motion, self.sliders, self._measured.record
@@ -94,7 +96,7 @@ class Setpoints:
         )
 
     def refusal(self, code: int) -> str | None:
-        """Return the reason of a refusal by the last gate; None if the code has no refusal."""
+        """Return the reason why the last gate refused the setpoints; None if the code contains no refusal."""
         refused = cycle.refusal(code)
         if refused == 0:
             return None
@@ -113,17 +115,18 @@ class Setpoints:
         return f"setpoint refused: {self._bounds.violation(refused - len(NAMES))}"
 
     def follow(self, schedule: Schedule, *, held: bool, stopped_now: bool) -> None:
-        """Command the measured pose, and lead the setpoint of each drive that holds no position to its measured one.
+        """Command the measured pose, and move the setpoint of each drive that holds no position to its measured one.
 
-        Setpoints follow at the speed of a slider, so that nothing moves on enable, and a drive that has missed the
-        command to stop does not jump. A drive that moves by itself, to home, gets its position as its setpoint.
+        A setpoint moves no faster than a slider. Nothing therefore moves when the drives are enabled, and a drive that
+        has missed the command to stop does not jump. For a drive that moves by itself to home, the setpoint is the
+        measured position.
 
         Parameters
         ----------
         held
             Whether enabled drives keep their setpoints.
         stopped_now
-            Whether all drives were stopped in this cycle, so that all keep their setpoints.
+            Whether all drives were stopped in this cycle, so that all of them keep their setpoints.
 
         """
         measured = self._measured
@@ -131,19 +134,19 @@ class Setpoints:
         cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self.step, *arrays)
 
     def set_cross_slides(self, pose: Sequence[float]) -> None:
-        """Set the positions of the cross slides for a pose; the gate compares the next setpoint with them."""
+        """Set the positions of the cross slides for a pose. The gate compares the next setpoint with them."""
         self._motion[:] = 0.0
         self._motion[0] = pose
         if inverse_into(self._legs, self._motion, self._tried) == 0:
             self.sliders[0, 3:] = self._tried[3:]
 
     def record_progress(self, progress: float, remaining: float) -> None:
-        """Record the progress of the goal under way, as a share, and the remaining time [s]."""
+        """Record the completed share of the current goal, and its remaining time [s]."""
         record = self._measured.record
         record["progress"], record["remaining"] = progress, remaining
 
     def check_rest(self) -> None:
-        """Raise RefusedError, on enable, while a setpoint still follows its slider."""
+        """Raise RefusedError on enable if a setpoint is still moving towards its slider."""
         places = self._measured.position
         for name, setpoint, position in zip(self._bounds.labels, self.rows[0], places, strict=True):
             if not abs(setpoint - position) <= self.step:
@@ -153,10 +156,10 @@ class Setpoints:
                 )
 
     def check_start(self) -> EventText | None:
-        """Return a warning if the robot is outside its limits by more than the tolerance; else None.
+        """Return a warning if the robot is outside its limits by more than the tolerance, else None.
 
-        From there only motion back is accepted. Raises RefusedError if the robot is at or behind a singular pose, which
-        no motion may pass.
+        From there, only motion back towards the limits is accepted. Raises RefusedError if the robot is at or beyond a
+        singular pose, because no motion may pass through one.
         """
         pose = self._measured.pose_of(self._measured.position)
         self._motion[:] = 0.0

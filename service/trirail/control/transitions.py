@@ -1,4 +1,4 @@
-"""Changes of mode, with their actions on drives, motion and goals in the same cycle."""
+"""Changes of mode, and the resulting actions on drives, motion and goals in the same cycle."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.INPUT_EDGE: "done",
     ModeEvent.FAULT: "faulted",
 }
-"""Outcome of a goal ended by an event; "stopped" for events not listed."""
+"""Outcome of a goal that an event ends; "stopped" for events that are not listed."""
 _ORDERS: dict[Action, Callable[[DriveGroup], None]] = {
     Action.POWER_UP: lambda drives: drives.enable(),
     Action.POWER_DOWN: lambda drives: drives.disable(),
@@ -35,24 +35,24 @@ _ORDERS: dict[Action, Callable[[DriveGroup], None]] = {
     Action.HOME: lambda drives: drives.home(),
     Action.STOP_HOMING: lambda drives: drives.stop_homing(),
 }
-"""Order to the drives for an action; actions not listed concern only the motion."""
+"""Order to the drives for each action. Actions that are not listed affect only the motion."""
 _KEEPS_GOALS = (
     ModeEvent.GOAL,
     ModeEvent.STANDSTILL,
     ModeEvent.ARRIVED,
     ModeEvent.POWERED,
-    # Not HOME: homing moves the sliders, so that earlier goals would not begin from their intended pose.
+    # HOME is excluded: homing moves the sliders, so earlier goals would not begin from their intended pose.
     *(
         ModeEvent[name.name]
         for name in Command
         if not name.stops and name.name in ModeEvent.__members__ and name is not Command.HOME
     ),
 )
-"""Events that do not withdraw goals that are received but not begun."""
+"""Events after which goals that have been received but not begun are kept."""
 
 
 class Transitions:
-    """Mode of the robot, and its changes; `cycle` is the number of the present cycle, or of the next between two."""
+    """Current mode of the robot, and its changes. Between two cycles, `cycle` is the number of the next one."""
 
     def __init__(
         self,
@@ -74,16 +74,16 @@ class Transitions:
         self.cycle = 1
         self.state: ModeState = DISABLED
         self.fault: str | None = None
-        """Reason of the first fault since the last reset."""
+        """Reason for the first fault since the last reset."""
         self.entered = 0
-        """Cycle in which the mode was entered."""
+        """Cycle in which the robot entered the current mode."""
         self._edge: EventText | None = None
-        """Edge of an input that has ended the goal under way."""
+        """Edge of an input that has ended the current goal."""
         self.orders = 0
         """Number of orders sent to the drives."""
 
     def check(self, event: ModeEvent) -> Step:
-        """Return the effect that an event would have now. Raises RefusedError if this mode does not allow it."""
+        """Return the effect that an event would have now. Raises RefusedError if the current mode does not allow it."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             because = f" (fault: {self.fault})" if self.fault else ""
@@ -91,7 +91,7 @@ class Transitions:
         return decided
 
     def apply_event(self, event: ModeEvent, reason: EventText, goal: GoalRequest | None = None) -> None:
-        """Change the mode and carry out the action, if the mode allows the event; `goal` is the goal that begins."""
+        """Change the mode and take the action, if the mode allows the event. `goal` is the goal being started."""
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             return
@@ -107,7 +107,7 @@ class Transitions:
         if goal is not None or not self.state.has_goal:
             self._measured.settling.cancel()
         if not self.state.has_goal:
-            self._schedule.stop_on_path()  # also if it brakes already, so that no later goal begins on the way
+            self._schedule.stop_on_path()  # also while braking, so that no later goal begins on the way
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = EventCode.RELEASED if before.released else EventCode.ARRIVED
             at_end = self._edge if self._edge is not None else coded(arrived.value, arrived)
@@ -125,7 +125,7 @@ class Transitions:
             self._planner.discard_rate_change()
 
     def handle_disturbance(self, event: ModeEvent, reason: EventText) -> None:
-        """Handle a disturbance: the gateway is lost, ticks are late, the service ends."""
+        """Handle a disturbance: the loss of the gateway, late ticks, or the end of the service."""
         decided = step(self.state, event)
         if not isinstance(decided, Refusal) and decided.state != self.state:
             self._ledger.notices.append(Notice("service", "warning", reason.text, **reason.fields))
@@ -133,7 +133,7 @@ class Transitions:
         self.withdraw(event, reason)
 
     def trip(self, reason: EventText, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives in this cycle, and latch the reason; cause, drive and code are as in FaultDetail."""
+        """Stop all three drives now and latch the reason. `cause`, `drive` and `code` are as in FaultDetail."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason.text
@@ -143,7 +143,7 @@ class Transitions:
         self.withdraw(ModeEvent.FAULT, reason)
 
     def withdraw(self, event: ModeEvent, reason: EventText) -> None:
-        """End goals that are received but not begun, if the event stops the robot; call after `apply_event`."""
+        """End goals that have not begun, if the event stops the robot. Call this after `apply_event`."""
         if event not in _KEEPS_GOALS:
             self._goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason.text)
 
@@ -155,7 +155,7 @@ class Transitions:
             case Action.CLEAR:
                 self.fault = None
             case Action.BRAKE:
-                if not decided.state.paused:  # stop on the present path: later goals do not begin
+                if not decided.state.paused:  # stop on the current path, so that later goals do not begin
                     self._schedule.stop_on_path()
                 self._planner.set_running(False)
             case Action.RESUME:

@@ -1,1 +1,1 @@
-"""The paper's recursion, the robot made of it, and its calibration; pure mathematics, compiled."""
+"""Recursion of the paper, the robot built on it, and its calibration. All modules are pure mathematics, compiled."""

@@ -1,13 +1,13 @@
-"""Calibration: the robot as built, from poses measured from outside and the slider readings at them.
+"""Calibration: identification of the robot as built, from measured poses and the slider readings at these poses.
 
-The measured poses differ from forward(geometry, sliders) by independent normal noise; the sliders' encoders count as
-exact beside it. The result is the geometry with the least weighted squares of the differences.
+The measured poses differ from forward(geometry, sliders) by independent normal noise. The encoders of the sliders are
+taken as exact in comparison. The result is the geometry with the least weighted sum of squared differences.
 
-Such data determines at most five combinations of the seven numbers of a leg: the PARAMETERS of its mechanism, as
-corrections to a starting geometry.
+Such data determines at most five combinations of the seven numbers of a leg. They are the PARAMETERS of its mechanism,
+and are given as corrections to a starting geometry.
 
-Poses with too little variety determine fewer. The undetermined combinations show in the singular values of each leg's
-Jacobian; they keep the values of the starting geometry, and the result names them.
+Poses with too little variety determine fewer combinations. The undetermined ones show in the singular values of the
+Jacobian of each leg. They keep the values of the starting geometry, and the result names them.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from trirail.kinematics.robot import forward, inverse, jacobians
 
 __all__ = ["Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
 
-MIN_NAMED_SHARE = 0.1  # of a parameter in an undetermined combination, in units of its doubt, for it to be named
-MINIMUM = 6  # each pose is one equation for a leg: five for its parameters, and one to contradict
-MISFIT = 3.0  # root mean square of residual over noise from which on the data cannot be that of this robot
+MIN_NAMED_SHARE = 0.1  # least share of a parameter in an undetermined combination, in units of its doubt, to name it
+MINIMUM = 6  # each pose gives one equation per leg: five for its parameters, and one to contradict
+MISFIT = 3.0  # ratio of residual to noise (root mean square) above which the data cannot be that of this robot
 TOLERANCE = 1e-12
-MAX_EVALUATIONS = 200  # a handful are enough for data that fits
+MAX_EVALUATIONS = 200  # data that fits needs only a few
 
 
 class CalibrationError(TrirailError):
-    """Data from which no geometry can be identified; `row` counts from 0, None where no single one is at fault."""
+    """Data from which no geometry can be identified. `row` counts from 0; it is None if no single row is at fault."""
 
     def __init__(self, message: str, *, row: int | None = None) -> None:
         super().__init__(message)
@@ -41,7 +41,7 @@ class CalibrationError(TrirailError):
 
 
 class Open(NamedTuple):
-    """Parameters of a leg of which the data leaves a number of independent combinations undetermined."""
+    """Parameters of a leg for which the data leaves one or more independent combinations undetermined."""
 
     leg: str
     parameters: tuple[str, ...]
@@ -49,23 +49,23 @@ class Open(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """A geometry identified from N poses. Corrections have the rows A, B, C and the columns of Geometry.parameters."""
+    """Geometry identified from N poses. Corrections have the rows A, B, C and the columns of Geometry.parameters."""
 
     geometry: Geometry
-    corrections: Array  # (3, 5), to the starting geometry [m, rad]
-    standard_errors: Array  # (3, 5), by the stated noise; infinite for a parameter of an undetermined combination
+    corrections: Array  # (3, 5), relative to the starting geometry [m, rad]
+    standard_errors: Array  # (3, 5), from the stated noise; infinite for undetermined parameters
     open: tuple[Open, ...]
-    residuals: Array  # (N, 3): measured less computed x, y, phi [m, m, rad]
-    misfit: float  # root mean square of residual over noise, per degree of freedom: about 1 if all is well
+    residuals: Array  # (N, 3): measured minus computed x, y, phi [m, m, rad]
+    misfit: float  # ratio of residual to noise (root mean square) per degree of freedom: about 1 for good data
 
 
 def identify(
     start: Geometry, poses: Array, sliders: Array, *, position_noise: float = 20e-6, angle_noise: float = 1e-4
 ) -> Calibration:
-    """Return the geometry with which measured `poses` and `sliders`, both (N, 3) in m and rad, agree best.
+    """Return the geometry that agrees best with measured `poses` and `sliders`, both (N, 3) in m and rad.
 
-    The noises are standard deviations of a measured coordinate [m] and angle [rad]. CalibrationError if there
-    are too few poses, if the starting geometry has no pose near a measured one, or if no geometry fits.
+    The noises are the standard deviations of a measured coordinate [m] and angle [rad]. Raises CalibrationError if
+    there are too few poses, if the starting geometry has no pose near a measured one, or if no geometry fits.
     """
     if len(poses) < MINIMUM:
         raise CalibrationError(
@@ -85,7 +85,7 @@ def identify(
         try:
             return (_residuals(geometry(z), poses, sliders) / noise).ravel()
         except KinematicsError:
-            return np.full(poses.size, math.inf)  # a step too far, of which the solver then takes a part
+            return np.full(poses.size, math.inf)  # the step is too large: the solver then takes a part of it
 
     def jacobian(z: Array) -> Array:
         reached = forward(geometry(z), sliders, near=poses)
@@ -128,17 +128,17 @@ def identify(
 
 
 def corrected(start: Geometry, corrections: Array) -> Geometry:
-    """Return the geometry with corrections, (3, 5) in m and rad, to its parameters. KinematicsError as Geometry."""
+    """Return a geometry with corrections (3, 5) [m, rad] to its parameters. Raises KinematicsError like Geometry."""
     first, second, third = (leg.corrected(row) for leg, row in zip(start.each, corrections.tolist(), strict=True))
     return Geometry(legs=(first, second, third), labels=start.labels)
 
 
 def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array:
-    """Return how corrections to `start` move the platform of `geometry`, sliders at rest: (N, 3, 3, 5).
+    """Return the derivatives of the poses of `geometry` by corrections to `start`, at fixed sliders: (N, 3, 3, 5).
 
-    Axes: pose from which it moves, of `poses` (N, 3); x, y, phi; leg; parameters. The loop of a leg demands F = 0. The
-    derivatives of F are J1 by the slider and -J2 by the pose, (16), so that J2 d pose = dF. KinematicsError as from
-    inverse.
+    The axes are: the pose from which the platform moves, out of `poses` (N, 3); x, y, phi; the leg; its parameters. The
+    loop of a leg requires F = 0. The derivative of F is J1 by the slider and -J2 by the pose, (16), so J2 d pose = dF.
+    Raises KinematicsError like inverse.
     """
     _, J2 = jacobians(geometry, poses)
     joints = inverse(geometry, poses)
@@ -150,7 +150,7 @@ def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array
 
 
 def _check(start: Geometry, poses: Array, sliders: Array) -> None:
-    """Refuse data that the starting geometry cannot follow, by row."""
+    """Refuse data that the starting geometry cannot follow, and name the row."""
     for row, (pose, reading) in enumerate(zip(poses, sliders, strict=True)):
         try:
             inverse(start, pose)
@@ -162,17 +162,18 @@ def _check(start: Geometry, poses: Array, sliders: Array) -> None:
 
 
 def _residuals(geometry: Geometry, poses: Array, sliders: Array) -> Array:
-    """Return measured less computed poses, (N, 3)."""
+    """Return measured minus computed poses, (N, 3)."""
     difference = poses - forward(geometry, sliders, near=poses)
     difference[:, 2] -= 2.0 * math.pi * np.round(difference[:, 2] / (2.0 * math.pi))
     return difference
 
 
 def _separate(start: Geometry, derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
-    """Return a basis (15, K) of the corrections that the data determines, by the whitened derivatives, and the rest.
+    """Separate the corrections that the data determines from the rest, given the whitened derivatives.
 
-    No correction of one leg can compensate that of another: at each pose their effects are independent. The
-    undetermined combinations therefore belong to one leg each, and can be named.
+    Returns a basis (15, K) of the former, and the parameters of the latter. No correction of one leg can compensate one
+    of another leg, because their effects at each pose are independent. The undetermined combinations therefore belong
+    to one leg each, and can be named.
     """
     columns: list[Array] = []
     unknown: list[Open] = []

@@ -1,6 +1,6 @@
-"""Compiled forward kinematics of every mechanism: the pose of the platform from its sliders.
+"""Compiled forward kinematics of all mechanisms: the pose of the platform for given slider positions.
 
-Functions return error codes and write arrays in place. `legs` is Geometry.packed(), poses are (x, y, phi).
+The functions return error codes and write arrays in place. `legs` is Geometry.packed(), and poses are (x, y, phi).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from trirail.kinematics.loops import SlideLine
 from trirail.kinematics.mechanism import beta, close, demand, line, move
 from trirail.kinematics.recursion import ZERO
 
-ROUNDING = 1e-15  # part of the squares whose difference is (det J2)² that their rounding can make up
-LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; 1 to 3 are the legs'
+ROUNDING = 1e-15  # share of the squares whose difference is (det J2)² that may be due to rounding
+LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; codes 1 to 3 are those of the legs
 LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry.packed() returns
 
 
 @compiled()
 def sign_of_det_j2(legs: Array, pose: Vector) -> float:
-    """Return -1, 1, or 0 if the pose is singular or not finite."""
+    """Return -1 or 1 as the sign of det J2; 0 if the pose is singular or not finite."""
     a, b, c = close(legs[0], pose), close(legs[1], pose), close(legs[2], pose)
     rows = beta(a), beta(b), beta(c)
     det = dot(rows[0], cross(rows[1], rows[2]))
@@ -44,18 +44,18 @@ def _loop_equation(a: SlideLine, b: SlideLine, c: SlideLine) -> Vector:
 
 @compiled(f"UniTuple(f8, 3)({LEGS_TYPE}, f8[::1])")
 def loop_equation(legs: Array, sliders: Array) -> Vector:
-    """Return A, B, C [m] of the equation A cos phi + B sin phi = C that the three loops leave for phi.
+    """Return A, B, C [m] of the equation A cos phi + B sin phi = C that follows for phi from the three loops.
 
-    Each leg demands n_i . G = a_i cos phi + b_i sin phi - c_i. The normals n_i turn together, or stand, so with the
-    sines w_i between the cross slides sum w_i n_i = 0 at every phi: the sum of the demands with these weights is free
-    of G.
+    Each leg requires n_i . G = a_i cos phi + b_i sin phi - c_i. The normals n_i all turn together, or all stay fixed.
+    With the sines w_i between the cross slides, sum w_i n_i = 0 at every phi. The sum of the equations with these
+    weights therefore does not contain G.
     """
     return _loop_equation(line(legs[0], sliders[0]), line(legs[1], sliders[1]), line(legs[2], sliders[2]))
 
 
 @compiled()
 def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> int:
-    """Write the pose of the legs as configured, without a correction."""
+    """Write the pose for the legs as configured, without a correction."""
     for i in range(3):
         if not math.isfinite(sliders[i]):
             return 1 + i
@@ -64,15 +64,15 @@ def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> 
     square = A * A + B * B
     if square - C * C < -ROUNDING * square:
         return LOOPS_OPEN
-    # det J2 = A sin phi - B cos phi: it differs in sign between the two solutions, and keeps it on any path
-    # that does not pass a singularity.
+    # det J2 = A sin phi - B cos phi. Its sign differs between the two solutions, and stays the same on any path that
+    # passes no singularity.
     sign = sign_of_det_j2(legs, (near[0], near[1], near[2]))
     if sign == 0.0 or not square - C * C > ROUNDING * square:
         return J2_SINGULAR
     det = sign * math.sqrt(square - C * C)
     cosine, sine = (A * C - B * det) / square, (B * C + A * det) / square
     pose[2] = math.atan2(sine, cosine)
-    # The demands on n . G agree at this phi; least squares, to favour none.
+    # The requirements on n . G agree at this phi. Least squares treats them all equally.
     xx = xy = yy = x = y = 0.0
     code = 0
     for i, each in enumerate(lines):
@@ -96,18 +96,18 @@ def _forward_real(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
 
 @compiled(f"i8({LEGS_TYPE}, f8[::1], f8[::1], f8[::1])")
 def forward_into(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
-    """Write the pose at which the sliders stand as given; raises and allocates nothing.
+    """Write the pose for given slider positions. The function raises no exception and allocates no memory.
 
-    `sliders`, `near` and `pose` have shape (3,); `near` is a pose on the wanted branch, and may be `pose`
-    itself. Returns 0; 1 + i if slider i is not finite or the cross slide of leg i parallel to its rail; 4 if no
-    pose closes the loops; 5 if J2 is singular, or `near` is. Then `pose` means nothing.
+    `sliders`, `near` and `pose` have shape (3,). `near` is a pose on the desired branch, and may be the same array as
+    `pose`. Returns 0; 1 + i if slider i is not finite or the cross slide of leg i is parallel to its rail; 4 if no pose
+    closes the loops; 5 if J2 is singular at the pose or at `near`. Unless the result is 0, `pose` is undefined.
     """
     return _forward_real(legs, sliders, near, pose)
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1], f8[:, ::1])")
 def forward_batch(legs: Array, sliders: Array, near: Array, poses: Array) -> int:
-    """Do forward_into for arrays (N, 3); the codes of row k begin after 5 k."""
+    """Apply forward_into to arrays (N, 3). The codes of row k begin after 5 k."""
     for k in range(len(sliders)):
         code = _forward_real(legs, sliders[k], near[k], poses[k])
         if code != 0:
@@ -127,10 +127,11 @@ def _solve(rows: tuple[Vector, Vector, Vector], right: Vector) -> Vector:
 
 @compiled()
 def forward_motion(legs: Array, sliders: Matrix, near: Array, motion: Array) -> int:
-    """Write the platform's pose, velocity and acceleration (3, 3) for those of the sliders, three rows.
+    """Write pose, velocity and acceleration (3, 3) of the platform for those of the sliders, given as three rows.
 
-    From (16): J2 times the platform's velocity is J1 times the sliders'. Their accelerations are linear in the
-    platform's, with the same matrices and an offset, which is subtracted. Codes of forward_into.
+    By (16), J2 times the velocity of the platform equals J1 times that of the sliders. The accelerations of the sliders
+    are linear in that of the platform, with the same matrices and an offset, which is subtracted. Returns a code of
+    forward_into.
     """
     code = _forward(legs, sliders[0], near, motion[0])
     if code != 0:

@@ -1,6 +1,6 @@
-"""Compiled loop closure of every mechanism: inverse kinematics and Jacobians.
+"""Compiled loop closure of all mechanisms: inverse kinematics and Jacobians.
 
-Functions return error codes and write arrays in place. `legs` is Geometry.packed(), poses are (x, y, phi).
+The functions return error codes and write arrays in place. `legs` is Geometry.packed(), and poses are (x, y, phi).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @compiled()
 def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
-    """Do inverse_into, from compiled code."""
+    """Write the motion of all joints. This is `inverse_into` for calls from compiled code."""
     commanded = (
         (motion[0, 0], motion[0, 1], motion[0, 2]),
         (motion[1, 0], motion[1, 1], motion[1, 2]),
@@ -40,18 +40,18 @@ def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1])")
 def inverse_into(legs: Array, motion: Array, out: Array) -> int:
-    """Write the motion of all joints for one motion of the platform; raises and allocates nothing.
+    """Write the motion of all joints for one motion of the platform, without raising or allocating memory.
 
-    `motion` (3, 3) holds the rows pose, velocity, acceleration in m, rad, s; `out` (6, 3), a column for each
-    leg, gets position, velocity and acceleration of its slider, then those of its cross slide. Returns 0, or
-    1 + i if leg i is singular or a number is not finite; then `out` means nothing.
+    `motion` (3, 3) holds the rows pose, velocity, acceleration in m, rad, s. `out` (6, 3) has a column for each leg,
+    with position, velocity and acceleration of its slider, then of its cross slide. Returns 0, or 1 + i if leg i is
+    singular or a number is not finite. In that case, `out` is undefined.
     """
     return inverse_motion(legs, motion, out)
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, :, ::1], f8[:, :, ::1])")
 def inverse_batch(legs: Array, motion: Array, out: Array) -> int:
-    """Do inverse_into for `motion` (3, N, 3) and `out` (6, N, 3); the codes of row k begin after 3 k."""
+    """Apply inverse_into to `motion` (3, N, 3) and `out` (6, N, 3). The codes of row k begin after 3 k."""
     for k in range(motion.shape[1]):
         code = inverse_motion(legs, motion[:, k], out[:, k])
         if code != 0:
@@ -61,7 +61,7 @@ def inverse_batch(legs: Array, motion: Array, out: Array) -> int:
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])")
 def jacobians_batch(legs: Array, poses: Array, j1: Array, j2: Array) -> int:
-    """Write the diagonals of J1 and all of J2, (17), (N, 3, 3), for poses (N, 3); codes of inverse_batch."""
+    """Write the diagonals of J1 and all of J2, (17), (N, 3, 3), for poses (N, 3). Returns a code of inverse_batch."""
     for k in range(len(poses)):
         pose, by_pose = (poses[k, 0], poses[k, 1], poses[k, 2]), UNIT
         if is_corrected(legs):  # rows of by_pose: derivatives of the corrected pose by x, y and phi

@@ -1,4 +1,4 @@
-"""Functions compiled by numba: plain IEEE arithmetic, cached on disk, never stale."""
+"""Functions compiled by numba, with plain IEEE arithmetic. They are cached on disk, and the cache is never stale."""
 
 from __future__ import annotations
 
@@ -19,40 +19,41 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 ROOMS = ("kinematics", "motion", "control", "processes")
-"""Folders with compiled functions. Inlined code and constants cross files and folders, so all count as one version."""
+"""Folders with compiled functions. Inlined code and constants cross files and folders, so all of them share one
+version."""
 
 
 def _sources() -> bytes:
     package = Path(__file__).parents[1]
     files = [file for room in ROOMS for file in sorted((package / room).rglob("*.py"))]
     sources = [(file.relative_to(package).parts[0], file.read_bytes()) for file in files]
-    # Constants come from any file of the kinematics; elsewhere from those that have compiled functions themselves.
+    # Constants may come from any file of the kinematics, but elsewhere only from files with compiled functions.
     return b"".join(source for room, source in sources if room == ROOMS[0] or b"@compiled(" in source)
 
 
 FINGERPRINT = hashlib.sha256(_sources()).hexdigest()
 FUNCTIONS = len(re.findall(rb"^@compiled\((?!\))", _sources(), re.MULTILINE))
-"""Number of functions in all rooms that are compiled ahead of their first call."""
+"""Number of functions in these folders that are compiled before their first call."""
 
 _listener: list[Callable[[str], None]] = []
 _functions: list[Any] = []
 
 
 def compile_no_more() -> None:
-    """Free the 16 MB that only the compilation of further functions needs."""
+    """Free the 16 MB of memory that are needed only to compile more functions."""
     for function in _functions:
         for library in map(operator.attrgetter("library"), function.overloads.values()):
             library._shared_module = None
 
 
 def on_compile(listener: Callable[[str], None]) -> None:
-    """Call `listener`, and no other, with the name of each uncached function before it is compiled."""
+    """Call `listener` with the name of each uncached function before it is compiled, instead of any earlier one."""
     _listener[:] = [listener]
 
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold the lock of a cache folder; the kernel takes it from a process that dies."""
+    """Hold the lock of a cache folder. The kernel releases the lock if the process dies."""
     with contextlib.ExitStack() as held:
         with contextlib.suppress(OSError):  # the folder belongs to another user: each process compiles for itself
             folder.mkdir(parents=True, exist_ok=True)
@@ -64,8 +65,8 @@ def _alone(folder: Path) -> Iterator[None]:
 def _kept(dispatcher: Any) -> Any:
     """Invalidate the cache of a function after every edit of any source file.
 
-    numba checks the function's own file alone, so that an edit of a function that it calls would go unnoticed. numba
-    reads the version first: unpickling older code may name classes that no longer exist.
+    numba checks only the file of the function itself, and would miss an edit of a function that it calls. The version
+    is stored where numba reads it first, because unpickling older code may refer to classes that no longer exist.
     """
     kept = dispatcher._cache._cache_file
     kept._version = (kept._version, FINGERPRINT)
@@ -74,26 +75,26 @@ def _kept(dispatcher: Any) -> Any:
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a few lines of arithmetic that are inlined into every compiled function that calls them.
+    """Inline a few lines of arithmetic into every compiled function that calls them (decorator).
 
-    Inlining everything takes three times as long to compile, and runs no faster.
+    Inlining everything takes three times as long to compile, and does not run faster.
     """
     return _kept(njit(function, error_model="numpy", forceinline=True, cache=True))  # type: ignore[no-any-return]
 
 
 def compiled(*signatures: Any, releases: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function that is compiled now, for these signatures; without signatures, at its first call.
+    """Compile a function now for the given signatures or, if there are none, at its first call (decorator).
 
-    Division by zero gives an infinity or NaN, never an exception. Compiled code is cached beside the source, or
-    in the user's cache directory where that cannot be written, and a later start only loads it. `releases` frees the
-    GIL during a call.
+    Division by zero gives an infinity or NaN, never an exception. Compiled code is cached beside the source, or in the
+    user's cache directory if the source folder cannot be written. Later starts load it from the cache. `releases`
+    releases the GIL during a call.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         dispatcher = _kept(njit(function, error_model="numpy", cache=True, nogil=releases))
         kept = dispatcher._cache._cache_file
         if signatures:
-            # Processes that start together compile each function once: the second loads what the first has cached.
+            # If two processes start together, the second loads what the first has compiled and cached.
             with _alone(Path(kept._cache_path)):
                 if not kept._load_index():
                     for listener in _listener:

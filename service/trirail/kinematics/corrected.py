@@ -1,7 +1,7 @@
-"""Motions through the as-built errors: from the real pose to the pose that the legs are solved for, and back.
+"""Motions corrected for as-built errors: from the real pose to the pose for which the legs are solved, and back.
 
-Compiled, with motions as rows pose, velocity, acceleration. `legs` is Geometry.packed(), with a
-trirail.kinematics.correction.Correction behind the legs where there is one.
+The functions are compiled, and motions have the rows pose, velocity, acceleration. `legs` is Geometry.packed(); a
+trirail.kinematics.correction.Correction, if there is one, follows the legs.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from trirail.kinematics.correction import DEGREE, HEADER_LENGTH, LEG, LEGS
 __all__ = ["corrected_motion", "is_corrected", "real_motion"]
 
 MAX_ITERATIONS = 20
-"""With STEEPEST, twelve iterations solve a correction of 20 mm to the last digit."""
+"""Greatest number of iterations. With STEEPEST, twelve of them solve a correction of 20 mm to the last digit."""
 CONVERGED = 1e-15
-"""Largest change of an iteration that has converged [m, rad, s]."""
+"""Change in an iteration below which it has converged [m, rad, s]."""
 
 Four: TypeAlias = tuple[float, float, float, float]
 
 
 class SplineValues(NamedTuple):
-    """The four non-zero splines of one axis at a position, with first and second derivatives by time."""
+    """Four non-zero splines of one axis at a position, with their first and second derivatives with respect to time."""
 
     first: int
     value: Four
@@ -39,7 +39,7 @@ def _along(
     """Return the splines at a position on an axis whose first cell begins at `low`."""
     place = (position - low) * per_length
     rate, change = velocity * per_length, acceleration * per_length
-    if not 0.0 <= place <= cells:  # nor where it is not a number
+    if not 0.0 <= place <= cells:  # also true if it is NaN
         place = float(cells) if place > cells else 0.0
         rate = change = 0.0
     first = min(int(place), cells - 1)
@@ -64,7 +64,7 @@ def _along(
 
 @compiled()
 def _correction(legs: Array, motion: Matrix) -> Matrix:
-    """Return c at a pose, and its first and second derivative by time as the pose moves."""
+    """Return the correction c at a pose, and its first and second time derivatives as the pose moves."""
     numbers = legs.reshape(-1)[LEGS * LEG :]
     pose, velocity, acceleration = motion
     of_x, of_y, of_z = int(numbers[6]), int(numbers[7]), int(numbers[8])
@@ -88,13 +88,13 @@ def _correction(legs: Array, motion: Matrix) -> Matrix:
 
 @compiled()
 def is_corrected(legs: Array) -> bool:
-    """Whether legs have a correction."""
+    """Return whether the legs have a correction."""
     return len(legs) > LEGS
 
 
 @compiled()
 def corrected_motion(legs: Array, motion: Matrix) -> Matrix:
-    """Return the motion that the legs are solved for, given the platform's: p + c(p), and its derivatives."""
+    """Return the motion for which the legs are solved, given that of the platform: p + c(p), and its derivatives."""
     more = _correction(legs, motion)
     return add(motion[0], more[0]), add(motion[1], more[1]), add(motion[2], more[2])
 
@@ -106,7 +106,7 @@ def _apart(a: Vector, b: Vector) -> float:
 
 @compiled()
 def real_motion(legs: Array, of_legs: Matrix) -> Matrix:
-    """Return the platform's motion, given that of the legs: p = q - c(p), and its derivatives, by iteration."""
+    """Return the motion of the platform, given that of the legs: p = q - c(p) by iteration, and its derivatives."""
     motion = of_legs
     for _ in range(MAX_ITERATIONS):
         less = _correction(legs, motion)

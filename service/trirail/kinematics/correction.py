@@ -1,10 +1,10 @@
-"""Smooth map of as-built errors, from the real pose of the platform to the pose that the legs are solved for.
+"""Smooth map of as-built errors, from the real pose of the platform to the pose for which the legs are solved.
 
-At the pose p the legs as configured have to be solved for q = p + c(p). The correction c is a tensor product of uniform
-cubic B-splines in x, y and phi: twice differentiable, so that a motion whose acceleration is continuous keeps that, and
-with a bound on its slope that its coefficients give. Beyond its box c stays what it is at the border.
+For a real pose p, the configured legs must be solved for q = p + c(p). The correction c is a tensor product of uniform
+cubic B-splines in x, y and phi. It is twice differentiable, so a continuous acceleration stays continuous, and its
+coefficients bound its slope. Outside its box, c has the value at the border.
 
-trirail.kinematics.corrected has the same compiled, for motions.
+trirail.kinematics.corrected has compiled versions of these functions for motions.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from trirail.kinematics.arrays import Array
 __all__ = ["DEGREE", "HEADER_LENGTH", "LEG", "LEGS", "STEEPEST", "Correction", "splines"]
 
 DEGREE = 3
-"""Degree of the splines: along each axis they have this many nodes more than cells."""
+"""Degree of the splines. Along each axis, the number of nodes exceeds that of the cells by the degree."""
 STEEPEST = 0.05
-"""Share of a motion's velocity that a correction may add: real_motion then gains more than a digit per iteration."""
+"""Share of a motion's velocity that a correction may add. real_motion then gains more than a digit per iteration."""
 LEGS, LEG = 3, 4 * 13
-"""The legs in front of a packed correction, and the numbers of each."""
+"""Number of legs before a packed correction, and the number of values of each leg."""
 HEADER_LENGTH = 9
-"""Numbers in front of the nodes: where the first cell begins, cells per metre or radian, and how many nodes there are,
-along each axis."""
+"""Number of values before the nodes. For each axis they are the start of the first cell, the cells per metre or
+radian, and the number of nodes."""
 
 
 def splines(
     poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the value of every spline at poses (N, 3), (N, nodes), and the poses' cells, (N, 3).
+    """Return the values of all splines at poses (N, 3) as (N, nodes), and the cells of the poses, (N, 3).
 
-    For a few poses, or for many at a time; the cycle uses the compiled trirail.kinematics.corrected.
+    This function is for a few poses, or for many at a time. The cycle uses the compiled trirail.kinematics.corrected.
     """
     rows, at = np.ones((len(poses), 1)), np.zeros((len(poses), 3), dtype=np.int64)
     for axis, (begin, end, number) in enumerate(zip(low, high, cells, strict=True)):
@@ -55,10 +55,10 @@ def splines(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """The map: its box, x, y [m] and phi [rad], and the coefficients of its splines [m, m, rad].
+    """Correction map: its box in x, y [m] and phi [rad], and the coefficients of its splines [m, m, rad].
 
-    `nodes` has shape (l + 3, m + 3, n + 3, 3) for l, m and n cells of equal size along x, y and phi. KinematicsError if
-    there is no cell, if a number is not finite, or if the box has no inside.
+    `nodes` has shape (l + 3, m + 3, n + 3, 3) for l, m and n cells of equal size along x, y and phi. Raises
+    KinematicsError if there is no cell, if a number is not finite, or if the box is empty.
     """
 
     low: tuple[float, float, float]
@@ -77,12 +77,12 @@ class Correction:
         object.__setattr__(self, "nodes", nodes)
 
     def packed(self) -> Array:
-        """Return it as compiled code takes it, behind the legs: as many numbers as some legs have."""
+        """Return the correction in the form for compiled code, padded to the size of a whole number of legs."""
         numbers = np.concatenate([self.low, 1.0 / self.size, self.nodes.shape[:3], self.nodes.ravel()])
         return np.concatenate([numbers, np.zeros(-len(numbers) % LEG)])
 
     def at(self, poses: Array) -> Array:
-        """Return c at poses, both (N, 3) [m, m, rad]."""
+        """Return the corrections c at poses; both are (N, 3) [m, m, rad]."""
         return splines(poses, self.low, self.high, self.cells)[0] @ self.nodes.reshape(-1, 3)
 
     @property
@@ -104,7 +104,7 @@ class Correction:
 
     @property
     def greatest(self) -> Array:
-        """The greatest correction in x, y and phi at the corners of the cells, (3,) [m, m, rad]."""
+        """Greatest correction in x, y and phi at the corners of the cells, (3,) [m, m, rad]."""
         at = self.nodes
         for axis in range(3):
             before, here, after = (np.take(at, range(k, at.shape[axis] - 2 + k), axis) for k in range(3))
@@ -113,10 +113,10 @@ class Correction:
         return greatest
 
     def adds(self, velocity: Sequence[float]) -> Array:
-        """Return bounds on what it adds to a pose's velocity in each cell, (l, m, n, 3), where that is at most given.
+        """Return bounds on the velocity added in each cell, (l, m, n, 3), for pose velocities up to `velocity`.
 
-        A spline's derivative is a spline whose coefficients are differences of these, and is nowhere beyond the
-        greatest of those that count in a cell.
+        The derivative of a spline is a spline whose coefficients are differences of the original ones. In a cell, it
+        never exceeds the greatest of the coefficients that affect the cell.
         """
         total = np.zeros((*self.cells, 3))
         for axis, most in enumerate(velocity):

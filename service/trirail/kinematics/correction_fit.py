@@ -1,12 +1,12 @@
-"""A correction from measured poses: deviations from the geometry, as errors of the geometry plus splines.
+"""Fit of a correction to measured poses: deviations from the geometry, modelled as geometry errors plus splines.
 
-At a measured pose p the sliders are where the geometry has the pose q: the correction there is q - p. Near a singular
-angle small errors of the geometry become large ones of the pose, over a short way: no smooth map through measured poses
-would know that. The fit first determines how much of these differences errors of the geometry explain, by the
-derivatives of trirail.kinematics.calibration, written as splines. Penalised splines (P-splines) fit the rest, with the
-curvature that predicts left-out poses best. The weight of the nodes' second
-differences is the one with which a fit to four fifths of the poses predicts the rest best (Eilers and Marx, Flexible
-smoothing with B-splines and penalties, 1996, and cross-validation).
+If the platform is at a measured pose p and the geometry gives the pose q for the same sliders, the correction is q - p.
+Near a singular angle, small errors of the geometry cause large errors of the pose within a short distance. A smooth map
+through measured poses alone cannot show this. The fit therefore first determines how much of the differences is
+explained by errors of the geometry, using the derivatives of trirail.kinematics.calibration written as splines.
+Penalised splines (P-splines) fit the rest. The weight of the second differences of the nodes is the one with which a
+fit to four fifths of the poses predicts the remaining poses best (Eilers and Marx, Flexible smoothing with B-splines
+and penalties, 1996, and cross-validation).
 """
 
 from __future__ import annotations
@@ -28,42 +28,43 @@ from trirail.kinematics.robot import forward
 __all__ = ["MIN_POSES", "Fit", "fit"]
 
 MIN_POSES = 30
-"""A grid of three in x, y and phi, and a few more."""
+"""Least number of poses: a grid of three in x, y and phi, and a few more."""
 END_SHARE = 0.15
-"""Share of the robot's reach, at either end, that may be without a measured pose."""
+"""Share of the robot's reach that may be without a measured pose at either end."""
 SAMPLES = 21
-"""Samples along each axis of the robot's reach and of the effects of geometry errors."""
+"""Number of samples along each axis, for the reach of the robot and for the effects of geometry errors."""
 TRAVEL_MARGIN_M = 0.02
-"""Distance beyond the sliders' travel that is sampled too, so that the effects are known up to its ends."""
+"""Distance beyond the sliders' travel that is also sampled [m], so that the effects are known up to its ends."""
 GEOMETRY_CURVATURE_WEIGHT = 2e-4
-"""Weight of curvature for the effects of geometry errors: enough to continue them beyond the samples."""
+"""Weight of curvature for the effects of geometry errors. It is large enough to continue them beyond the samples."""
 WEIGHTS = tuple(10.0**k for k in range(-6, 4))
-"""Weights of curvature to choose from."""
+"""Weights of curvature from which one is chosen."""
 FOLDS = 5
 SEED = 1
-"""Seed of the choice of poses that are left out together."""
+"""Seed for choosing which poses are left out together."""
 NAMES = ("x", "y", "phi")
 
 
 class Fit(NamedTuple):
-    """A correction, and how good it is."""
+    """Correction, and measures of its quality."""
 
     correction: Correction
     before: Array
-    """The pose errors that were measured (N, 3): measured less computed x, y, phi [m, m, rad]."""
+    """Pose errors that were measured (N, 3): measured minus computed x, y, phi [m, m, rad]."""
     residuals: Array
     """Pose errors that remain with the correction."""
     predicted: Array
-    """Pose errors that remain with a correction made without the pose in question: the errors to expect elsewhere."""
+    """Pose errors that remain with a correction fitted without the pose in question, as to be expected at other
+    poses."""
     empty: int
-    """Number of cells without a measured pose, which continue their neighbours."""
+    """Number of cells without a measured pose. They continue their neighbours."""
 
 
 def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Sequence[int]) -> Fit:
     """Return the correction of a geometry from measured `poses` and `sliders`, both (N, 3) in m and rad.
 
-    The correction covers the whole room, with `cells` along x, y and phi. CalibrationError if there are too few poses,
-    if they do not cover the robot's reach, or if the geometry has no pose near a measured one.
+    The correction covers the whole room, with `cells` along x, y and phi. Raises CalibrationError if there are too few
+    poses, if they do not cover the robot's reach, or if the geometry has no pose near a measured one.
     """
     low, high = room.low, room.high
     if len(poses) < MIN_POSES:
@@ -115,7 +116,7 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
 
 
 def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
-    """Return poses all over the room within the sliders' travel, or up to `beyond` [m] outside it: (N, 3)."""
+    """Return poses spread over the room, (N, 3), within the sliders' travel or up to `beyond` [m] outside it."""
     axes = [np.linspace(low, high, SAMPLES) for low, high in zip(room.low, room.high, strict=True)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     reached: Array = poses[room.holds(travels(geometry, poses), beyond)]
@@ -125,7 +126,7 @@ def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
 
 
 def _curvature(shape: Sequence[int]) -> Array:
-    """Return the matrix whose form is the sum of the squares of the nodes' second differences along x, y and phi."""
+    """Return the matrix of the quadratic form that sums the squared second differences of the nodes along all axes."""
     total = np.zeros((math.prod(shape), math.prod(shape)))
     for axis, number in enumerate(shape):
         differences = np.diff(np.eye(number), 2, axis=0)
@@ -153,7 +154,7 @@ def _by_geometry(geometry: Geometry, room: Room, cells: Sequence[int], curvature
 
 
 def _nodes(rows: Array, by_geometry: Array, wanted: Array, scale: Array, penalty: Array) -> Array:
-    """Return the nodes, (nodes, 3): those of the geometry's errors plus those of the remainder."""
+    """Return the nodes (nodes, 3), which are those of the geometry errors plus those of the remainder."""
     each = np.tensordot(rows, by_geometry, 1) / scale[:, None]
     parameters, *_ = np.linalg.lstsq(each.reshape(wanted.size, -1), (wanted / scale).ravel(), rcond=None)
     nodes: Array = by_geometry @ parameters.astype(np.float64)

@@ -1,6 +1,6 @@
 """The three legs of a robot, symmetric or as built, and the platform angles at which they are singular.
 
-Lengths are in metres, angles in radians. This module uses the interface of trirail.kinematics.leg alone; prp3.leg and
+Lengths are in metres, angles in radians. This module uses only the interface of trirail.kinematics.leg; prp3.leg and
 ppr3.leg implement it.
 """
 
@@ -41,17 +41,17 @@ __all__ = [
 class Geometry:
     """Three legs A, B, C, and the correction for as-built errors, if there is one.
 
-    KinematicsError if a number is not finite, the legs are of two mechanisms or of another `kind`, or the pose
-    (0, 0, 0) is singular.
+    Raises KinematicsError if a number is not finite, if the legs belong to different mechanisms or do not match `kind`,
+    or if the pose (0, 0, 0) is singular.
     """
 
     legs: tuple[Any, Any, Any]
-    """Legs of one mechanism, prp3.leg.Leg or ppr3.leg.CrossLeg; code for every mechanism reads `each`."""
+    """Legs of one mechanism: prp3.leg.Leg or ppr3.leg.CrossLeg. Code that works for every mechanism reads `each`."""
     correction: Correction | None = None
     labels: Labels = field(default=LEGS, compare=False)
     """Display names of the sliders."""
     kind: str = ""
-    """The mechanism, as [geometry] kind names it: 3-PRP or 3-PPR; that of the legs if it is not given."""
+    """Mechanism as named by [geometry] kind, 3-PRP or 3-PPR. By default, it is the mechanism of the legs."""
     _packed: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -68,7 +68,7 @@ class Geometry:
 
     @classmethod
     def symmetric(cls, l0: float = 0.3) -> Geometry:
-        """Return the paper's robot, (1) and (10): its anchors at l0 [m] from the centre."""
+        """Return the paper's robot, (1) and (10), with its anchors at l0 [m] from the centre."""
         if not (math.isfinite(l0) and l0 > 0.0):
             raise KinematicsError(f"l0 is {l0} m: it must be finite and positive", value=l0, limit=0.0)
         alphas = (math.pi / 3, math.pi, -math.pi / 3)
@@ -79,7 +79,7 @@ class Geometry:
                 anchor=(x, y),
                 rail_angle=alpha,
                 home=home,
-                # in the central configuration every slider reads zero and the edge point lies at the pin
+                # in the central configuration, every slider reads zero and the edge point is at the pin
                 edge_point=(x + home * math.cos(alpha), y + home * math.sin(alpha)),
                 edge_angle=alpha - math.pi / 3,
             )
@@ -88,17 +88,17 @@ class Geometry:
         return cls(legs=(legs[0], legs[1], legs[2]))
 
     def packed(self) -> Array:
-        """Return the three legs as compiled code takes them: float64, shape (3, 4, 13), read-only.
+        """Return the three legs in the form for compiled code: float64, shape (3, 4, 13), read-only.
 
-        Axes: leg; its three joints and the platform's centre; the columns described in trirail.kinematics.recursion.
-        Where there is a correction it follows, in as many more rows of the first axis as it takes: one array, since
-        each further one would cost every call a microsecond.
+        The axes are: the leg; its three joints and the platform's centre; the columns described in
+        trirail.kinematics.recursion. A correction, if there is one, follows in as many additional rows of the first
+        axis as it needs. A single array is used because every further one would cost each call a microsecond.
         """
         return self._packed
 
     @property
     def each(self) -> tuple[AnyLeg, AnyLeg, AnyLeg]:
-        """The legs, as all mechanisms have them."""
+        """Legs with the interface that all mechanisms share."""
         return self.legs
 
     @property
@@ -113,12 +113,12 @@ class Geometry:
 
 
 def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)) -> tuple[float, ...]:
-    """Return every phi [rad] in (-pi, pi], ascending, at which J1 or J2 is singular with G at `centre` [m].
+    """Return every phi [rad] in (-pi, pi], in ascending order, at which J1 or J2 is singular with G at `centre` [m].
 
-    The nearest on either side of zero bound the usable range: on the symmetric robot -2 pi/3 and pi/3,
-    wherever G is. On a robot as built the angles that J1 excludes, where an edge is parallel to its rail,
-    still depend on nothing else; those that J2 excludes move with G, and can lie degrees inside. A 3-PPR robot has two,
-    pi apart, at which J2 is singular wherever G is.
+    The nearest angles on both sides of zero bound the usable range. On the symmetric robot, they are -2 pi/3 and pi/3,
+    wherever G is. On a robot as built, the angles at which J1 is singular, where an edge is parallel to its rail, still
+    depend on nothing else. Those at which J2 is singular move with G, and can be several degrees closer to zero. A
+    3-PPR robot has two angles, pi apart, at which J2 is singular wherever G is.
     """
     of_j1 = _singular_angles_of_j1(geometry)
     if not of_j1:  # then det J2 = A sin phi - B cos phi
@@ -127,7 +127,7 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
         return tuple(sorted((wrapped(angle), wrapped(angle + math.pi))))
     angles = [*of_j1]
     for low, high in zip(of_j1, [*of_j1[1:], of_j1[0] + 2.0 * math.pi], strict=True):
-        # det J2 is smooth between two singular angles of J1. Zeros crowd at the ends, so the samples do too.
+        # det J2 is smooth between two singular angles of J1. Its zeros crowd at the ends, so the samples do too.
         phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, 257)[1:-1])
         negative = det_j2(geometry, centre, phi) < 0.0
         changes = np.flatnonzero(negative[1:] != negative[:-1]).tolist()
@@ -141,11 +141,11 @@ class Room(NamedTuple):
     low: Sequence[float]
     high: Sequence[float]
     position: tuple[float, float] | tuple[tuple[float, float], ...]
-    """Travel of all sliders, or of each."""
+    """Travel of all sliders, or of each slider."""
     passive: tuple[float, float]
 
     def holds(self, travelled: Array, spare: float = 0.0) -> NDArray[np.bool]:
-        """Whether sliders and passive joints (2, ..., 3) are within their travel, or `spare` beyond it [m]: (...)."""
+        """Return whether sliders and passive joints (2, ..., 3) are within their travel, give or take `spare` [m]."""
         both = np.stack([np.broadcast_to(ends, (3, 2)) for ends in (self.position, self.passive)])
         low, high = np.moveaxis(both, -1, 0).reshape(2, 2, *[1] * (travelled.ndim - 2), 3)
         within: NDArray[np.bool] = ((travelled >= low - spare) & (travelled <= high + spare)).all(axis=(0, -1))
@@ -153,10 +153,10 @@ class Room(NamedTuple):
 
 
 def travels(geometry: Geometry, poses: ArrayLike) -> Array:
-    """Return where sliders and cross slides are at poses (..., 3) of x, y [m], phi [rad]: (2, ..., 3) [m], by (11).
+    """Return the positions of sliders and cross slides at poses (..., 3) of x, y [m], phi [rad]: (2, ..., 3) [m].
 
-    For a few poses, without the compiled trirail.kinematics.robot.inverse. Not finite where a cross slide is parallel
-    to its rail.
+    The positions follow from (11). This function is intended for a few poses and does not need the compiled
+    trirail.kinematics.robot.inverse. The result is not finite if a cross slide is parallel to its rail.
     """
     solved = np.array(poses, dtype=np.float64)
     if geometry.correction is not None:
@@ -168,7 +168,8 @@ def travels(geometry: Geometry, poses: ArrayLike) -> Array:
 def other_kind(geometry: Geometry) -> Geometry:
     """Return the robot of the other mechanism with rails and cross slides in the same places at the pose (0, 0, 0).
 
-    An owner who mistakes one mechanism for the other has this robot. KinematicsError where it is singular there.
+    This is the robot of an owner who mistakes one mechanism for the other. Raises KinematicsError if it is singular
+    there.
     """
     sliders = travels(geometry, (0.0, 0.0, 0.0))[0].tolist()
     legs = []
@@ -182,9 +183,9 @@ def other_kind(geometry: Geometry) -> Geometry:
 
 
 def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
-    """Return by how much x, y [m] and phi [rad] change for a metre of each slider: (3, 3), J2^-1 J1 at a pose.
+    """Return the change of x, y [m] and phi [rad] per metre of each slider at a pose: (3, 3), J2^-1 J1.
 
-    LinAlgError where J2 is singular.
+    Raises LinAlgError if J2 is singular.
     """
     rows = [leg.row(pose) for leg in geometry.each]
     changes: Array = np.linalg.solve(np.array([row for _, row in rows]), np.diag([delta for delta, _ in rows]))
@@ -192,7 +193,7 @@ def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
 
 
 def _singular_angles_of_j1(geometry: Geometry) -> list[float]:
-    """Return each phi in (-pi, pi] at which the cross slide of some leg is parallel to its rail, ascending."""
+    """Return each phi in (-pi, pi], ascending, at which the cross slide of some leg is parallel to its rail."""
     parallel = [leg.parallel_angle for leg in geometry.each]
     angles = sorted(wrapped(phi + turn) for phi in parallel if phi is not None for turn in (0.0, math.pi))
     return [phi for k, phi in enumerate(angles) if k == 0 or phi - angles[k - 1] > PARALLEL]
@@ -201,7 +202,8 @@ def _singular_angles_of_j1(geometry: Geometry) -> list[float]:
 def det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Array:
     """Return det J2 [m] for poses with G at `centre` and any angles `phi`.
 
-    The cofactors w of its third column, the sines between the cross slides, are constant: det J2 = sum w_i beta_3^i.
+    The cofactors w of its third column are the sines between the cross slides, which are constant. Therefore det J2 =
+    sum w_i beta_3^i.
     """
     a, b, c = (leg.cross_angle for leg in geometry.each)
     cofactors = math.sin(c - b), math.sin(a - c), math.sin(b - a)
@@ -212,7 +214,7 @@ def det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Array
 
 
 def _bisect(geometry: Geometry, centre: tuple[float, float], low: float, high: float) -> float:
-    """Return the phi between `low` and `high`, where det J2 differs in sign, at which it is zero."""
+    """Return the zero of det J2 between the angles `low` and `high`, at which its signs differ."""
     negative = det_j2(geometry, centre, np.array([low]))[0] < 0.0
     while low < (middle := (low + high) / 2.0) < high:
         if (det_j2(geometry, centre, np.array([middle]))[0] < 0.0) == negative:
@@ -223,7 +225,7 @@ def _bisect(geometry: Geometry, centre: tuple[float, float], low: float, high: f
 
 
 def _check(geometry: Geometry) -> None:
-    """Refuse what is not finite, or singular at the pose (0, 0, 0), by which forward tells branches apart."""
+    """Refuse a geometry that is not finite, or is singular at (0, 0, 0), the pose by which forward selects branches."""
     if len({leg.KIND for leg in geometry.each}) > 1:
         kinds = ", ".join(leg.KIND for leg in geometry.each)
         raise KinematicsError(f"the legs are of different mechanisms: {kinds}")

@@ -1,7 +1,7 @@
-"""Interface of a leg, whatever its mechanism; prp3 and ppr3 keep their own symbols behind it.
+"""Interface of a leg of any mechanism. prp3 and ppr3 implement it with their own symbols.
 
-A leg has a driven slider on a rail of the base, a cross slide that is not driven, and a pivot. Mechanisms differ in the
-order of the last two. Lengths are in metres, angles in radians, a pose is x, y [m] and phi [rad].
+A leg has a driven slider on a rail of the base, a cross slide that is not driven, and a pivot. The mechanisms differ in
+the order of the last two. Lengths are in metres, angles in radians; a pose is x, y [m] and phi [rad].
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from trirail.kinematics.arrays import Array
 __all__ = ["LEGS", "PARALLEL", "THETA_1", "AnyLeg", "CrossSlide", "across", "check_finite", "theta", "wrapped"]
 
 LEGS = ("A", "B", "C")
-PARALLEL = 1e-9  # |sin| of the angle between a cross slide and its rail up to which the leg counts as singular
+PARALLEL = 1e-9  # |sin| of the angle between a cross slide and its rail below which the leg is singular
 THETA_1 = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # (3)
 
 
@@ -27,28 +27,28 @@ class CrossSlide(NamedTuple):
     """Position and direction of a leg's cross slide, for drawings."""
 
     point: tuple[float, float]
-    """The point that the cross slide's travel is counted from: on the platform, in its frame, or on the carriage."""
+    """Point from which the travel of the cross slide is counted, in the frame of the platform or of the carriage."""
     angle: float
-    """Its direction, in the frame of the part that it is fixed to."""
+    """Direction of the cross slide, in the frame of the part to which it is fixed."""
     turns: bool
-    """Whether it is fixed to the platform, and turns with it; else it is fixed to the carriage."""
+    """Whether the cross slide is fixed to the platform and turns with it. Otherwise, it is fixed to the carriage."""
 
 
 class AnyLeg(Protocol):
-    """One leg of a mechanism; anchor, rail_angle and home are the rail's, whatever rides on it."""
+    """Leg of any mechanism. `anchor`, `rail_angle` and `home` describe the rail."""
 
     KIND: ClassVar[str]
-    """The mechanism, as [geometry] kind names it."""
+    """Mechanism as named by [geometry] kind."""
     PARAMETERS: ClassVar[tuple[str, ...]]
     """Names of the five parameters that calibration determines [m, rad]."""
     DOUBT: ClassVar[tuple[float, ...]]
-    """Standard deviation of each beyond which drawings tell as much [m, rad]."""
+    """Standard deviation of each parameter above which drawings are more accurate [m, rad]."""
     CROSS: ClassVar[str]
     """Name of the cross slide's guide, for messages."""
 
     @property
     def anchor(self) -> tuple[float, float]:
-        """A point of the rail in the base frame [m]."""
+        """Point of the rail in the base frame [m]."""
         ...
 
     @property
@@ -68,7 +68,7 @@ class AnyLeg(Protocol):
 
     @property
     def parallel_angle(self) -> float | None:
-        """A phi at which cross slide and rail are parallel, others are pi apart; None where there is none [rad]."""
+        """Angle phi at which cross slide and rail are parallel, as they are every pi; None if they never are [rad]."""
         ...
 
     @property
@@ -78,23 +78,23 @@ class AnyLeg(Protocol):
 
     @property
     def crossing(self) -> CrossSlide:
-        """How to draw the cross slide."""
+        """Position and direction of the cross slide, for drawings."""
         ...
 
     def keys(self) -> dict[str, Any]:
-        """Return its numbers by the keys of [[geometry.leg]] [m, rad]."""
+        """Return the numbers of the leg, by their keys in [[geometry.leg]] [m, rad]."""
         ...
 
     def check(self, name: str) -> None:
-        """Refuse what is not finite, or singular at the pose (0, 0, 0). Raises KinematicsError."""
+        """Raise KinematicsError if a number is not finite, or the leg is singular at the pose (0, 0, 0)."""
         ...
 
     def packed(self) -> Array:
-        """Return the leg as joints for trirail.kinematics.recursion: shape (4, 13)."""
+        """Return the leg as joints for trirail.kinematics.recursion, with shape (4, 13)."""
         ...
 
     def travels(self, x: Array, y: Array, phi: Array) -> tuple[Array, Array]:
-        """Return where slider and cross slide are at poses, arrays of one shape [m]."""
+        """Return the positions of slider and cross slide at poses, as arrays of one shape [m]."""
         ...
 
     def row(self, pose: tuple[float, float, float]) -> tuple[float, Array]:
@@ -110,12 +110,12 @@ class AnyLeg(Protocol):
         ...
 
     def parameter_derivatives(self, first: Any, phi: Array, slider: Array, passive: Array) -> Array:
-        """Return how F, J1 by the slider and -J2 by the pose, changes with corrections to `first`: (N, 5)."""
+        """Return the derivatives of F by corrections to `first`: (N, 5). F has the derivatives J1 and -J2."""
         ...
 
 
 def check_finite(leg: Any, name: str) -> None:
-    """Refuse a leg, a dataclass, with a number that is not finite. Raises KinematicsError."""
+    """Raise KinematicsError if a number of a leg, which is a dataclass, is not finite."""
     for key, value in zip(leg.__slots__, astuple(leg), strict=True):
         if not np.all(np.isfinite(value)):
             raise KinematicsError(f"leg {name}: {key} is {value}: it must be finite", leg=name)
@@ -128,11 +128,11 @@ def theta(angle: float) -> Array:
 
 
 def wrapped(angle: float) -> float:
-    """Return the same angle in (-pi, pi]."""
+    """Return an angle, reduced to the range (-pi, pi]."""
     within = math.remainder(angle, 2.0 * math.pi)
     return within if within > -math.pi else math.pi
 
 
 def across(point: tuple[float, float], angle: float, distance: float) -> tuple[float, float]:
-    """Return the point at a distance to the left of a line at this angle."""
+    """Return the point at a distance to the left of a line through `point` with the given angle."""
     return point[0] - distance * math.sin(angle), point[1] + distance * math.cos(angle)

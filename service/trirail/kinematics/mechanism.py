@@ -1,6 +1,6 @@
 """Dispatch of compiled calls to the mechanism of a packed leg.
 
-The tag is in the array: the second joint of a 3-PRP leg turns, that of a 3-PPR leg slides.
+The array itself shows the mechanism: the second joint is revolute in a 3-PRP leg, and prismatic in a 3-PPR leg.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _close_ppr3, _line_ppr3, _demand_ppr3 = ppr3.close, ppr3.line, ppr3.demand
 
 
 class MovingLeg(NamedTuple):
-    """A closed leg whose platform moves."""
+    """Closed leg of a moving platform."""
 
     closed: ClosedLeg
     rate: float  # of the slider
@@ -36,32 +36,32 @@ class MovingLeg(NamedTuple):
 
 @inlined
 def _turns_second(leg: Array) -> bool:
-    """Whether the pivot rides on the carriage: 3-PRP."""
+    """Return whether the pivot is on the carriage, as in a 3-PRP leg."""
     return bool(leg[1, 0] != 0.0)
 
 
 @compiled()
 def close(leg: Array, pose: Vector) -> ClosedLeg:
-    """Return where a leg's joints are with the platform at a pose."""
+    """Return the joint positions of a leg for a pose of the platform."""
     return _close_prp3(leg, pose) if _turns_second(leg) else _close_ppr3(leg, pose)
 
 
 @compiled()
 def line(leg: Array, slider: float) -> SlideLine:
-    """Return the line that a leg leaves to the platform while its slider stands."""
+    """Return the line along which a leg lets the platform move while its slider is fixed."""
     return _line_prp3(leg, slider) if _turns_second(leg) else _line_ppr3(leg, slider)
 
 
 @compiled()
 def demand(leg: Array, line: SlideLine, cosine: float, sine: float) -> tuple[Vector, Vector, float]:
-    """Return normal n and direction of a leg's cross slide at phi, and the n . G that the leg demands there."""
+    """Return normal n and direction of a leg's cross slide at phi, and the n . G that the leg requires there."""
     return _demand_prp3(line, cosine, sine) if _turns_second(leg) else _demand_ppr3(line, cosine, sine)
 
 
 @compiled()
 def move(leg: Array, pose: Vector, velocity: Vector, acceleration: Vector) -> MovingLeg:
-    """Solve a leg for the motion of its platform."""
-    if _turns_second(leg):  # decided once: merging the results of two branches costs a tenth more time
+    """Solve a leg for the motion of the platform."""
+    if _turns_second(leg):  # decided once: merging the results of two branches takes a tenth more time
         closed = _close_prp3(leg, pose)
         rates, changes = joint_motion(leg, (closed.slider, pose[2], closed.passive), velocity, acceleration)
         return _moving(closed, rates[0], changes[0], rates[2], changes[2])

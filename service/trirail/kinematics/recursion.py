@@ -61,7 +61,7 @@ class Link(NamedTuple):
 
 
 class LinkMotion(NamedTuple):
-    """Motion of link T_k relative to the base, in the components of T_k."""
+    """Motion of link T_k relative to the base, in components of T_k."""
 
     omega: Vector  # omega_k0
     v: Vector  # v_k0, the velocity of A_k
@@ -116,7 +116,7 @@ def _spin(omega: Vector, epsilon: Vector, r: Vector) -> Vector:
 
 @inlined
 def link_motion(base: LinkMotion, link: Link, rate: float, acceleration: float) -> LinkMotion:
-    """Return how a link moves on its moving base, for a rate and an acceleration of its joint."""
+    """Return the motion of a link on a moving base, given the rate and the acceleration of its joint."""
     omega_k, v_k = (rate, 0.0) if link.revolute else (0.0, rate)
     epsilon_k, gamma_k = (acceleration, 0.0) if link.revolute else (0.0, acceleration)
     a, r = link.a, link.r
@@ -137,7 +137,7 @@ def link_motion(base: LinkMotion, link: Link, rate: float, acceleration: float) 
 
 @inlined
 def platform_motion(leg: Array, last: Link, motion: LinkMotion) -> tuple[Vector, Vector]:
-    """Return velocity and acceleration (x, y, phi) of the platform that the last link of a leg carries."""
+    """Return velocity and acceleration (x, y, phi) of the platform, which is carried by the last link of a leg."""
     r = _constant_vector(leg, len(leg) - 1)
     vx, vy, _ = transposed_times(last.q, add(motion.v, cross(motion.omega, r)))
     ax, ay, _ = transposed_times(last.q, add(motion.gamma, _spin(motion.omega, motion.epsilon, r)))
@@ -148,7 +148,7 @@ def platform_motion(leg: Array, last: Link, motion: LinkMotion) -> tuple[Vector,
 
 @inlined
 def follow(leg: Array, joints: Array) -> tuple[Link, LinkMotion]:
-    """Return place and motion of link T_k from rows (variable, rate, acceleration) for joints 1 to k."""
+    """Return position and motion of link T_k, given rows (variable, rate, acceleration) for the joints 1 to k."""
     place, motion = BASE, AT_REST
     for k in range(len(joints)):
         place = link(place, leg, k, joints[k, 0])
@@ -158,7 +158,7 @@ def follow(leg: Array, joints: Array) -> tuple[Link, LinkMotion]:
 
 @inlined
 def _unit_velocity(link: Link, centre: Vector) -> Vector:
-    """Return the platform velocity (x, y, phi) that a unit rate of this joint gives: its factors in (15)."""
+    """Return the platform velocity (x, y, phi) for a unit rate of this joint, which are its factors in (15)."""
     axis = link.q[2]  # q_k0ᵀ u3
     if link.revolute:
         x, y, _ = cross(axis, subtract(centre, link.p))
@@ -170,11 +170,10 @@ def _unit_velocity(link: Link, centre: Vector) -> Vector:
 def joint_motion(leg: Array, variables: Vector, velocity: Vector, acceleration: Vector) -> tuple[Vector, Vector]:
     """Return rates and accelerations of a leg's three joints from the motion of its platform: (15) and (19).
 
-    Three joints are what it takes to follow any planar motion. The unknowns of (15) and of (19) have the same
-    factors, the unit velocities j. The right side of (19) is what is left of the platform's acceleration
-    without the part that (20) gives for joints at constant rates. For a PRP leg these are the paper's
-    equations, with the factor lambda_32 that its (19) lacks in the omega_21² term, and with epsilon_21 =
-    d²phi/dt².
+    Three joints are enough to follow any planar motion. The unknowns of (15) and of (19) have the same factors, the
+    unit velocities j. The right side of (19) is the platform's acceleration minus the part that (20) gives for joints
+    at constant rates. For a PRP leg, these are the paper's equations, but with the factor lambda_32 that is missing
+    from the omega_21² term of its (19), and with epsilon_21 = d²phi/dt².
     """
     first = link(BASE, leg, 0, variables[0])
     second = link(first, leg, 1, variables[1])

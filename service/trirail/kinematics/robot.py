@@ -1,8 +1,8 @@
 """The 3-PRP robot: inverse and forward kinematics, and both Jacobians.
 
-A pose is (x, y, phi): the platform's centre G in the base frame [m], and its angle [rad]. The sliders are
-lambda_10 of legs A, B, C [m]; the passive joints are lambda_32 of the same legs [m], and phi_21 = phi, (8).
-Arrays hold one pose, shape (3,), or N of them, shape (N, 3).
+A pose is (x, y, phi): the platform's centre G in the base frame [m], and its angle [rad]. The sliders are lambda_10 of
+the legs A, B, C [m]. The passive joints are lambda_32 of the same legs [m], and phi_21 = phi, (8). An array holds
+either one pose, with shape (3,), or N poses, with shape (N, 3).
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ HOME = np.zeros(3)
 
 
 class Motion(NamedTuple):
-    """Motion of the joints of legs A, B, C: each field (3,) or (N, 3), in m, m/s or m/s²."""
+    """Motion of the joints of legs A, B, C. Each field has shape (3,) or (N, 3), in m, m/s or m/s²."""
 
     position: Array
-    """lambda_10, the sliders on their rails from where they read zero [m]."""
+    """lambda_10, the positions of the sliders on their rails, counted from where they read zero [m]."""
     velocity: Array
     """v_10 [m/s]."""
     acceleration: Array
     """gamma_10 [m/s²]."""
     passive_position: Array
-    """lambda_32, the sliders' pins along the platform's edges [m]."""
+    """lambda_32, the positions of the sliders' pins along the platform's edges [m]."""
     passive_velocity: Array
     """v_32 [m/s]."""
     passive_acceleration: Array
@@ -53,9 +53,10 @@ def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acce
     """Return the motion of all joints for a motion of the platform, by (9) to (19).
 
     `pose` is x, y [m] and phi [rad] in the base frame, (3,) or (N, 3). `velocity` [m/s, m/s, rad/s] and `acceleration`
-    [m/s², m/s², rad/s²] are its time derivatives, of its shape, or (3,) for all rows; at rest if not given. Limits
-    of travel are not looked at. Raises KinematicsError, with leg, value and limit, if a number is not finite, or where
-    the edge of a leg is parallel to its rail, sin(phi + edge_angle - rail_angle) = 0.
+    [m/s², m/s², rad/s²] are its time derivatives. They have the shape of `pose`, or (3,) to apply to all rows; by
+    default the platform is at rest. Limits of travel are not checked. Raises KinematicsError, with leg, value and
+    limit, if a number is not finite, or if the edge of a leg is parallel to its rail, sin(phi + edge_angle -
+    rail_angle) = 0.
     """
     pose = np.asarray(pose, dtype=np.float64)
     rows = _rows("pose", pose)
@@ -72,12 +73,12 @@ def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acce
 
 
 def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = None) -> Array:
-    """Return the pose, x, y [m] and phi in (-pi, pi], at which the sliders A, B, C stand as given [m], by (11).
+    """Return the pose, x, y [m] and phi in (-pi, pi], for given positions of the sliders A, B, C [m], by (11).
 
-    Of the two poses that close the loops it is the one that can be reached from the pose `near`, (0, 0, 0)
-    if not given, without passing a singularity of J2. `near` has the shape of `sliders`, or (3,) for all
-    rows. The symmetric robot does not need it in its usable range, -2 pi/3 < phi < pi/3. Raises KinematicsError if
-    a number is not finite, if no pose closes the loops, or if that pose or `near` is singular.
+    Two poses close the loops. The function returns the one that can be reached from the pose `near` without passing a
+    singularity of J2. `near` has the shape of `sliders`, or (3,) to apply to all rows; the default is (0, 0, 0). The
+    symmetric robot does not need it in its usable range, -2 pi/3 < phi < pi/3. Raises KinematicsError if a number is
+    not finite, if no pose closes the loops, or if that pose or `near` is singular.
     """
     sliders = np.asarray(sliders, dtype=np.float64)
     rows, start, pose = np.empty((3, _rows("sliders", sliders), 3))
@@ -95,8 +96,9 @@ def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = Non
 def jacobians(geometry: Geometry, pose: ArrayLike) -> tuple[Array, Array]:
     """Return J1 and J2 of (16) to (18), (3, 3) or (N, 3, 3): J1 @ slider velocity = J2 @ platform velocity.
 
-    `pose` as of inverse. J1 is diagonal. The last column of J2 is in metres, the rest has no unit. Neither is
-    inverted here, so J2 may be singular. Raises KinematicsError as inverse does, where J1 is.
+    `pose` has the form that inverse takes. J1 is diagonal. The last column of J2 is in metres, and the other columns
+    have no unit. The function inverts neither matrix, so J2 may be singular. Raises KinematicsError like inverse if J1
+    is singular.
     """
     pose = np.asarray(pose, dtype=np.float64)
     rows = np.empty((_rows("pose", pose), 3))
@@ -110,7 +112,7 @@ def jacobians(geometry: Geometry, pose: ArrayLike) -> tuple[Array, Array]:
 
 
 def warm_up() -> None:
-    """Run once what importing this module compiled or loaded, so that no later call is the first."""
+    """Run all functions that this module has compiled or loaded once, so that no later call is the first."""
     geometry = Geometry.symmetric()
     legs, pose = geometry.packed(), np.zeros(3)
     inverse_into(legs, np.zeros((3, 3)), np.empty((6, 3)))
@@ -120,7 +122,7 @@ def warm_up() -> None:
 
 
 def _rows(name: str, array: Array) -> int:
-    """Return how many rows an array has, 1 if it is one."""
+    """Return the number of rows of an array; 1 if the array is a single row."""
     if array.ndim not in {1, 2} or array.shape[-1] != 3:
         raise KinematicsError(f"{name} has shape {array.shape}: expected (3,) or (N, 3)")
     return len(array) if array.ndim == 2 else 1
@@ -140,7 +142,7 @@ def _place(row: int, array: Array) -> str:
 
 
 def _refuse_pose(geometry: Geometry, motion: Array, leg: int, place: str) -> NoReturn:
-    """Say why a leg cannot follow `motion`: rows pose and, where they matter, velocity and acceleration."""
+    """Raise the error that explains why a leg cannot follow `motion`, with rows pose, velocity and acceleration."""
     for name, row in zip(("pose", "velocity", "acceleration"), motion, strict=False):
         for axis, value in zip(("x", "y", "phi"), row, strict=True):
             if not math.isfinite(value):
@@ -149,7 +151,7 @@ def _refuse_pose(geometry: Geometry, motion: Array, leg: int, place: str) -> NoR
 
 
 def _refuse_slider(geometry: Geometry, sliders: Array, pose: Array, leg: int, place: str) -> NoReturn:
-    """Say what is wrong with a slider, or with the angle to which the sliders bring the edge of its leg."""
+    """Raise the error for a bad slider position, or for the angle to which the sliders bring the edge of the leg."""
     slider = float(sliders[leg])
     if not math.isfinite(slider):
         message = f"{place}slider {geometry.labels[leg]} is {slider}: it must be finite"
@@ -158,7 +160,7 @@ def _refuse_slider(geometry: Geometry, sliders: Array, pose: Array, leg: int, pl
 
 
 def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoReturn:
-    """Say where the edge of a leg is parallel to its rail."""
+    """Raise the error that states where the edge of a leg is parallel to its rail."""
     built, at, where = geometry.each[leg], worded(phi, "rad"), f"{place}leg {geometry.labels[leg]}"
     parallel = built.parallel_angle
     if parallel is None:
@@ -174,7 +176,7 @@ def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoRet
 
 
 def _refuse_loops(geometry: Geometry, sliders: Array, near: Array, place: str) -> NoReturn:
-    """Say by how much the loops fail to close, or that they do so singularly."""
+    """Raise the error that states by how much the loops fail to close, or that they close at a singular pose."""
     A, B, C = loop_equation(geometry.packed(), sliders)
     reach, needed = math.hypot(A, B), abs(C)
     readings = "{}sliders ({}, {}, {})".format(place, *(worded(slider, "m") for slider in sliders))

@@ -1,7 +1,7 @@
 """Share of the sliders' limits that is reserved for taking up backlash.
 
-When a slider reverses, its motor additionally crosses the backlash on a quintic from rest to rest. The duration depends
-on the widest backlash alone.
+When a slider reverses, its motor also crosses the backlash, on a quintic from rest to rest. The duration depends only
+on the widest backlash.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from trirail.config import Limits, SliderLimits
 SHARE = 0.1
 """Share of the sliders' velocity, acceleration and jerk limits that is reserved for backlash."""
 PEAKS = (15.0 / 8.0, 10.0 / math.sqrt(3.0), 60.0)
-"""Greatest velocity, acceleration and jerk of the quintic over unit distance in unit time."""
+"""Peak velocity, acceleration and jerk of a quintic that covers unit distance in unit time."""
 
 
 class TakeUp(NamedTuple):
@@ -39,7 +39,7 @@ NO_BACKLASH = TakeUp((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
 
 
 def reserve_for_backlash(widths: Sequence[float], slider: SliderLimits) -> TakeUp:
-    """Return the fastest take-up of these widths [m] within the reserved share of the limits."""
+    """Return the fastest take-up of the given widths [m] within the reserved share of the limits."""
     widest = max(widths)
     limits = min(slider.velocities), min(slider.accelerations), min(slider.jerks)
     powers = (1, 2, 3)
@@ -54,9 +54,9 @@ def reserve_for_backlash(widths: Sequence[float], slider: SliderLimits) -> TakeU
 
 
 def planned_limits(limits: Limits, widths: Sequence[float]) -> Limits:
-    """Return the limits for planning: the robot's limits less the share reserved for backlash.
+    """Return the limits for planning, which are the robot's limits minus the share reserved for backlash.
 
-    The sliders' in-position windows grow by the backlash, because a position is uncertain within it.
+    The in-position windows of the sliders are enlarged by the backlash, because a position is uncertain by that amount.
     """
     if not any(widths):
         return limits

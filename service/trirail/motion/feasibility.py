@@ -1,4 +1,4 @@
-"""Feasibility of a path: its load on the limits of sliders and platform, and the time when it leaves the workspace."""
+"""Feasibility of a path: how much it uses of the limits of sliders and platform, and when it leaves the workspace."""
 
 from __future__ import annotations
 
@@ -20,46 +20,46 @@ from trirail.motion.paths import ROUNDING, Path, constant_law, evaluate, law_fal
 from trirail.motion.runs import ZERO_RATES
 
 SLIDER_PLAN_SHARES = (0.98, 0.98, 0.93)
-"""Shares of the sliders' velocity, acceleration and jerk limits that plans use. The rest covers peaks between samples;
-jerk varies most there."""
+"""Shares of the sliders' velocity, acceleration and jerk limits that plans use. The rest covers peaks between
+samples, which are highest for the jerk."""
 SLIDER_LAW_SHARES = (0.99, 0.99, 0.98)
-"""Shares of the same limits that a change of rate may use in total, on top of the path itself."""
+"""Shares of the same limits that a path and a change of its rate may use together."""
 PLATFORM_PLAN_SHARES = (0.995, 0.98, 0.957)
-"""Shares of the platform's velocity, acceleration and jerk limits that plans use. They are higher than the sliders',
-because the platform's rates vary less between samples, and because a change of rate adds no velocity."""
+"""Shares of the platform's velocity, acceleration and jerk limits that plans use. They are higher than those of the
+sliders, because the platform's rates vary less between samples, and because a change of rate adds no velocity."""
 PLATFORM_LAW_SHARES = (0.997, 0.99, 0.985)
-"""Shares of the same limits that a change of rate may use: the margin in which a robot at its limits can brake."""
+"""Shares of the same limits that a change of rate may use. The margin allows a robot at its limits to brake."""
 ROUNDING_FACTOR = 1.0 + 1e-6
-"""Factor by which rounding may exceed a share."""
+"""Factor by which a share may be exceeded because of rounding."""
 SUBJECTS = ("a slider", *(f"the platform's {name}" for name in (*COORDINATES, "centre in x", "centre in y")))
-"""Subjects of the rows of SampleResult.worst. The centre has rows of its own for a path of another point, because the
-limits hold for both points."""
+"""Names of the rows of SampleResult.worst. The centre has rows of its own for a path of another point, because the
+limits apply to both points."""
 SAMPLE_INTERVAL_S = 0.005
-"""Interval between samples of a path, in addition to its knots. With samples 20 ms apart, an acceleration between two
-of them was once 1.4 % above both while the rate changed as well."""
+"""Interval between the samples of a path, in addition to its knots [s]. With samples 20 ms apart, an acceleration
+between two samples was once 1.4 % above both of them while the rate was changing as well."""
 MIN_SAMPLES, MAX_SAMPLES = 16, 64
-"""Bounds on the number of these samples, for a short and a long path."""
+"""Least and greatest number of these samples, for short and long paths."""
 KNOTS_PER_PART = 48
-"""Knots of a planned path that are sampled together; each part has at least MIN_SAMPLES samples."""
+"""Number of knots of a planned path that are sampled together. Each part has at least MIN_SAMPLES samples."""
 SLOWDOWN_EXPONENTS = 1.0 / np.arange(1.0, 4.0)
-"""Exponents that turn excess velocity, acceleration and jerk into a factor of time."""
+"""Exponents that convert excess velocity, acceleration and jerk into a factor of time."""
 MAX_SAMPLED_S = 600.0
-"""Longest part of a path that one call samples."""
+"""Longest part of a path that is sampled in one call [s]."""
 
 
 class SampleResult(NamedTuple):
-    """Load of a path on the limits, and the time at which it leaves the workspace."""
+    """Use of the limits by a path, and the time at which the path leaves the workspace."""
 
     worst: Array
-    """Greatest velocity, acceleration and jerk (6, 3) of SUBJECTS, as shares of the limits that plans use."""
+    """Greatest velocity, acceleration and jerk of each of SUBJECTS, (6, 3), as shares of the limits that plans use."""
     within_limits: bool
-    """Whether the motion stays within the limits for changes of rate, and its time never falls."""
+    """Whether the motion stays within the limits for changes of rate, and the time along the path never decreases."""
     leaves_at: float
-    """Time at which it leaves the workspace [s]; NaN if it never does."""
+    """Time at which the path leaves the workspace [s]; NaN if it never does."""
 
     @property
     def slowdown_factor(self) -> float:
-        """Factor by which it must be slowed to fit; at most 1 if it fits."""
+        """Factor by which the path must be slowed to fit; at most 1 if it fits already."""
         return slowdown_factor(self.worst)
 
     @property
@@ -69,9 +69,9 @@ class SampleResult(NamedTuple):
 
 
 def slowdown_factor(worst: Array) -> float:
-    """Return the factor by which a motion must be slowed to fit, from its shares (…, 3) of the limits.
+    """Return the factor by which a motion must be slowed to fit, given its shares (…, 3) of the limits.
 
-    The same path k times slower has 1/k of the velocity, 1/k² of the acceleration and 1/k³ of the jerk.
+    If a path is slowed k times, its velocity is 1/k, its acceleration 1/k² and its jerk 1/k³ of the original.
     """
     return float((worst**SLOWDOWN_EXPONENTS).max())
 
@@ -82,7 +82,7 @@ def most_exceeded(worst: Array) -> str:
 
 
 def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list[tuple[float, float]]:
-    """Return the start and end of parts of a law's time [s], each with at most `knots` of the path's knots."""
+    """Divide a law's time [s] into parts with at most `knots` knots of the path each. Return their starts and ends."""
     at = np.zeros((3, 1))
     evaluate(law.knots, law.pieces, first, at)
     begin = int(np.searchsorted(path.knots, at[0, 0], side="right"))
@@ -94,7 +94,7 @@ def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list
 
 
 def _positions(motion: Array, rows: Array) -> Array:
-    """Return the nine limited positions: x, y, phi, the sliders and the cross slides."""
+    """Return the nine positions that have limits: x, y, phi, the sliders and the cross slides."""
     return np.concatenate([motion[0], rows[0], rows[3]])
 
 
@@ -104,15 +104,15 @@ class Checker:
     Parameters
     ----------
     geometry : Geometry
-        The robot as built.
+        Geometry of the robot as built.
     limits : Limits
-        Limits for planning, as of backlash_reserve.planned_limits.
+        Limits for planning, from backlash_reserve.planned_limits.
     bounds : Bounds
         The same limits, for messages.
     period : float
         Cycle time of the loop [s].
     beat : Callable[[], None]
-        Sign of life, called once per sampled path.
+        Function called once per sampled path as a sign of life.
     """
 
     def __init__(
@@ -132,15 +132,15 @@ class Checker:
         each = np.array([most, x, y, phi, x, y])
         planned = each * [SLIDER_PLAN_SHARES, *[PLATFORM_PLAN_SHARES] * 5]
         self.slider_limits = planned[0]
-        """Velocity, acceleration and jerk (3,) that plans use, of the slider with the highest limits."""
+        """Velocity, acceleration and jerk limits (3,) that plans use for the slider with the highest limits."""
         self.each_slider_limits = self.slider_limits[:, None] / self._shares
-        """Limits that plans use for each slider: rows velocity, acceleration, jerk (3, 3)."""
+        """Limits that plans use for each slider; rows are velocity, acceleration, jerk (3, 3)."""
         self.platform_limits = planned[1:4]
-        """Limits that plans use for the platform: rows x, y, phi (3, 3)."""
+        """Limits that plans use for the platform; rows are x, y, phi (3, 3)."""
         self.centre_limits = planned[4:]
-        """Limits that plans use for the platform's centre in x and y on a path of another point (2, 3)."""
+        """Limits that plans use for x and y of the platform's centre if the path is that of another point (2, 3)."""
         self.law_limits = each[1:4] * PLATFORM_LAW_SHARES
-        """Limits that changes of rate use for the platform: rows x, y, phi (3, 3)."""
+        """Limits that changes of rate use for the platform; rows are x, y, phi (3, 3)."""
         self._planned = planned * ROUNDING_FACTOR
         self._laws = each * [SLIDER_LAW_SHARES, *[PLATFORM_LAW_SHARES] * 5] / planned
         self._legs = geometry.packed()
@@ -150,14 +150,14 @@ class Checker:
         self._tolerance = standing_tolerance(limits, geometry.arm)
 
     def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
-        """Sample a path under a law from one time of the law to another [s].
+        """Sample a path under a law between two times of the law [s].
 
-        `pose` is on the branch of the first sample. Each call gives a sign of life: every loop of the planner samples a
-        path in each iteration.
+        `pose` selects the branch of the first sample. Each call gives a sign of life, because every loop of the planner
+        samples a path in each iteration.
         """
         self._beat()
         until = max(first, min(until, first + MAX_SAMPLED_S))
-        # A path from standstill may begin with an acceleration: the step into it counts, like the step at the end.
+        # A path from standstill may begin with an acceleration. The step into it counts, as does the step at the end.
         if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():
             first = -self._period
         even = min(max(MIN_SAMPLES, int((until - first) / SAMPLE_INTERVAL_S)), MAX_SAMPLES)
@@ -181,11 +181,11 @@ class Checker:
         return SampleResult(worst, within_limits, leaves_at)
 
     def keeps_limits(self, worst: Array) -> bool:
-        """Return whether shares (6, 3) of plan limits stay within the limits for changes of rate."""
+        """Return whether shares (6, 3) of the plan limits stay within the limits for changes of rate."""
         return bool((worst <= self._laws).all())
 
     def worst_shares(self, path: Path, pose: Sequence[float]) -> Array:
-        """Return SampleResult.worst of a whole path.
+        """Return SampleResult.worst for a whole path.
 
         Raises
         ------
@@ -201,7 +201,7 @@ class Checker:
         return worst
 
     def refusal(self, path: Path, time: float, pose: Sequence[float]) -> RefusedError:
-        """Return the refusal of a path that leaves the workspace at a time along it [s]."""
+        """Return the error that refuses a path because it leaves the workspace at a time along it [s]."""
         where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
         rows = self._rows(path, time, pose)
         if rows is None:
@@ -218,13 +218,13 @@ class Checker:
         )
 
     def bound(self, path: Path, time: float, pose: Sequence[float]) -> str:
-        """Return the name of the limit at which a path leaves the workspace, at a time along it [s]."""
+        """Return the name of the limit at which a path leaves the workspace at a time along it [s]."""
         rows = self._rows(path, time, pose)
         violation = self._farther_out(path, rows, pose) if rows is not None else None
         return violation.bound if violation is not None else "the workspace"
 
     def exceeded_bound(self, pose: Sequence[float]) -> str | None:
-        """Return the name of the limit that a pose exceeds; None if the robot can stand there."""
+        """Return the name of the limit that a pose exceeds; None if the robot can be at that pose."""
         motion, rows = np.array((pose, ZERO_RATES, ZERO_RATES)), np.zeros((6, 3))
         if inverse_into(self._legs, motion, rows):
             return "the workspace"
@@ -242,7 +242,7 @@ class Checker:
         return motion, rows
 
     def _farther_out(self, path: Path, rows: tuple[Array, Array], pose: Sequence[float]) -> Violation | None:
-        """Return the first position that is beyond its limit and farther out than at the start of the path."""
+        """Return the first position that is beyond its limit and farther out than it was at the start of the path."""
         begin = self._rows(path, 0.0, pose)
         return self._violation(_positions(*rows), _positions(*begin) if begin is not None else None)
 

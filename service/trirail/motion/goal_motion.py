@@ -1,4 +1,4 @@
-"""Interface of goal kinds to the planner: resolve names and frames, check the request, plan the path."""
+"""Interface between kinds of goals and the planner: resolve names and frames, check the request, and plan the path."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from trirail.wire.goal_kind import GoalKind
 
 G = TypeVar("G", bound=GoalKind)
 PoseSource = Callable[[Literal["commanded", "measured"]], Sequence[float]]
-"""Source of the pose of the platform's centre from which a relative move counts."""
+"""Function that returns the pose of the platform's centre from which a relative move is counted."""
 
 
 class GoalMotion(Generic[G]):
-    """Planning of the goals of one kind; subclasses are in trirail.motion.kinds."""
+    """Planning of the goals of one kind. The subclasses are in trirail.motion.kinds."""
 
     kind: ClassVar[type[GoalKind]]
     examples: ClassVar[tuple[GoalKind, ...]] = ()
@@ -38,7 +38,7 @@ class GoalMotion(Generic[G]):
         return goal
 
     def check(self, goal: G) -> None:
-        """Raise RefusedError if the goal is impossible from any start."""
+        """Raise RefusedError if the goal cannot be reached from any start."""
 
     def plan(self, goal: G, start: MotionState, rate: float, begins: float) -> Plan:
         """Return a path to the goal.
@@ -46,7 +46,7 @@ class GoalMotion(Generic[G]):
         Parameters
         ----------
         goal : G
-            A resolved goal.
+            Goal that has been resolved.
         start : MotionState
             State of the platform's centre at the start of the path.
         rate : float

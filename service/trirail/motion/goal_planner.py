@@ -1,4 +1,4 @@
-"""Planner of goals of any kind, from the motion under way."""
+"""Planner that plans a motion to a goal of any kind, starting from the motion under way."""
 
 from __future__ import annotations
 
@@ -26,60 +26,60 @@ from trirail.wire.goals import Goal
 from trirail.wire.messages import GoalReply
 
 MIN_REPLAN_RATE = 0.05
-"""Lowest rate at which a new goal is planned from motion; below it, from a standstill."""
+"""Lowest rate at which a new goal is planned from motion. Below it, the goal is planned from a standstill."""
 STOP_SHARES = tuple(0.5**k for k in range(5))
-"""Shares of the quickest stop that are tried if the robot must stop before a goal."""
+"""Shares of the quickest stop that are tried if the robot must stop before it moves to a goal."""
 SLOWDOWN_STEP = 1.3
-"""Factor by which a path is slowed if an override makes it too fast."""
+"""Factor by which a path is slowed if the override makes it too fast."""
 MAX_SLOWDOWNS = 12
-"""Number of such slowdowns: 1.3 to the power of 12 is a factor of 23."""
+"""Greatest number of such slowdowns; 1.3 to the power of 12 is a factor of 23."""
 
 import_all(kinds)
 MOTIONS: dict[type[Goal], type[GoalMotion[Any]]] = {made.kind: made for made in GoalMotion.__subclasses__()}
-"""Planning of each kind of goal."""
+"""Class that plans each kind of goal."""
 
 
 def resolve_goal(goal: Goal, frames: NamedFrames, source: PoseSource) -> Goal:
-    """Return the goal in the base frame, as the planner expects it. Raises RefusedError for an unknown name."""
+    """Return the goal in the base frame, as the planner requires it. Raises RefusedError for an unknown name."""
     return MOTIONS[type(goal)].resolve(goal, frames, source)
 
 
 class PlannedMotion(NamedTuple):
-    """Planned motion to a goal."""
+    """Motion that has been planned to a goal."""
 
     run: Run
     reply: GoalReply
-    """Reply to the goal, without its id."""
+    """Reply to the sender of the goal, without the goal's id."""
     bound: str | None
-    """Limit before which a jog brakes, or beyond which a track's target is."""
+    """Limit before which a jog brakes, or which the target of a track exceeds."""
     stop: Path | None = None
-    """Law of that stop; None if the present law already leads to a standstill."""
+    """Law that stops the current motion first; None if its present law already leads to a standstill."""
     first: int | None = None
-    """Cycle of the schedule in which it begins; None if the robot stands, so that it may begin in any cycle."""
+    """Cycle of the schedule in which the motion begins. None if the robot is at rest, so it may begin in any cycle."""
 
     @property
     def duration(self) -> float:
-        """Time from the start of the motion to arrival, infinite if it never arrives [s]."""
+        """Time from the start of the motion to the arrival [s]; infinite if it never arrives."""
         return math.inf if self.reply.duration is None else self.reply.duration
 
 
 class Extension(NamedTuple):
-    """Planned path of a goal that follows the goals before it."""
+    """Path planned for a goal that follows the goals before it."""
 
     s: float
-    """Time along their path at which it begins [s]."""
+    """Time along the path of the earlier goals at which this path begins [s]."""
     path: Path
     reply: GoalReply
-    """Reply to the goal, without its id and duration."""
+    """Reply to the sender of the goal, without the goal's id and the duration."""
 
     @classmethod
     def from_plan(cls, s: float, plan: Plan) -> Extension:
-        """Return a planned path as an extension that begins at a time along the path before it [s]."""
+        """Return a plan as an extension that begins at a time along the earlier path [s]."""
         return cls(s, plan.path, structs.replace(plan.reply, queued=True))
 
 
 class GoalPlanner:
-    """Planner of the goals of one robot; `beat` is called for each path that is sampled."""
+    """Planner of the goals of one robot. It calls `beat` for each path that it samples."""
 
     def __init__(
         self, geometry: Geometry, limits: Limits, period: float, beat: Callable[[], None] = lambda: None
@@ -93,21 +93,22 @@ class GoalPlanner:
         self.time_scaling = TimeScaling(geometry, checker, period)
 
     def plan(self, goal: Goal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
-        """Return the motion to a goal from the commanded state.
+        """Return the motion to a goal, starting from the commanded state.
 
-        If the robot moves, the new motion begins `lead` cycles later. If it does not fit as requested, the planner
-        takes the sooner of two: a motion at lower speed, or one after a stop on the old path.
+        If the robot moves, the new motion begins `lead` cycles later. If the motion does not fit as requested, the
+        planner compares a motion at a lower speed with one after a stop on the old path, and returns the one that
+        arrives sooner.
 
         Parameters
         ----------
         goal : Goal
-            A resolved goal.
+            Goal that has been resolved.
         schedule : Schedule
-            The motion under way.
+            Schedule with the motion under way.
         rate : float
             Rate at which time runs along the new path.
         lead : int
-            Cycles until the new motion may begin.
+            Number of cycles until the new motion may begin.
 
         Raises
         ------
@@ -136,9 +137,9 @@ class GoalPlanner:
         return best._replace(first=first)
 
     def append(self, goal: Goal, run: Run, blend: float, lead: int) -> Extension:
-        """Return the path of a goal that follows a run, from within `blend` [m] of the end of its path.
+        """Return the path of a goal that follows a run. It begins within `blend` [m] of the end of the run's path.
 
-        The path begins in motion if the limits allow it, else at rest at the end. Raises RefusedError.
+        The path begins in motion if the limits allow it, and otherwise at rest at the end. Raises RefusedError.
         """
         self._motions[type(goal)].check(goal)
         at, end = self._blend_start(run, blend, lead), run.path.duration
@@ -172,8 +173,8 @@ class GoalPlanner:
         for now in (
             schedule.runs[0].law_state.rate,
             1.0,
-        ):  # an override that the old path could take the new one may not
-            # The new path's time runs at the rate of the old one, so that in its own time the motion is slower.
+        ):  # the new path may not allow an override that the old path allowed
+            # Time along the new path runs at the rate of the old path, so the motion is slower in the path's own time.
             velocity = [value / now for value in start.velocity]
             acceleration = [value / now**2 for value in start.acceleration]
             plan = self._plan(goal, MotionState(start.pose, velocity, acceleration), now, begins)
@@ -185,11 +186,11 @@ class GoalPlanner:
         raise TOO_FAST_IN_MOTION
 
     def _plan_after_stop(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
-        """Plan from the pose at which the motion under way can stop."""
+        """Plan from the pose at which the current motion can stop."""
         stop, law = schedule.runs[0].copy(), None
         if stop.target != 0.0:
             law = self.time_scaling.stop(stop, schedule.commanded.pose, STOP_SHARES)
-            if law is not None:  # without a law it runs to the end of its path
+            if law is not None:  # without a law, it runs to the end of its path
                 stop.change_law(law, 0.0)
         left = stop.end_time - stop.time
         end = stop.state(left, schedule.commanded.pose).pose
@@ -200,14 +201,14 @@ class GoalPlanner:
         return PlannedMotion(run, reply, plan.bound, stop=law)
 
     def _plan(self, goal: Goal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Return a path to the goal: GoalMotion.plan."""
+        """Return a path to the goal, planned by GoalMotion.plan."""
         return self._motions[type(goal)].plan(goal, start, rate, begins)
 
     def _blend_start(self, run: Run, blend: float, lead: int) -> float:
-        """Return the time along a run's path [s] at which it is within `blend` [m] of its end, after `lead` cycles."""
+        """Return the time along a path [s], at least `lead` cycles ahead, that is within `blend` [m] of its end."""
         end = run.path.duration
         target = nominal_motion(run.path, end).pose
-        # Strictly ahead even at override 0, because the override may rise at any time.
+        # Stay strictly ahead even at override 0, because the override may rise at any time.
         soonest = run.law_state.s + lead * self._period * max(run.law_state.rate, run.target, 1.0)
         low, high = max(soonest, run.seams[-1].s if run.seams else 0.0), end
         if low >= end or self._planner.distance(nominal_motion(run.path, low).pose, target) <= blend:
@@ -221,11 +222,11 @@ class GoalPlanner:
         return high
 
     def _fits(self, run: Run, s: float, path: Path) -> bool:
-        """Return whether a path appended to a run stays within the limits under the run's law."""
+        """Return whether a path that is appended to a run stays within the limits under the run's law."""
         longer = run.copy()
         longer.append(s, path)
         law, first = longer.law, longer.arrival_at(s)
         last = longer.arrival_at(longer.path.duration)
-        if not math.isfinite(last):  # it stops before; later it runs at full speed at most, or is sampled again
+        if not math.isfinite(last):  # it stops before that; later it runs at most at full speed, or is sampled again
             law, first, last = constant_law(1.0), s, longer.path.duration
         return self._checker.sample(longer.path, law, first, last, nominal_motion(run.path, s).pose).within_limits

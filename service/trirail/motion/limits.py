@@ -1,4 +1,4 @@
-"""Limits of sliders and platform: checks of paths before they start and of every setpoint before it is sent."""
+"""Limits of sliders and platform. Paths are checked before they start, and every setpoint before it is sent."""
 
 from __future__ import annotations
 
@@ -23,31 +23,32 @@ COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 
 SETPOINT_TOLERANCE = 1e-6
-"""Distance that a setpoint may lie beyond a position limit that its path was checked against [m, rad]."""
+"""Distance by which a setpoint may exceed the position limit that its path was checked against [m, rad]."""
 OUTWARD_ROUNDING = 1e-12
-"""Growth of a limit excess from one cycle to the next that counts as rounding [m, rad]."""
+"""Increase of a limit excess per cycle that is treated as rounding [m, rad]."""
 MAX_RELATIVE_EXCESS = 1e-3
-"""Relative excess of a setpoint over the velocity, acceleration and jerk limits that its path was checked against."""
+"""Relative amount by which a setpoint may exceed the velocity, acceleration and jerk limits that its path was
+checked against."""
 
 
 class AllowedMotion(IntEnum):
-    """Platform motion that the mode allows; the last gate refuses a setpoint that exceeds it."""
+    """Platform motion that a mode allows. The last gate refuses a setpoint that goes beyond it."""
 
     ANY = 0
-    """Motion within the limits."""
+    """Any motion within the limits."""
     BRAKING = 1
-    """Any motion until its law leads to a standstill; the limits may delay that law."""
+    """Any motion until its law leads to a standstill. The limits may delay such a law."""
     BRAKED = 2
-    """A motion whose law leads to a standstill."""
+    """Only a motion whose law leads to a standstill."""
     NONE = 3
-    """A standstill; the sliders may take up backlash."""
+    """No motion, except that the sliders may take up backlash."""
 
 
 BOUNDS = np.dtype(
     [
-        ("rows", "f8", (4, 3, 3)),  # position, velocity, acceleration, cross slide; per leg: low, high, slack
+        ("rows", "f8", (4, 3, 3)),  # position, velocity, acceleration, cross slide; for each leg: low, high, slack
         ("pose", "f8", (3, 2)),  # x, y, phi: low, high
-        ("edge", "f8"),  # slack of the pose limits
+        ("edge", "f8"),  # slack of the pose limits [m, rad]
         ("step", "f8", 3),  # greatest travel of each slider in one cycle [m]
         ("slider_jerk", "f8", 3),
         ("platform", "f8", (3, 3)),  # velocity, acceleration and jerk of x, y, phi
@@ -68,12 +69,12 @@ _CHECKS = (
     ("platform", "acceleration", "/s²"),
     ("platform", "jerk", "/s³"),
 )
-"""Subject, quantity and unit of each check; a unit of the platform is appended to that of the coordinate."""
+"""Subject, quantity and unit of each check. For the platform, the unit is appended to that of the coordinate."""
 _PASSIVE, _POSE, _STEP, _JERK, _PLATFORM = 3, 4, 5, 6, 7  # indices of _CHECKS; 0 to 3 are the sliders' rows
 
 
 class Violation(NamedTuple):
-    """Quantity that exceeds its limit."""
+    """Quantity that exceeds its limit, with the value and the limit."""
 
     axis: str
     """Slider (A, B, C) or platform coordinate (x, y, phi)."""
@@ -89,7 +90,7 @@ class Violation(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """Slider or platform coordinate, for messages."""
+        """Slider or platform coordinate, as used in messages."""
         return f"{self.part} {self.name}"
 
     @property
@@ -99,12 +100,12 @@ class Violation(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the slider or coordinate, for messages."""
+        """Name of the slider or coordinate, as used in messages."""
         return self.label or self.axis
 
     @property
     def bound(self) -> str:
-        """Quantity and its limit, for messages."""
+        """Quantity and its limit, as used in messages."""
         return f"{self.subject} ({self.quantity} {worded(self.limit, self.unit)})"
 
 
@@ -113,18 +114,18 @@ _BOUNDS, _ROWS, _ROW = from_dtype(BOUNDS)[::1], f8[:, ::1], f8[::1]
 
 @compiled()
 def _store_violation(check: int, n: int, value: float, limit: float, violation: Array) -> int:
-    """Store value and limit; return the code of a violation: 1 + 3 * check + leg or coordinate."""
+    """Store the value and the limit. Return the code of the violation, 1 + 3 * check + leg or coordinate."""
     violation[0], violation[1] = value, limit
     return 1 + 3 * check + n
 
 
 @compiled()
 def _least_jerk(now: Array, before: Array, n: int, period: float) -> float:
-    """Return the least jerk that explains two successive rows (position, velocity, acceleration).
+    """Return the least jerk that explains two successive rows of position, velocity and acceleration.
 
-    The jerk may switch between ±j at any time within the cycle T. Then the acceleration changes by at most j T, the
-    velocity differs by at most j T² / 2 from the mean acceleration times T, and the position by at most j T³ / 4 from
-    the mean velocity times T.
+    The jerk may switch between ±j at any time within the cycle T. The acceleration then changes by at most j T, the
+    velocity differs by at most j T² / 2 from the mean acceleration times T, and the position differs by at most j T³ /
+    4 from the mean velocity times T.
     """
     half = period / 2.0
     p, v, a = now[0, n], now[1, n], now[2, n]
@@ -149,7 +150,7 @@ def _check_row(bounds: NDArray[np.void], rows: Array, row: int, violation: Array
 
 @compiled(i8(_BOUNDS, _ROWS, _ROW))
 def check_setpoint(bounds: NDArray[np.void], rows: Array, violation: Array) -> int:
-    """Check rows of solved sliders: position, velocity, acceleration, cross slide, or the first of these [m, s].
+    """Check rows of solved sliders [m, s]: position, velocity, acceleration, cross slide, or only the first of these.
 
     NaN violates every limit. Returns 0, or a code for Bounds.violation.
     """
@@ -162,7 +163,7 @@ def check_setpoint(bounds: NDArray[np.void], rows: Array, violation: Array) -> i
 
 @compiled()
 def _check_rates(bounds: NDArray[np.void], rows: Array, violation: Array) -> int:
-    """Check velocities and accelerations of solved sliders."""
+    """Check the velocities and accelerations of solved sliders."""
     for row in (1, 2):
         code = _check_row(bounds, rows, row, violation)
         if code:
@@ -172,7 +173,7 @@ def _check_rates(bounds: NDArray[np.void], rows: Array, violation: Array) -> int
 
 @compiled(i8(_BOUNDS, _ROW, _ROW))
 def check_pose(bounds: NDArray[np.void], pose: Array, violation: Array) -> int:
-    """Check a pose x, y [m], phi [rad] alone."""
+    """Check only a pose: x, y [m], phi [rad]."""
     edge = bounds[0].edge
     for n in range(3):
         low, high = bounds[0].pose[n, 0], bounds[0].pose[n, 1]
@@ -183,7 +184,7 @@ def check_pose(bounds: NDArray[np.void], pose: Array, violation: Array) -> int:
 
 @compiled()
 def _check_step(bounds: NDArray[np.void], rows: Array, before: Array, violation: Array) -> int:
-    """Check travel and jerk of the sliders since the previous cycle."""
+    """Check the travel and the jerk of the sliders since the previous cycle."""
     for n in range(3):
         step, most = rows[0, n] - before[0, n], bounds[0].step[n]
         if not abs(step) <= most:
@@ -214,7 +215,7 @@ def _check_platform(bounds: NDArray[np.void], motion: Array, before: Array, viol
 def _check_positions(
     bounds: NDArray[np.void], rows: Array, before: Array, pose: Array, pose_before: Array, violation: Array
 ) -> int:
-    """Check that positions are within their limits, or no farther beyond them than in the previous cycle."""
+    """Check that each position is within its limits, or no farther beyond them than in the previous cycle."""
     for row in (0, 3):
         for n in range(3):
             limits = bounds[0].rows[row, n]
@@ -240,18 +241,18 @@ def gate(
 ) -> int:
     """Check sliders and platform against the limits and against the previous cycle.
 
-    A position beyond its limit may return, but never move farther out.
+    A position beyond its limit may return towards the limit, but must not move farther out.
 
     Parameters
     ----------
     bounds : (1,) of BOUNDS
-        The robot's limits.
+        Limits of the robot.
     rows, rows_before : (4, 3)
-        Sliders, as of check_setpoint, now and in the previous cycle.
+        Sliders now and in the previous cycle, with the rows of check_setpoint.
     motion, motion_before : (3, 3)
-        Platform pose, velocity, acceleration, now and in the previous cycle.
+        Pose, velocity and acceleration of the platform now and in the previous cycle.
     violation : (2,)
-        Receives the value that violates its limit, and that limit.
+        Output: the value that violates its limit, and that limit.
 
     Returns
     -------
@@ -269,10 +270,10 @@ def gate(
 
 
 def standing_tolerance(limits: Limits, arm: float) -> Array:
-    """Return the distance beyond its limits at which a standing robot may be measured, (9,) [m, m, rad, m …].
+    """Return how far beyond its limits a robot at rest may be measured, (9,) [m, m, rad, m …].
 
-    These are the in-position windows of x, y, phi, the sliders and the cross slides; each is at least three counts of
-    its drive. `limits` are those of backlash_reserve.planned_limits, `arm` is Geometry.arm [m].
+    The distances are the in-position windows of x, y, phi, the sliders and the cross slides, but at least three counts
+    of the drive. `limits` are those of backlash_reserve.planned_limits, and `arm` is Geometry.arm [m].
     """
     x, y, phi = limits.in_position.pose
     sliders = limits.in_position.sliders
@@ -280,7 +281,7 @@ def standing_tolerance(limits: Limits, arm: float) -> Array:
 
 
 class Bounds:
-    """Limits of one robot, packed for compiled checks, and violations for people.
+    """Limits of one robot, packed for compiled checks, and descriptions of violations for the user.
 
     `edge` is the tolerance of positions [m, rad]; `labels` names the sliders in messages.
     """
@@ -289,7 +290,7 @@ class Bounds:
         slider, platform = limits.slider, limits.platform
         self.labels = labels
         self.packed = np.zeros(1, BOUNDS)
-        """The limits for compiled code, (1,) of BOUNDS."""
+        """Limits for compiled code, (1,) of dtype BOUNDS."""
         self.last_violation = np.zeros(2)
         """Last value that violated its limit, and that limit."""
         bounds = self.packed[0]
@@ -316,11 +317,11 @@ class Bounds:
         return box
 
     def pose_violation(self, pose: ArrayLike) -> Violation | None:
-        """Return the violation of the platform's position limits at a pose x, y [m], phi [rad], if any."""
+        """Return the violation of the position limits at a platform pose x, y [m], phi [rad]; None if there is none."""
         return self.violation(check_pose(self.packed, np.array(pose, dtype=np.float64), self.last_violation))
 
     def pose_violation_from(self, pose: ArrayLike, start: Sequence[float]) -> Violation | None:
-        """Return the violation at a pose if it is also farther beyond the limit than the pose `start`."""
+        """Return the violation at a pose; None if the pose is no farther beyond that limit than the pose `start`."""
         values = np.array(pose, dtype=np.float64)
         low, high = self.box
         edge = float(self.packed[0]["edge"])
@@ -330,14 +331,14 @@ class Bounds:
         return self.position_violation(int(np.argmax(outside)), float(values[outside][0])) if outside.any() else None
 
     def standing_violation(self, positions: Array, tolerance: Array) -> Violation | None:
-        """Return the violation among the nine positions of a standing robot, each with its tolerance (9,)."""
+        """Return the first violation of the nine positions of a robot at rest, given a tolerance for each (9,)."""
         low, high = np.vstack([self.packed[0]["pose"], *self.packed[0]["rows"][(0, 3), :, :2]]).T
         outside = (positions < low - tolerance) | (positions > high + tolerance)
         number = int(np.argmax(outside))
         return self.position_violation(number, float(positions[number])) if outside.any() else None
 
     def setpoint_violation(self, rows: ArrayLike) -> Violation | None:
-        """Return the violation of solved sliders, rows as of check_setpoint [m, s], if any."""
+        """Return the violation of solved sliders, with the rows of check_setpoint [m, s]; None if there is none."""
         return self.violation(check_setpoint(self.packed, np.array(rows, dtype=np.float64), self.last_violation))
 
     def position_violation(self, number: int, value: float) -> Violation | None:
@@ -349,7 +350,7 @@ class Bounds:
         return self.violation(1 + 3 * check + n)
 
     def violation(self, code: int) -> Violation | None:
-        """Return the violation of a code, with the values in last_violation; None for 0."""
+        """Return the violation for a code, with the values of last_violation; None for code 0."""
         if code == 0:
             return None
         check, n = divmod(code - 1, 3)

@@ -1,4 +1,4 @@
-"""Places of marks: the times along a planned path at which outputs switch."""
+"""Times along a planned path at which its marks are reached and outputs switch."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from trirail.motion.paths import Path, constant_law, path_motion, platform_at_la
 from trirail.wire.marks import Mark, PlacedMark
 
 SWITCH: Final = np.dtype([("s", "<f8"), ("width", "<f8"), ("mark", "<i4"), ("on", "<i4")], align=True)
-"""A switch: time along the path [s], duration of the pulse [s] (NaN for a value that stays), index of the mark in its
-goal, and the new value."""
+"""A switch: time along the path [s], duration of the pulse [s] (NaN if the value stays), index of the mark in its
+goal, and the new value of the output."""
 MAX_SWITCHES = 10_000
-"""Switches of one goal."""
+"""Greatest number of switches of one goal."""
 SAMPLES = 24
-"""Samples per piece of a path, between which its length is integrated."""
+"""Number of samples per piece of a path. The length of the path is integrated between samples."""
 BISECTIONS = 50
-"""Bisection steps after which an interval between samples is narrower than the resolution of a float."""
+"""Number of bisection steps after which an interval between samples is narrower than the resolution of a float."""
 LEAST_LENGTH = 1e-9
-"""Length below which a tool does not travel [m]."""
+"""Length below which a tool does not count as travelling [m]."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 class Placed(NamedTuple):
-    """Marks of a goal on its path."""
+    """Marks of a goal, located on its path."""
 
     switches: NDArray[np.void]
-    """(n,) of SWITCH, by rising time along the path."""
+    """Switches, (n,) of dtype SWITCH, in the order of the time along the path."""
     marks: tuple[PlacedMark, ...]
 
 
 def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[float], period: float) -> Placed:
-    """Return where the marks of a goal lie on its path.
+    """Locate the marks of a goal on its path.
 
     Parameters
     ----------
     marks
-        The goal's marks.
+        Marks of the goal.
     path
-        The goal's path alone.
+        Path of this goal only.
     legs
-        Geometry.packed(), for a path in slider space.
+        Geometry.packed(), needed for a path in slider space.
     start
         Pose of the platform's centre at the start of the path: x, y [m], phi [rad].
     period
@@ -54,7 +54,7 @@ def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[
     Raises
     ------
     RefusedError
-        A mark is not on the path, or switches would follow each other within two cycles.
+        A mark is not on the path, or two switches would be less than two cycles apart.
 
     """
     if not marks:
@@ -80,14 +80,14 @@ def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[
 
 
 class GoalMarks:
-    """Marks of a goal on the path of a run, and which of its switches have happened."""
+    """Marks of a goal on the path of a run, and a record of the switches that have taken place."""
 
     def __init__(self, goal: str = "", marks: Sequence[Mark] = (), switches: bytes = b"") -> None:
-        """`switches`: packed rows of SWITCH. Raises ValueError where they are not of these marks."""
+        """Create the marks. `switches` is packed rows of SWITCH; raises ValueError if they do not match the marks."""
         self.goal = goal
         """Id of the goal."""
         self.begin = 0.0
-        """Time along the path of the run at which the path of the goal begins [s]."""
+        """Time along the path of the run at which the goal's own path begins [s]."""
         self._marks = tuple(marks)
         self._rows = np.frombuffer(switches, SWITCH)
         self._passed = np.zeros(len(self._rows), np.bool)
@@ -100,10 +100,10 @@ class GoalMarks:
         return len(self._rows) > 0
 
     def pending(self, output: str, end: float) -> Iterator[tuple[float, int, float, bool, int]]:
-        """Yield the switches of an output that have not happened, before the time `end` along the path of the run.
+        """Yield the remaining switches of an output, up to the time `end` along the path of the run.
 
-        Each has its time along that path [s], its value, the duration of its pulse [s] (NaN for none), whether it
-        opens what closes again, and the index of its mark.
+        Each switch has its time along that path [s], its value, the duration of its pulse [s] (NaN for none), whether
+        something later switches it back, and the index of its mark.
         """
         for k in self._pending_rows(output):
             s, width, mark, on = self._rows[k].tolist()
@@ -112,7 +112,7 @@ class GoalMarks:
                 yield self.begin + s, on, width, opens, mark
 
     def note_passed(self, output: str, number: int) -> None:
-        """Note that a number of switches of an output have happened, besides those noted before."""
+        """Record that `number` more switches of an output have taken place."""
         self._passed[self._pending_rows(output)[:number]] = True
 
     def _pending_rows(self, output: str) -> NDArray[np.int64]:
@@ -121,7 +121,7 @@ class GoalMarks:
 
 
 class _Trace:
-    """Path of a tool: lengths and coordinates by the time along it."""
+    """Path of a tool: arc length and coordinates as functions of the time along the path."""
 
     def __init__(self, path: Path, legs: Array, start: Sequence[float]) -> None:
         self._path, self._legs = path, legs
@@ -141,7 +141,7 @@ class _Trace:
         return float(self._lengths[-1])
 
     def states(self, times: Array) -> tuple[Array, Array]:
-        """Return coordinates of the tool (n, 3), x, y [m], phi [rad], and their velocities at full speed."""
+        """Return the tool's coordinates x, y [m], phi [rad] at times, (n, 3), and their velocities at full speed."""
         if self._path.in_sliders:
             return self._platform_states(times)
         knots, pieces = self._path.knots, self._path.pieces
@@ -156,7 +156,7 @@ class _Trace:
         law = constant_law(1.0)
         out, near = np.zeros((3, 3)), self._near.copy()
         states = np.zeros((2, len(times), 3))
-        for k in np.argsort(times, kind="stable"):  # each on the branch of the pose before it
+        for k in np.argsort(times, kind="stable"):  # take each on the branch of the pose before it
             if platform_at_law_time(self._legs, *self._path, law.knots, law.pieces, times[k], near, out):
                 raise RefusedError(RefusalCode.BAD_MARK, "the marks of a path through a singular pose have no place")
             near[:] = out[0]
@@ -174,20 +174,20 @@ class _Trace:
         return x, y, phi
 
     def _integrate(self, begins: Array, ends: Array) -> Array:
-        """Return the length of the tool's path between times, by Gauss' quadrature [m]."""
+        """Return the length of the tool's path between pairs of times, computed by Gaussian quadrature [m]."""
         half = (ends - begins) / 2.0
         times = (begins + half)[:, None] + half[:, None] * _NODES
         velocities = self.states(times.ravel())[1]
         return half * (np.hypot(velocities[:, 0], velocities[:, 1]).reshape(times.shape) @ _WEIGHTS)
 
     def lengths_at(self, times: Array) -> Array:
-        """Return the length of the tool's path up to times along it [m]."""
+        """Return the length that the tool has travelled at each time along the path [m]."""
         k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         lengths: Array = self._lengths[k] + self._integrate(self.times[k], times)
         return lengths
 
     def times_at(self, lengths: Array) -> Array:
-        """Return the times along the path at which the tool has travelled lengths [m]."""
+        """Return the times along the path at which the tool has travelled the given lengths [m]."""
         k = np.clip(np.searchsorted(self._lengths, lengths, side="left") - 1, 0, len(self.times) - 2)
         left, low, high = lengths - self._lengths[k], self.times[k].copy(), self.times[k + 1].copy()
         for _ in range(BISECTIONS):
@@ -197,7 +197,7 @@ class _Trace:
         return high
 
     def crossing(self, coordinate: int, value: float) -> float | None:
-        """Return the time of the first crossing of a coordinate's value; None where there is none."""
+        """Return the first time at which a coordinate crosses a value; None if it never does."""
         offset = self.coordinates[:, coordinate] - value
         if offset[0] == 0.0:
             return 0.0
@@ -213,7 +213,7 @@ class _Trace:
 
 
 def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, float, int, int]]:
-    """Yield rows of SWITCH."""
+    """Yield the rows of SWITCH for a mark."""
     width = mark.pulse_width if mark.pulse_width is not None else np.nan
     if mark.start is None:
         yield _time_of(number, mark, trace), width, number, int(mark.value)
@@ -234,7 +234,7 @@ def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, f
 
 
 def _time_of(number: int, mark: Mark, trace: _Trace) -> float:
-    """Return the time along the path of a mark that is one place."""
+    """Return the time along the path at which a mark with a single place is reached."""
     if mark.at is not None:
         coordinate, value = mark.at.coordinate
         s = trace.crossing(coordinate, value)
@@ -272,7 +272,7 @@ def _check_length(number: int, mark: Mark, name: str, length: float, whole: floa
 
 
 def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: float) -> None:
-    """Refuse switches of one output that full speed would bring into one cycle, or before a pulse has ended."""
+    """Refuse switches of one output that, at full speed, would share a cycle or come before a pulse has ended."""
     for output in {mark.output for mark in marks}:
         own = switches[[marks[number].output == output for number in switches["mark"]]]
         if len(own) < 2:

@@ -1,7 +1,7 @@
-"""The planner: a pure function from a goal and the motion under way to a new motion or a refusal.
+"""Planner as a pure function: it takes a goal and the motion under way, and returns a new motion or a refusal.
 
-It keeps no state between requests. A plan depends on the request and on the robot's geometry and limits, which have a
-revision; so the planner can run in its own process, in this one, or on a recorded request.
+It keeps no state between requests. A plan depends only on the request and on the robot's geometry and limits, which
+have a revision. The planner can therefore run in its own process or in the calling one, or on a recorded request.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def revision(config: Config) -> int:
 
 
 class MotionPlanner:
-    """Planner of one robot; `beat` is called between the parts of a plan, as a sign of life."""
+    """Planner of one robot. It calls `beat` between the parts of a plan, as a sign of life."""
 
     def __init__(self, config: Config, beat: Callable[[], None] = lambda: None) -> None:
         robot = corrected_geometry(config)
@@ -42,7 +42,7 @@ class MotionPlanner:
         self._goals = GoalPlanner(robot, planned_limits(config.limits, config.correction.backlash), config.period, beat)
 
     def plan(self, request: PlanRequest) -> PlanAnswer:
-        """Return the motion to a goal, or a refusal. An internal error is also answered by a refusal."""
+        """Return the motion to a goal, or a refusal. An internal error also results in a refusal."""
         try:
             decided = self._decide(request)
         except RefusedError as refusal:
@@ -71,7 +71,7 @@ class MotionPlanner:
         )
 
     def warm_up(self) -> None:
-        """Plan a motion of each kind, because the first plan of a kind is slow."""
+        """Plan one motion of each kind, because the first plan of a kind is slow."""
         start = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         runs: tuple[PackedRun, ...] = ()
         for goal in (goal for motion in MOTIONS.values() for goal in motion.examples):

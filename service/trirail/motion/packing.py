@@ -1,4 +1,4 @@
-"""Packed paths and runs, for messages between loop and planner and for recordings; the numbers keep every bit."""
+"""Packed paths and runs, for messages between loop and planner and for recordings. All numbers keep full precision."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail.motion.runs import Run, Seam
 from trirail.wire.plan_packets import PackedPath, PackedRun
 
 POWERS = 6
-"""Coefficients per piece and coordinate."""
+"""Number of coefficients per piece and coordinate."""
 
 
 def pack_path(path: Path) -> PackedPath:
@@ -19,14 +19,14 @@ def pack_path(path: Path) -> PackedPath:
 
 
 def unpack_path(packed: PackedPath, degrees: int) -> Path:
-    """Return a path of `degrees` coordinates from its packed form.
+    """Return the path of `degrees` coordinates that is stored in packed form.
 
-    The checks here let compiled code rely on the shape.
+    The function checks the shape, so that compiled code can rely on it.
 
     Raises
     ------
     ValueError
-        The shape is wrong, a number is not finite, or the knots do not ascend.
+        The shape is wrong, a number is not finite, or the knots are not in ascending order.
     """
     knots = np.frombuffer(packed.knots).copy()
     pieces = np.frombuffer(packed.pieces).copy()
@@ -42,7 +42,7 @@ def unpack_path(packed: PackedPath, degrees: int) -> Path:
 
 
 def unpack_law(packed: PackedPath) -> Path:
-    """Return a law from its packed form. Raises ValueError as unpack_path, and if its time falls."""
+    """Return a law from its packed form. Raises ValueError like unpack_path, and if its time decreases."""
     law = unpack_path(packed, 1)
     if law_falls(law.knots, law.pieces):
         raise ValueError("a law whose time along the path falls")
@@ -56,7 +56,7 @@ def pack_run(run: Run) -> PackedRun:
 
 
 def unpack_run(legs: Array, packed: PackedRun) -> Run:
-    """Return a run from its packed form, for a robot with these packed legs. Raises ValueError as unpack_path.
+    """Return a run from its packed form, for a robot with these packed legs. Raises ValueError like unpack_path.
 
     The paths before the seams are not packed, because no plan starts from them.
     """

@@ -1,4 +1,4 @@
-"""Planner of jerk-limited paths from any state of motion, sampled along their whole length before they start."""
+"""Planner of jerk-limited paths from any state of motion. Each path is sampled completely before it starts."""
 
 from __future__ import annotations
 
@@ -33,17 +33,18 @@ from trirail.quantities import apart, beyond, meant, worded
 from trirail.wire.messages import GoalReply
 
 MIN_LIMIT_SHARE = 0.1
-"""Lowest share of a limit with which a plan from motion is tried."""
+"""Lowest share of a limit that is tried for a plan from motion."""
 MAX_REPLANS = 3
-"""Plans from motion, each with lower limits."""
+"""Greatest number of plans from motion, each with lower limits than the one before."""
 MAX_SLOWDOWN_CHECKS = 8
-"""Checks of a slowed path, each followed by a further slowdown if it does not fit."""
+"""Greatest number of checks of a slowed path. If the path does not fit, it is slowed further after each check."""
 LIMIT_UTILISATION = 0.97
-"""Share of a limit that replanning aims at, so that rounding does not exceed it."""
+"""Share of a limit that replanning aims at, so that rounding does not exceed the limit."""
 MAX_JOG_PLANS = 12
-"""Plans of a jog, each slower, softer or shorter, before it is refused or only brakes."""
+"""Greatest number of plans for a jog, each slower, softer or shorter. After the last one, the jog is refused or only
+brakes."""
 MAX_PATH_RATE = 2.0
-"""Highest rate of the time along a path: an override of 200 %."""
+"""Highest rate of the time along a path, which is an override of 200 %."""
 RATE_UNITS = "/s", "/s²", "/s³"
 TOO_FAST_IN_MOTION = RefusedError(
     RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
@@ -51,22 +52,22 @@ TOO_FAST_IN_MOTION = RefusedError(
 
 
 class Plan(NamedTuple):
-    """Path that keeps every limit."""
+    """Path that keeps all limits."""
 
     path: Path
     reply: GoalReply = GoalReply("", None)
-    """Reply to the goal as far as it follows from the path, without id and duration."""
+    """Those fields of the reply to the goal that follow from the path; id and duration are missing."""
     bound: str | None = None
-    """Limit before which a jog brakes, or beyond which a track's target is."""
+    """Limit before which a jog brakes, or which the target of a track exceeds."""
 
 
 def slowed(factor: float) -> GoalReply:
-    """Return the reply to a goal that the limits make slower than requested by a factor."""
+    """Return the reply to a goal whose motion the limits make slower by a factor than requested."""
     return GoalReply("", None, slowed=factor)
 
 
 class PathPlanner:
-    """Planner of paths within the limits of platform and sliders."""
+    """Planner of paths within the limits of the platform and the sliders."""
 
     def __init__(
         self,
@@ -91,15 +92,15 @@ class PathPlanner:
         self._arm = geometry.arm
 
     def check_pose(self, target: Sequence[float], start: Sequence[float], tool: Sequence[float] = NO_TOOL) -> None:
-        """Check that a pose is in the workspace of the platform's centre.
+        """Check that a tool pose keeps the platform's centre within its workspace.
 
-        The pose is that of a tool, (u, v) in the platform's frame [m]. A robot that starts beyond a limit may move
-        nearer to it.
+        `tool` is the point (u, v) of the platform in its own frame [m] that `target` refers to. A robot that starts
+        beyond a limit may move closer to it.
 
         Raises
         ------
         RefusedError
-            A coordinate exceeds its limit; with value and limit.
+            A coordinate exceeds its limit. The error has the value and the limit.
         """
         if violation := self.bounds.pose_violation_from(centre_motion(rest(target), tool).pose, start):
             asked = _suggestion(violation.value, violation.limit, violation.unit)
@@ -111,9 +112,10 @@ class PathPlanner:
             )
 
     def check_sliders(self, target: Sequence[float], start: Sequence[float]) -> None:
-        """Check that slider positions are within their travel.
+        """Check that slider positions are within the travel of the sliders.
 
-        A slider that starts beyond its travel may move nearer to it. Raises RefusedError, with slider, value and limit.
+        A slider that starts beyond its travel may move closer to it. Raises RefusedError with the slider, the value and
+        the limit.
         """
         rows = zip(LEGS, self.bounds.labels, target, start, self._travel, strict=True)
         for name, label, position, begin, (low, high) in rows:
@@ -123,7 +125,7 @@ class PathPlanner:
                 raise RefusedError(RefusalCode.OUT_OF_WORKSPACE, text, slider=name, value=position, limit=limit)
 
     def check_velocity(self, velocity: Sequence[float]) -> None:
-        """Check a jog's velocity against the platform's limits. Raises RefusedError, with value and limit."""
+        """Check a jog's velocity against the platform's limits. Raises RefusedError with the value and the limit."""
         for name, unit, value, limit in zip(COORDINATES, UNITS, velocity, self._robot_limits.velocity, strict=True):
             if abs(value) > limit * ROUNDING_FACTOR:
                 most = math.copysign(limit, value)
@@ -135,7 +137,7 @@ class PathPlanner:
     def lower_limits(
         self, velocity: Sequence[float] | None, acceleration: Sequence[float] | None, jerk: Sequence[float] | None
     ) -> Kinodynamic:
-        """Return the limits for plans, lowered to a goal's own. Raises RefusedError if these are above the robot's."""
+        """Return the limits for a plan, lowered to a goal's own. Raises RefusedError if these exceed the robot's."""
         asked = velocity, acceleration, jerk
         for name, per, own, limits in zip(Kinodynamic._fields, RATE_UNITS, asked, self._robot_limits, strict=True):
             for coordinate, unit, value, limit in zip(COORDINATES, UNITS, own or limits, limits, strict=True):
@@ -155,10 +157,10 @@ class PathPlanner:
         limits: Kinodynamic | None = None,
         tool: Sequence[float] = NO_TOOL,
     ) -> Plan:
-        """Plan to rest at a pose, straight in pose space if the robot starts at rest.
+        """Plan a motion that ends at rest at a pose. If the robot starts at rest, the path is straight in pose space.
 
-        A path that is too fast for a slider or the platform is replaced by the time-optimal one on the same line, or
-        slowed as a whole if that is no slower.
+        A path that is too fast for a slider or the platform is replaced by the time-optimal path on the same line. It
+        is slowed as a whole instead if that takes no longer.
 
         Parameters
         ----------
@@ -169,9 +171,9 @@ class PathPlanner:
         speed : float
             Share of full speed; at 0.5 the motion takes twice as long.
         limits : Kinodynamic, optional
-            Limits of the tool's motion. The platform's limits hold for its centre as well.
+            Limits of the tool's motion. The platform's limits apply to its centre as well.
         tool : (2,)
-            Point that moves straight, in the platform's frame [m].
+            Point that moves on the straight line, in the platform's frame [m].
 
         Raises
         ------
@@ -183,7 +185,10 @@ class PathPlanner:
         return self._plan_to_rest(start, tool_motion(start, tool), target, limits or self.platform, speed, tool=tool)
 
     def plan_to_sliders(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Plan:
-        """Plan to rest at slider positions [m], straight in slider space from rest; otherwise as plan_to_pose."""
+        """Plan a motion that ends at rest at slider positions [m]. From rest, it is straight in slider space.
+
+        In all other respects, it is planned as by plan_to_pose.
+        """
         rows = np.zeros((6, 3))
         inverse_into(self._legs, np.array(start), rows)
         sliders = MotionState(*rows[:3].tolist())
@@ -193,11 +198,11 @@ class PathPlanner:
     def plan_jog(
         self, start: MotionState, velocity: Sequence[float], timeout: float, tool: Sequence[float] = NO_TOOL
     ) -> Plan:
-        """Plan a ramp to a velocity, a part at that velocity until a limit is near, and a brake.
+        """Plan a jog: a ramp to a velocity, a part at that velocity until a limit is near, and a brake.
 
-        The control ends the jog at its time-out. The path lasts longer: `timeout` is real time, and time along the path
-        may run at MAX_PATH_RATE. A velocity that is too high for platform or sliders is lowered. If only the ramp is
-        too hard, it becomes softer and the velocity stays.
+        The control ends the jog at its time-out. The path lasts longer than `timeout`, which is real time, because the
+        time along the path may run at up to MAX_PATH_RATE. A velocity that is too high for the platform or the sliders
+        is lowered. If only the ramp exceeds a limit, the ramp becomes softer and the velocity stays.
 
         Parameters
         ----------
@@ -206,14 +211,14 @@ class PathPlanner:
         velocity : (3,)
             Velocity of the tool [m/s, rad/s].
         timeout : float
-            Time for which the jog lasts at most [s].
+            Longest duration of the jog [s].
         tool : (2,)
             Point about which the platform turns, in the platform's frame [m].
 
         Raises
         ------
         RefusedError
-            The robot would not move, or even a brake would leave the workspace.
+            The robot would not move, or even braking would leave the workspace.
         """
         share, slower, softer, hold, bound = 1.0, 1.0, 1.0, MAX_PATH_RATE * timeout, None
         for value, limit in zip(velocity, self.platform.velocity, strict=True):
@@ -245,7 +250,7 @@ class PathPlanner:
         return Plan(path, bound=bound)
 
     def plan_trajectory(self, start: MotionState, points: Sequence[Point], stretch: bool) -> Plan:
-        """Plan a path through timed points, quintic between them.
+        """Plan a path through timed points, with a quintic between each two of them.
 
         With `stretch`, a trajectory that is too fast is slowed as a whole.
 
@@ -277,7 +282,7 @@ class PathPlanner:
         return self._solver.to_velocity(start, velocity, self.platform)
 
     def distance(self, pose: Sequence[float], target: Sequence[float]) -> float:
-        """Return the greatest distance of a point of the platform between two poses [m]."""
+        """Return the greatest distance that any point of the platform travels between two poses [m]."""
         x, y, phi = (here - there for here, there in zip(pose, target, strict=True))
         return math.hypot(x, y) + self._arm * abs(phi)
 
@@ -293,7 +298,7 @@ class PathPlanner:
         in_sliders: bool = False,
         tool: Sequence[float] = NO_TOOL,
     ) -> Plan:
-        """Plan from `begin`, which is `start` in the path's own coordinates: sliders or a tool."""
+        """Plan a motion to rest. `begin` is `start` in the coordinates of the path: sliders or a tool."""
         if start.at_rest:
             path = self._solver.to_rest(begin, target, limits, in_sliders, tool)
             slower = max(1.0 / speed, slowdown_factor(self.checker.worst_shares(path, start.pose)))
@@ -315,9 +320,9 @@ class PathPlanner:
         raise TOO_FAST_IN_MOTION
 
     def _time_optimal_path(self, path: Path, limits: Kinodynamic, asked: float, pose: Sequence[float]) -> Path | None:
-        """Return the time-optimal path on the line of a path that is too fast; `asked` is its least duration [s].
+        """Return the time-optimal path along the line of a path that is too fast. `asked` is its shortest duration [s].
 
-        None if the method fails or its path does not fit.
+        Returns None if the method fails or the resulting path does not fit.
         """
         others = self.platform if path.in_sliders else self._checked_sliders
         quickest = time_optimal(self._legs, path, limits, others, self._centre, pose)
@@ -330,9 +335,9 @@ class PathPlanner:
         return path
 
     def _slow_down(self, path: Path, factor: float, pose: Sequence[float]) -> tuple[Path, float]:
-        """Return a path slowed by at least `factor` until it fits, and the factor used.
+        """Slow a path by at least `factor` until it fits. Return the slowed path and the factor used.
 
-        One slowdown may not be enough: a jerk shorter than one sampling step lasts longer in the slower path.
+        One slowdown may not be enough, because a jerk shorter than one sampling step lasts longer in the slower path.
         """
         for _ in range(MAX_SLOWDOWN_CHECKS):
             slow = stretched(path, factor)
@@ -343,14 +348,14 @@ class PathPlanner:
         raise RefusedError(RefusalCode.TOO_FAST, f"the path does not fit its limits even {factor:.3g} times slower")
 
     def _can_hold(self, path: Path, ramp: float, brake: float, pose: Sequence[float]) -> bool:
-        """Return whether a jog's velocity itself fits, between the end of its ramp and its brake."""
+        """Return whether the constant velocity of a jog, between its ramp and its brake, is within the limits."""
         first, until = ramp + self._period, path.duration - brake - 2.0 * self._period
         return first >= until or self.checker.sample(path, constant_law(1.0), first, until, pose).slowdown_factor <= 1.0
 
     def _jog_path(
         self, start: MotionState, velocity: Sequence[float], hold: float, tool: Sequence[float], limits: Kinodynamic
     ) -> tuple[float, float, Path]:
-        """Return the durations of a jog's ramp and brake [s], and its whole path."""
+        """Return the durations of a jog's ramp and brake [s], and the complete path."""
         ramp = self._solver.to_velocity_straight(start, velocity, limits, tool)
         if not any(velocity):
             return ramp.duration, 0.0, ramp
@@ -365,7 +370,7 @@ class PathPlanner:
 
 
 def _jog_refusal(bound: str | None, result: SampleResult) -> RefusedError:
-    """Return the refusal of a jog that would not move the robot."""
+    """Return the error that refuses a jog because it would not move the robot."""
     if bound is not None:
         text = f"the jog cannot move: it would pass the limit of {bound} before it could brake"
         return RefusedError(RefusalCode.OUT_OF_WORKSPACE, text)
@@ -374,7 +379,7 @@ def _jog_refusal(bound: str | None, result: SampleResult) -> RefusedError:
 
 
 def _scaled_limits(limits: Kinodynamic, factor: float, softer: float) -> Kinodynamic:
-    """Return the limits of a motion `factor` times slower, acceleration `softer`² and jerk `softer`³ times lower."""
+    """Return limits for a motion `factor` times slower, with acceleration `softer`² and jerk `softer`³ times lower."""
     powers = factor ** np.arange(1.0, 4.0) * softer ** np.array((0.0, 2.0, 3.0))
     return Kinodynamic(*(np.array(limits) / powers[:, None]).tolist())
 

@@ -1,4 +1,4 @@
-"""Compiled sampling of a path under a law: positions against limits, greatest velocity, acceleration and jerk."""
+"""Compiled sampling of a path under a law. It compares positions with limits and finds the greatest rates."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from trirail.motion.paths import BISECTIONS, ROUNDING, law_at, passing_time, pla
 __all__ = ["survey"]
 
 TURN_CLEARANCE = 1e-3
-"""Distance from its limit within which a turning position is located exactly [m, rad]."""
+"""Distance from a limit within which the turning point of a position is located exactly [m, rad]."""
 UNIT_WEIGHTS = (1.0, 1.0, 1.0)
 RETURN_SLOWDOWN = 10.0
-"""Factor by which the robot returns more slowly from beyond its limits."""
+"""Factor by which the robot moves more slowly while it returns from beyond its limits."""
 SAMPLES_PER_PIECE = 4
-"""Samples in every piece of a path."""
+"""Number of samples in every piece of a path."""
 
 
 @compiled()
 def _insert_time(times: Array, n: int, time: float, first: float, until: float) -> int:
-    """Append a time after the first n if it is between `first` and `until`; return the new number."""
+    """Append a time after the first n times if it is between `first` and `until`. Return the new number of times."""
     if first <= time <= until:
         times[n] = time
         n += 1
@@ -38,10 +38,10 @@ def _insert_time(times: Array, n: int, time: float, first: float, until: float) 
 def _sample_times(
     knots: Array, law_knots: Array, law_pieces: Array, first: float, until: float, even: int, step: float
 ) -> Array:
-    """Return the times of samples, ascending: evenly spaced, within every piece, and on both sides of every knot.
+    """Return the ascending times of samples: evenly spaced, within every piece, and on both sides of every knot.
 
-    Jerk peaks next to a knot of the path or of the law, possibly for a short time. Its mean over a step across a knot
-    is between the means over the steps that end and begin there.
+    Jerk peaks next to a knot of the path or of the law, possibly only for a short time. The mean jerk over a step
+    across a knot is between the means over the steps that end and begin there.
     """
     times = np.empty(even + (SAMPLES_PER_PIECE + 1) * len(knots) + 2 * len(law_knots))
     for k in range(even):
@@ -76,10 +76,10 @@ def _limited_position(motion: Array, sliders: Array, i: int) -> tuple[float, flo
 
 
 class PathProblem(NamedTuple):
-    """A path, its law, the robot, and the robot's limits.
+    """Path, its law, the robot, and the limits of the robot.
 
-    `box` (2, 9) holds the position limits. `reach` (2, 9) is the same for a robot within them; beyond a limit it is the
-    position itself, and follows that inwards.
+    `box` (2, 9) holds the position limits. `reach` (2, 9) equals `box` for a robot that starts within the limits. If a
+    position starts beyond a limit, its reach is the position itself, and moves inwards with it.
     """
 
     legs: Array
@@ -124,7 +124,7 @@ def _narrow_reach(problem: PathProblem, motion: Array, sliders: Array) -> None:
 
 @compiled()
 def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sliders: Array) -> bool:
-    """Write platform and sliders at a time of the law; return whether they are within reach."""
+    """Write the platform and the sliders at a time of the law. Return whether they are within reach."""
     law = law_at(problem.law_knots, problem.law_pieces, time)
     if (
         platform_at(problem.legs, problem.knots, problem.pieces, problem.in_sliders, problem.tools, law, near, motion)
@@ -142,7 +142,7 @@ def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sli
     phi = motion[0, 2]
     if problem.box[0, 2] - ROUNDING <= phi <= problem.box[1, 2] + ROUNDING:
         return True
-    # J2 is regular within the limits of phi; beyond them a singular angle may be on the way back.
+    # J2 is regular within the limits of phi. Beyond them, there may be a singular angle on the way back.
     return sign_of_det_j2(problem.legs, (motion[0, 0], motion[0, 1], phi)) == sign_of_det_j2(problem.legs, ZERO)
 
 
@@ -150,16 +150,16 @@ def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sli
 def _find_turn_beyond_limit(
     problem: PathProblem, last: float, time: float, near: Array, motion: Array, sliders: Array
 ) -> float:
-    """Return the time at which a position that turns between two samples is beyond its limit; NaN if none is.
+    """Return the time at which a position that turns between two samples exceeds its limit; NaN if none does.
 
-    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for one more.
+    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for a third one.
     """
     for i in range(9):
         before, leaving = _limited_position(motion[0], sliders[0], i)
         _, coming = _limited_position(motion[1], sliders[1], i)
         if leaving * coming >= 0.0:
             continue
-        # Estimate of the turning point for constant acceleration.
+        # Estimate the turning point, assuming constant acceleration.
         turn = before + leaving * leaving / (leaving - coming) * (time - last) / 2.0
         if problem.box[0, i] + TURN_CLEARANCE <= turn <= problem.box[1, i] - TURN_CLEARANCE:
             continue
@@ -186,15 +186,15 @@ def _measure_rates(
     worst: Array,
     weights: tuple[float, float, float] = UNIT_WEIGHTS,
 ) -> None:
-    """Raise `worst` (3,) to the velocity, acceleration and jerk of column i of two rows one step apart.
+    """Raise `worst` (3,) to the velocity, acceleration and jerk of column i between two samples one step apart.
 
-    `now` and `then` have the rows position, velocity, acceleration. `whole` is whether the platform moves during the
-    whole step. `weights` multiply the three.
+    `now` and `then` have the rows position, velocity, acceleration. `whole` states whether the platform moves during
+    the whole step. `weights` are factors of the three results.
     """
     worst[0] = max(worst[0], weights[0] * abs(now[1, i]))
     worst[1] = max(worst[1], weights[1] * abs(now[2, i]))
-    # Jerk of the two halves from the change of velocity, in addition to the mean: a rate may rise and fall within one
-    # step, with the same acceleration before and after.
+    # Compute the jerk of both halves of the step from the change of velocity, in addition to the mean jerk. Within a
+    # step, a rate may rise and fall while the acceleration is the same before and after.
     change = then[1, i] - now[1, i]
     early = 2.0 * (change / step - now[2, i]) / step
     late = 2.0 * (then[2, i] - change / step) / step
@@ -207,14 +207,14 @@ def _measure_rates(
 def _measure_tool(
     problem: PathProblem, time: float, motion: Array, arms: Array, step: float, whole: bool, worst: Array
 ) -> None:
-    """Raise `worst` to the rates of the path's tool, and of the centre in the last two rows if that is another point.
+    """Raise `worst` to the rates of the tool. If the tool is not the centre, the last two rows are those of the centre.
 
     `motion` (3, 3, 3) holds the platform one step later and at `time`; `arms` (2, 3, 3) is space for the tool's motion.
     """
     u, v = tool_at(problem.knots, problem.tools, law_at(problem.law_knots, problem.law_pieces, time)[0])
     arms[:] = motion[:2]
     if u != 0.0 or v != 0.0:
-        # The same point one step later, even if a piece of another point begins in between.
+        # Use the same point one step later, even if a piece for another point begins in between.
         transfer_to_point(arms[0], u, v)
         transfer_to_point(arms[1], u, v)
         for i in range(2):
@@ -227,7 +227,7 @@ def _measure_tool(
 def _sample_path(
     problem: PathProblem, times: Array, until: float, step: float, near: Array, worst: Array
 ) -> tuple[float, float]:
-    """Sample a path at ascending times and one step after each; return the last time within reach, and one beyond."""
+    """Sample a path at ascending times and one step after each. Return the last time within reach and one beyond it."""
     motion, sliders, arms = np.empty((3, 3, 3)), np.empty((3, 6, 3)), np.empty((2, 3, 3))
     last = -math.inf
     for k in range(len(times)):
@@ -280,30 +280,29 @@ def survey(
     Parameters
     ----------
     legs, knots, pieces, in_sliders, tools, law_knots, law_pieces
-        The robot's packed legs, the path and its law.
+        Packed legs of the robot, the path and its law.
     first, until : float
         Times of the law between which the path is sampled [s].
     even : int
-        Number of evenly spaced samples, in addition to those at and between knots and at turns near a limit.
+        Number of evenly spaced samples. Samples at and between knots, and at turning points near a limit, are added.
     step : float
-        Cycle time [s]. Jerk is measured between setpoints one step apart, as the drives see it.
+        Cycle time [s]. Jerk is measured between setpoints one step apart, because the drives see it that way.
     start : (3,)
-        Pose at `first`, for the branch of the forward kinematics.
+        Pose at `first`. It selects the branch of the forward kinematics.
     box : (2, 9)
         Low and high limits of x, y, phi, of each slider and of each cross slide.
     tolerance : (9,)
-        Distances beyond these limits at which a path may begin; beyond them its velocities count RETURN_SLOWDOWN
-        times.
+        Distances beyond these limits at which a path may begin. There, velocities count RETURN_SLOWDOWN times.
     shares : (3, 3)
         Weights of velocity, acceleration and jerk for each slider.
     worst : (6, 3)
-        Receives the greatest velocity, acceleration and jerk: over the sliders, of x, y and phi of the tool, and of
-        x and y of the centre if the tool is another point. Undefined if the path leaves the workspace.
+        Output: greatest velocity, acceleration and jerk. The rows are: all sliders; x, y and phi of the tool; x and y
+        of the centre, if the tool is another point. Undefined if the path leaves the workspace.
 
     Returns
     -------
     float
-        First time out of reach [s]; NaN if the path stays within reach.
+        First time at which the path is out of reach [s]; NaN if it stays within reach.
     """
     problem = PathProblem(legs, knots, pieces, in_sliders, tools, law_knots, law_pieces, box, np.empty((2, 9)), shares)
     times = _sample_times(knots, law_knots, law_pieces, first, until, even, step)

@@ -1,12 +1,12 @@
 """Paths as piecewise polynomials in time, and laws that map real time to time along a path.
 
-A path has knots (n + 1,) in seconds and pieces (n, d, 6): coefficients of ascending powers of the time since the
-piece's knot, for each of d coordinates. A law is a path of one coordinate: s, the time along the path, as a function
-of time. The functions are compiled and return error codes.
+A path has knots (n + 1,) in seconds and pieces (n, d, 6). A piece holds, for each of d coordinates, the coefficients of
+ascending powers of the time since the piece's knot. A law is a path of one coordinate: it gives s, the time along the
+path, as a function of real time. The functions are compiled and return error codes.
 
 In pose space the coordinates are those of a point of the platform, the tool: its place in the base frame [m], and phi.
-The platform is a rigid body, so that its centre is p = T - R(phi) t for a tool at t in the platform's frame. Only this
-module converts a path into platform poses.
+The platform is a rigid body, so its centre is p = T - R(phi) t for a tool at t in the platform's frame. Only this
+module converts paths into platform poses.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ __all__ = [
 ]
 
 LAST_PIECE_S = 1e9
-"""Duration of the last piece of a law: practically unlimited."""
+"""Duration of the last piece of a law [s]; in practice, the law never ends."""
 BISECTIONS = 48
-"""Bisection steps after which an interval is narrower than the resolution of a float."""
+"""Number of bisection steps after which an interval is narrower than the resolution of a float."""
 ROUNDING = 1e-9
-"""Tolerance for rounding of positions beyond a limit and of equal times [m, rad, s]."""
+"""Tolerance for rounding of positions beyond a limit, and of times that should be equal [m, rad, s]."""
 MAX_TIME_FALL_S = 1e-12
-"""Greatest fall of the time along a path that counts as rounding."""
+"""Greatest decrease of the time along a path that is treated as rounding [s]."""
 CENTRE_TOOLS = np.zeros((0, 2))
-"""Tools of a path of the platform's centre."""
+"""Tools of a path of the platform's centre, which needs none."""
 
 
 class Path(NamedTuple):
-    """Motion in time, in pose space or in slider space."""
+    """Motion as a function of time, in pose space or in slider space."""
 
     knots: Array
     pieces: Array
@@ -59,12 +59,12 @@ class Path(NamedTuple):
 
     @property
     def duration(self) -> float:
-        """Time from the first knot, at zero, to the last [s]."""
+        """Time from the first knot, which is at zero, to the last knot [s]."""
         return float(self.knots[-1])
 
     @property
     def end(self) -> Array:
-        """Last position, (d,), in the path's own coordinates."""
+        """Last position, (d,), in the coordinates of the path."""
         end: Array = self.pieces[-1] @ (self.knots[-1] - self.knots[-2]) ** np.arange(6.0)
         return end
 
@@ -98,7 +98,7 @@ def _locate(knots: Array, time: float) -> PieceTime:
 
 @compiled()
 def _evaluate_polynomial(p: Array, at: PieceTime) -> Vector:
-    """Return a polynomial's value and first two derivatives; these are zero before the start and after the end."""
+    """Return the value and the first two derivatives of a polynomial. The derivatives are zero outside the path."""
     t = at.time
     position = p[0] + t * (p[1] + t * (p[2] + t * (p[3] + t * (p[4] + t * p[5]))))
     if not at.inside:
@@ -110,7 +110,7 @@ def _evaluate_polynomial(p: Array, at: PieceTime) -> Vector:
 
 @compiled()
 def evaluate_path(knots: Array, pieces: Array, time: float, out: Array) -> None:
-    """Write value and first two derivatives (3, d): evaluate, for compiled code."""
+    """Write the value and the first two derivatives, (3, d). This is `evaluate` for calls from compiled code."""
     at = _locate(knots, time)
     for i in range(pieces.shape[1]):
         out[0, i], out[1, i], out[2, i] = _evaluate_polynomial(pieces[at.piece, i], at)
@@ -118,7 +118,7 @@ def evaluate_path(knots: Array, pieces: Array, time: float, out: Array) -> None:
 
 @compiled()
 def tool_at(knots: Array, tools: Array, time: float) -> tuple[float, float]:
-    """Return the point of the platform that a path moves at a time along it, in the platform's frame [m]."""
+    """Return the point that a path moves at a time along it, (u, v) in the platform's frame [m]."""
     if len(tools) == 0:
         return 0.0, 0.0
     piece = _locate(knots, time).piece
@@ -127,10 +127,11 @@ def tool_at(knots: Array, tools: Array, time: float) -> tuple[float, float]:
 
 @compiled("void(f8[:, ::1], f8, f8)")
 def transfer_to_point(motion: Array, u: float, v: float) -> None:
-    """Convert the motion of one point of the platform to that of the point (u, v) away from it, in place.
+    """Convert the motion of one point of the platform to that of a second point at (u, v) from the first, in place.
 
-    `motion` (3, 3) has the rows x, y, phi, and their first and second derivatives; (u, v) is in the platform's frame
-    [m]. With r = R(phi) (u, v), and r_ as r turned by a right angle: p + r, p' + phi' r_, p'' + phi'' r_ - phi'^2 r.
+    `motion` (3, 3) has the rows x, y, phi, and their first and second derivatives. (u, v) is in the platform's frame
+    [m]. With r = R(phi) (u, v) and with r_ as r turned by a right angle, the rows become p + r, p' + phi' r_ and p'' +
+    phi'' r_ - phi'^2 r.
     """
     if u == 0.0 and v == 0.0:
         return
@@ -154,13 +155,13 @@ def law_at(knots: Array, pieces: Array, time: float) -> Vector:
 
 @compiled("void(f8[::1], f8[:, :, ::1], f8, f8[:, ::1])")
 def evaluate(knots: Array, pieces: Array, time: float, out: Array) -> None:
-    """Write a path's value and first two derivatives at a time [s] into `out` (3, d)."""
+    """Write the value and the first two derivatives of a path at a time [s] into `out` (3, d)."""
     evaluate_path(knots, pieces, time, out)
 
 
 @compiled()
 def motion_at(knots: Array, pieces: Array, tools: Array, law: Vector, out: Array) -> None:
-    """Write the motion (3, 3) of sliders or platform centre at a law's state: value and two derivatives."""
+    """Write the motion (3, 3) of sliders or platform centre at a state of the law: value and two derivatives."""
     s, rate, change = law
     evaluate_path(knots, pieces, s, out)
     for i in range(3):
@@ -180,7 +181,7 @@ def path_motion(knots: Array, pieces: Array, tools: Array, time: float, out: Arr
 def platform_at(
     legs: Array, knots: Array, pieces: Array, in_sliders: bool, tools: Array, law: Vector, near: Array, out: Array
 ) -> int:
-    """Write the platform's pose, velocity and acceleration (3, 3) at a law's state.
+    """Write the pose, velocity and acceleration (3, 3) of the platform at a state of the law.
 
     A path in slider space is converted on the branch of the pose `near`. Returns 0, or a code of forward_into.
     """
@@ -208,13 +209,13 @@ def platform_at_law_time(
     near: Array,
     out: Array,
 ) -> int:
-    """Write the platform's pose, velocity and acceleration (3, 3) at a time of the law [s]; see platform_at."""
+    """Write the pose, velocity and acceleration (3, 3) of the platform at a time of the law [s]; see platform_at."""
     return platform_at(legs, knots, pieces, in_sliders, tools, law_at(law_knots, law_pieces, time), near, out)
 
 
 @compiled("b1(f8[::1], f8[::1], f8[::1])")
 def is_valid_path(knots: Array, coefficients: Array, tools: Array) -> bool:
-    """Return whether all numbers of a path are finite and its knots ascend."""
+    """Return whether all numbers of a path are finite and its knots are in ascending order."""
     for numbers in (knots, coefficients, tools):
         for number in numbers:
             if not math.isfinite(number):
@@ -229,17 +230,17 @@ def is_valid_path(knots: Array, coefficients: Array, tools: Array) -> bool:
 
 @compiled("b1(f8[::1], f8[:, :, ::1])")
 def law_falls(law_knots: Array, law_pieces: Array) -> bool:
-    """Return whether the time along a path falls anywhere by more than MAX_TIME_FALL_S; then it is no valid law.
+    """Return whether the time along a path ever decreases by more than MAX_TIME_FALL_S, so that the law is not valid.
 
-    Pieces of a law are cubic, so that extrema of the time are at knots and at the zeros of its rate, a parabola. A
-    piece of higher degree counts as falling, because this method cannot check it.
+    The pieces of a law are cubic. The extrema of the time are therefore at knots and at the zeros of its rate, which is
+    a parabola. A piece of a higher degree counts as decreasing, because this method cannot check it.
     """
     highest = -math.inf
     for k in range(len(law_pieces)):
         p, span = law_pieces[k, 0], law_knots[k + 1] - law_knots[k]
         if p[4] != 0.0 or p[5] != 0.0:
             return True
-        a, b, c = 3.0 * p[3], p[2], p[1]  # rate a t^2 + 2 b t + c, zero where t = (-b -+ root) / a
+        a, b, c = 3.0 * p[3], p[2], p[1]  # the rate is a t^2 + 2 b t + c, which is zero where t = (-b -+ root) / a
         root = math.sqrt(max(0.0, b * b - a * c))
         q = -(b + math.copysign(root, b))
         one, other = q / a if a != 0.0 else math.inf, c / q if q != 0.0 else math.inf
@@ -254,7 +255,7 @@ def law_falls(law_knots: Array, law_pieces: Array) -> bool:
 
 @compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")
 def passing_time(law_knots: Array, law_pieces: Array, s: float, last: float) -> float:
-    """Return the time at which a law passes a time along the path [s], by bisection from its start to `last`."""
+    """Return the time at which a law passes a time along the path [s]. Found by bisection from its start to `last`."""
     low, high = law_knots[0], last
     for _ in range(BISECTIONS):
         middle = (low + high) / 2.0
@@ -266,7 +267,7 @@ def passing_time(law_knots: Array, law_pieces: Array, s: float, last: float) -> 
 
 
 def constant_law(rate: float, start: float = 0.0) -> Path:
-    """Return a law with a constant rate, from the time `start` along the path."""
+    """Return a law with a constant rate that starts at the time `start` along the path."""
     pieces = np.zeros((1, 1, 6))
     pieces[0, 0, :2] = start, rate
     return Path(np.array([0.0, LAST_PIECE_S]), pieces)

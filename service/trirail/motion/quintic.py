@@ -1,4 +1,4 @@
-"""Quintic paths through timed points, with given position, velocity and acceleration at each point."""
+"""Quintic paths through timed points, each with a given position, velocity and acceleration."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from trirail.motion.runs import ZERO_RATES, MotionState
 from trirail.quantities import apart, worded
 
 MAX_START_OFFSET = 1e-4
-"""Greatest distance between the start of a trajectory and the robot's pose [m, rad]."""
+"""Greatest allowed distance between the start of a trajectory and the robot's pose [m, rad]."""
 GO_THERE_HINT = "trirail follow --go-there or in Python follow(…, go_there=True)"
-"""Remedy for a robot that stands elsewhere, for messages."""
+"""Advice for messages if the robot is not at the start of a trajectory."""
 REST_VELOCITY = 1e-6
-"""Velocity at the ends of a trajectory that counts as rest [m/s, rad/s]."""
+"""Velocity below which the ends of a trajectory count as being at rest [m/s, rad/s]."""
 
 
 class Point(NamedTuple):
-    """Point of a timed trajectory: time [s], pose, velocity and acceleration of the platform."""
+    """Point of a timed trajectory: time [s], and the pose, velocity and acceleration of the platform."""
 
     t: float
     pose: Sequence[float]
@@ -32,9 +32,9 @@ class Point(NamedTuple):
 
 
 def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
-    """Return the path through points, from standstill at the pose `start` to standstill.
+    """Return the path through points. It begins at rest at the pose `start`, and ends at rest.
 
-    Missing velocities and accelerations are central differences of the neighbours, and zero at the ends.
+    Missing velocities and accelerations are central differences of the neighbouring points, and zero at the ends.
     """
     t = np.array([point.t for point in points])
     p = np.array([point.pose for point in points])
@@ -46,7 +46,7 @@ def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
 
 
 def quintic_between(begin: Point, end: Point) -> Path:
-    """Return the quintic between two complete points: the path of least squared jerk."""
+    """Return the quintic between two complete points, which has the least squared jerk."""
     t, p, v, a = (np.array(values) for values in zip(begin, end, strict=True))
     return _hermite_path(t, p, v, a)
 
@@ -65,7 +65,7 @@ def _hermite_path(t: Array, p: Array, v: Array, a: Array) -> Path:
 
 
 def _complete_derivatives(specified: Sequence[Sequence[float] | None], t: Array, values: Array) -> Array:
-    """Return derivatives at points (n, 3): as specified, else central differences, and zero at the ends."""
+    """Return the derivatives at points (n, 3): those specified, else central differences, and zero at the ends."""
     rates = np.zeros_like(values)
     if len(t) > 2:
         rates[1:-1] = (values[2:] - values[:-2]) / (t[2:] - t[:-2])[:, None]
@@ -76,9 +76,9 @@ def _complete_derivatives(specified: Sequence[Sequence[float] | None], t: Array,
 
 
 def check_ends(points: Sequence[Point], start: MotionState) -> None:
-    """Check that points begin at rest where the robot stands, and end at rest. Raises RefusedError.
+    """Check that points begin at rest where the robot is, and end at rest. Raises RefusedError.
 
-    An acceleration at either end is allowed; Checker.sample counts it as jerk over one cycle.
+    An acceleration at either end is allowed. Checker.sample counts it as a jerk over one cycle.
     """
     if not start.at_rest:
         raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it is at rest")

@@ -1,6 +1,6 @@
-"""Change of the rate at which a motion runs: pause, stop, resume, override.
+"""Changes of the rate at which a motion runs, for pause, stop, resume and override.
 
-The loop itself makes the change, with a bounded amount of sampling per cycle, so that braking needs no other process.
+The loop itself makes the change and samples a limited number of knots per cycle, so braking needs no other process.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from trirail.motion.schedule import Schedule
 from trirail.motion.time_scaling import CHANGE_SHARES, TimeScaling, greatest_rate
 
 MIN_KNOTS_PER_CYCLE = 8
-"""Least number of knots of a path that one cycle samples."""
+"""Least number of knots of a path that are sampled in one cycle."""
 KNOTS_PER_SECOND = 24_000.0
-"""Knots that one cycle samples per second of its period, because a longer cycle has more time."""
+"""Number of knots sampled in one cycle per second of its period, because a longer cycle has more time."""
 MAX_POSTPONEMENTS = 3
-"""Postponements of the start of a law, until there is time to sample all of it before it starts."""
+"""Greatest number of times that the start of a law is postponed so that all of it can be sampled before it starts."""
 
 
 class _Candidate(NamedTuple):
-    """Proposed law, and the parts of it that are not yet sampled."""
+    """Proposed law, and the parts of it that have not been sampled yet."""
 
     law: Path
     begins: int
-    """Cycle of the schedule in which it begins."""
+    """Cycle of the schedule in which the law begins."""
     ahead: list[tuple[float, float]]
-    """Parts to sample, the last one first."""
+    """Parts to sample, the last part first."""
 
 
 class RateChange:
     """Change of the last motion of a schedule to another rate, as early and as quickly as the limits allow.
 
-    The old law stays valid until a new one is proven. A change is improved while it runs: the slower the motion, the
-    more of the limits is free. A motion that has not begun yet begins at the new rate.
+    The old law stays valid until a new one has been proven. The change is improved while it is running, because a
+    slower motion leaves a larger part of the limits free. A motion that has not begun yet begins at the new rate.
     """
 
     def __init__(self, scaling: TimeScaling, schedule: Schedule, rate: float, period: float) -> None:
@@ -46,7 +46,7 @@ class RateChange:
         self.cycles = 0
         """Number of cycles used."""
         self.applied = False
-        """Whether the motion has a law to the new rate; further cycles only make the change quicker."""
+        """Whether the motion has a law that leads to the new rate. Further cycles only make the change quicker."""
         self._scaling = scaling
         self._schedule = schedule
         self._period = period
@@ -55,12 +55,12 @@ class RateChange:
 
     @property
     def lowers_rate(self) -> bool:
-        """Whether the rate falls and no law to it is applied yet; such a change does not wait for the planner."""
+        """Whether the rate falls and no law for it is applied yet. Such a change does not wait for the planner."""
         runs = self._schedule.runs
         return not self.applied and bool(runs) and self.rate < max(runs[-1].target, runs[-1].law_state.rate)
 
     def step(self) -> bool:
-        """Sample at most one part; return whether the change is complete."""
+        """Sample at most one part. Return whether the change is complete."""
         self.cycles += 1
         schedule = self._schedule
         if not schedule.runs:
@@ -85,11 +85,11 @@ class RateChange:
     # ------------------------------------------------------------------ inside
 
     def _is_over(self, run: Run) -> bool:
-        """Return whether the applied law has reached the rate, or slows down to a rate above zero."""
+        """Return whether the applied law has reached the rate, or is slowing down to a rate above zero."""
         return self.applied and (run.at_rest if self.rate == 0.0 else run.law_state.rate >= self._possible)
 
     def _restart(self) -> None:
-        """Start again with the motion as it is now."""
+        """Start again from the motion as it is now."""
         schedule = self._schedule
         self._motion_key = schedule.version, len(schedule.runs)
         self._possible = self.rate
@@ -105,7 +105,7 @@ class RateChange:
             self._unsampled = parts(run.path, law, 0.0, run.path.duration - self._first_s, self._knots)[::-1]
 
     def _search_greatest_rate(self, run: Run) -> None:
-        """Sample one part of the rest of the path; after the last part compute the greatest possible rate."""
+        """Sample one part of the remaining path. After the last part, compute the greatest possible rate."""
         if self._unsampled:
             first, until = self._unsampled.pop()
             result = self._scaling.sample(
@@ -119,7 +119,7 @@ class RateChange:
             self._unsampled = None
 
     def _check_candidate(self, run: Run) -> None:
-        """Sample one part of the proposed law; apply the law once all parts fit and its cycle has come."""
+        """Sample one part of the proposed law. Apply the law when all parts fit and its cycle has come."""
         cycle = self._schedule.cycle
         if self._candidate is not None and self._candidate.begins < cycle:  # too late: not all of it was sampled
             self._candidate = None
@@ -142,7 +142,7 @@ class RateChange:
         self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
 
     def _propose(self, run: Run) -> _Candidate | None:
-        """Return the law at the present share, late enough to sample all of it before its start; None without one."""
+        """Return the law at the current share, late enough to be sampled before it starts; None if there is none."""
         cycles = 1
         for _ in range(MAX_POSTPONEMENTS):
             at = run.law_state if cycles == 1 else run.law_state_at(run.time + (cycles - 1) * self._period)

@@ -15,12 +15,12 @@ from trirail.motion.paths import Path
 from trirail.motion.runs import NO_TOOL, MotionState, from_ruckig, repeat_tool
 
 JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
-"""Shares of the jerk limit that are tried in turn. Ruckig fails exactly at the border between two kinds of profile, for
-example for a distance of 2 a³ / j² from rest to rest; slightly less jerk has a solution there."""
+"""Shares of the jerk limit that are tried in turn. Ruckig fails exactly at the border between two kinds of profile,
+for example for a distance of 2 a³ / j² from rest to rest. With slightly less jerk, there is a solution."""
 PARALLEL_TOLERANCE = 1e-9
-"""Motion across a line that counts as rounding [m/s, m/s², m/s³; relative to the greatest if that is above 1]."""
+"""Motion across a line that is treated as rounding [m/s, m/s², m/s³]; relative to the greatest if that is above 1."""
 UNBOUNDED_LIMIT = 1e6
-"""Limit in place of infinity, for motions that no limit bounds [m/s, m/s², m/s³]."""
+"""Limit used in place of infinity, for motions that no limit bounds [m/s, m/s², m/s³]."""
 
 
 class Kinodynamic(NamedTuple):
@@ -34,7 +34,7 @@ class Kinodynamic(NamedTuple):
 def try_solve(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory) -> bool:
     """Return whether Ruckig finds a trajectory.
 
-    Some of its failures raise; code -101 raises ValueError because it is missing in Ruckig's own enum.
+    Some failures raise an exception; code -101 raises ValueError because it is missing in Ruckig's own enum.
     """
     try:
         return ruckig.calculate(request, trajectory) in (Result.Working, Result.Finished)
@@ -43,7 +43,7 @@ def try_solve(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory) -
 
 
 def solve_within(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory, jerk: Sequence[float]) -> None:
-    """Solve a request with these jerk limits, or slightly lower ones. Raises RefusedError."""
+    """Solve a request with the given jerk limits, or with slightly lower ones. Raises RefusedError."""
     for share in JERK_SHARES:
         request.max_jerk = [share * limit for limit in jerk]
         if try_solve(ruckig, request, trajectory):
@@ -54,7 +54,7 @@ def solve_within(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory
 
 
 class Solver:
-    """Path solver over Ruckig; the paths are not checked against the workspace."""
+    """Path solver based on Ruckig. It does not check the paths against the workspace."""
 
     def __init__(self) -> None:
         self._three_axes, self._one_axis = Ruckig(3), Ruckig(1)
@@ -67,9 +67,10 @@ class Solver:
         in_sliders: bool = False,
         tool: Sequence[float] = NO_TOOL,
     ) -> Path:
-        """Return the path to rest at a target, straight if it starts at rest. Raises RefusedError.
+        """Return the path to rest at a target. It is straight if it starts at rest. Raises RefusedError.
 
-        The target is slider positions with `in_sliders`, else the pose of a tool, (u, v) in the platform's frame [m].
+        With `in_sliders`, the target is slider positions. Otherwise it is the pose of a tool, (u, v) in the platform's
+        frame [m].
         """
         if start.at_rest:
             return self._straight(start.pose, target, limits, in_sliders, tool)
@@ -89,9 +90,9 @@ class Solver:
     def to_velocity_straight(
         self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic, tool: Sequence[float] = NO_TOOL
     ) -> Path:
-        """Return the path to a tool's velocity along one line if the motion begins on it; else as to_velocity.
+        """Return the path to a tool's velocity along one line if the motion begins on that line, else as to_velocity.
 
-        Ruckig's phase synchronisation fails on some of these paths, as in `_straight`.
+        Ruckig's phase synchronisation fails for some of these paths; see `_straight`.
         """
         direction = np.array(velocity if any(velocity) else start.velocity)
         farthest = float(np.abs(direction).max())
@@ -128,8 +129,8 @@ class Solver:
     ) -> Path:
         """Return the straight path from rest to rest: Ruckig's for the farthest coordinate, scaled for the others.
 
-        Ruckig's phase synchronisation fails where one coordinate would have to use less velocity, acceleration or jerk
-        than it uses alone; with it, 3 % of the goals left their line.
+        Ruckig's phase synchronisation fails if one coordinate would have to use less velocity, acceleration or jerk
+        than it would use alone. With it, 3 % of the goals left their line.
         """
         length = np.subtract(target, begin)
         farthest = float(np.abs(length).max())
@@ -161,13 +162,13 @@ class Solver:
 
 
 def _is_parallel(rows: Array, direction: Array) -> bool:
-    """Return whether all rows (..., 3) are parallel to a direction (3,), except for rounding."""
+    """Return whether all rows (..., 3) are parallel to a direction (3,), within rounding."""
     across = rows - (rows @ direction)[..., None] * direction / (direction @ direction)
     return bool(np.abs(across).max(initial=0.0) <= PARALLEL_TOLERANCE * max(1.0, float(np.abs(rows).max(initial=0.0))))
 
 
 def _request(start: MotionState, limits: Kinodynamic) -> InputParameter:
-    """Return Ruckig's input for a state of motion, without target and jerk limits."""
+    """Return Ruckig's input for a state of motion, without a target and without jerk limits."""
     request = InputParameter(3)
     request.current_position = list(start.pose)
     request.current_velocity = list(start.velocity)

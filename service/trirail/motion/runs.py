@@ -1,4 +1,4 @@
-"""Motion of the platform under way: a path, its law, and their state."""
+"""Motion of the platform that is under way: a path, its law, and the state of both."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from trirail.motion.paths import (
 
 ZERO_RATES = (0.0, 0.0, 0.0)
 NO_TOOL = (0.0, 0.0)
-"""The platform's centre as a tool [m]."""
+"""Tool that is the platform's centre itself [m]."""
 KNOT_TOLERANCE_S = 1e-9
-"""Distance below which two knots are merged."""
+"""Distance between two knots below which they are merged [s]."""
 
 
 class MotionState(NamedTuple):
-    """Pose, velocity and acceleration: x, y [m], phi [rad], and their derivatives."""
+    """Pose x, y [m], phi [rad], and its first and second derivatives with respect to time."""
 
     pose: Sequence[float]
     velocity: Sequence[float]
@@ -45,25 +45,25 @@ class MotionState(NamedTuple):
 
 
 def rest(pose: Sequence[float]) -> MotionState:
-    """Return the state of a robot that stands at a pose."""
+    """Return the state of a robot that is at rest at a pose."""
     return MotionState(tuple(pose), ZERO_RATES, ZERO_RATES)
 
 
 def tool_motion(motion: MotionState, tool: Sequence[float]) -> MotionState:
-    """Return the motion of a point of the platform, (u, v) in its frame [m], from that of the platform's centre."""
+    """Convert the motion of the platform's centre to that of a point of the platform, (u, v) in its frame [m]."""
     rows = np.array(motion, dtype=np.float64)
     transfer_to_point(rows, *tool)
     return MotionState(*rows.tolist())
 
 
 def centre_motion(motion: MotionState, tool: Sequence[float]) -> MotionState:
-    """Return the motion of the platform's centre from that of a point, (u, v) in the platform's frame [m]."""
+    """Convert the motion of a point of the platform, (u, v) in its frame [m], to that of the platform's centre."""
     u, v = tool
     return tool_motion(motion, (-u, -v))
 
 
 class LawState(NamedTuple):
-    """State of a law: time along the path [s], its rate, and the rate's change [1/s]."""
+    """State of a law: time along the path [s], the rate of that time, and the change of the rate [1/s]."""
 
     s: float
     rate: float
@@ -76,11 +76,11 @@ class Seam(NamedTuple):
     s: float
     """Time along the path [s]."""
     before: Path
-    """The path without the next goal; equal up to the seam."""
+    """Path without the next goal. It equals the whole path up to the seam."""
 
 
 class GoalSpan(NamedTuple):
-    """Start and end of the goal under way along the path [s], and its arrival in time of the law [s]."""
+    """Times along the path at which the current goal begins and ends [s], and the time of the law at its end [s]."""
 
     begun: float
     end: float
@@ -88,20 +88,20 @@ class GoalSpan(NamedTuple):
 
 
 class Run:
-    """A path and its law, advanced by one period per cycle."""
+    """Path and its law, which advance by one period per cycle."""
 
     def __init__(self, legs: Array, path: Path, law: Path, target: float) -> None:
         self.path = path
         self.law = law
         self.target = target
-        """Rate at the end of the law."""
+        """Rate at which the law ends."""
         self.time = 0.0
         """Time since the start of the law [s]."""
         self.furthest = np.full(1, -np.inf)
-        """Greatest time along the path that was commanded, (1,) [s]; it never falls."""
+        """Greatest time along the path that has been commanded, (1,) [s]. It never decreases."""
         self.seams: deque[Seam] = deque()
         self.marks: deque[GoalMarks] = deque()
-        """Marks of the goals on the path, in their order, from the goal under way on; empty where no goal has any."""
+        """Marks of the goals on the path, from the current goal on, in order; empty if no goal has marks."""
         self._begun = 0.0
         self._goal_span = GoalSpan(0.0, 0.0, 0.0)
         self._span_law: Path | None = None
@@ -112,7 +112,7 @@ class Run:
 
     @property
     def law_state(self) -> LawState:
-        """Present state of the law."""
+        """Current state of the law."""
         return self.law_state_at(self.time)
 
     def law_state_at(self, time: float) -> LawState:
@@ -123,18 +123,18 @@ class Run:
 
     @property
     def arrived(self) -> bool:
-        """Whether the end of the path is reached."""
+        """Whether the end of the path has been reached."""
         return self.law_state.s >= self.path.duration
 
     @property
     def at_rest(self) -> bool:
-        """Whether the motion stands: at the end of the path, or stopped by its law."""
+        """Whether the motion is at rest: at the end of the path, or because its law has stopped it."""
         at = self.law_state
         return at.s >= self.path.duration or (self.target == 0.0 and at.rate == at.change == 0.0)
 
     @property
     def goal_span(self) -> GoalSpan:
-        """Span of the goal under way, computed again after a change of law or goal."""
+        """Span of the current goal. It is computed again after a change of the law or of the goal."""
         begun, end = self._begun, self.seams[0].s if self.seams else self.path.duration
         if self._span_law is not self.law or self._goal_span[:2] != (begun, end):
             self._goal_span, self._span_law = GoalSpan(begun, end, self.arrival_at(end)), self.law
@@ -142,32 +142,32 @@ class Run:
 
     @property
     def remaining(self) -> float:
-        """Time to the end of the goal under way [s]; at full speed if the law stops before."""
+        """Time to the end of the current goal [s]. If the law stops before that, full speed is assumed."""
         _, end, arrival = self.goal_span
         return max(0.0, arrival - self.time if self.target else end - self.law_state.s)
 
     @property
     def end_time(self) -> float:
-        """Time of the law at which the motion stands [s]."""
+        """Time of the law at which the motion is at rest [s]."""
         stops = LAST_PIECE_S if self.target else float(self.law.knots[-2])
         return min(self.arrival_at(self.path.duration), stops)
 
     def arrival_at(self, s: float) -> float:
-        """Return the time of the law at a time along the path [s]; infinite if the motion stops before."""
+        """Return the time of the law at a time along the path [s]; infinite if the motion stops before that."""
         return arrival_time(self.law, self.target, s)
 
     @property
     def progress(self) -> float:
-        """Completed share of the time of the goal under way, 0 to 1."""
+        """Elapsed share of the duration of the current goal, from 0 to 1."""
         begun, end, _ = self.goal_span
         return max(0.0, min(1.0, (self.law_state.s - begun) / (end - begun))) if end > begun else 1.0
 
     def destination(self, near: Sequence[float]) -> Sequence[float]:
-        """Return the target pose of the goal under way, on the branch of the pose `near`."""
+        """Return the target pose of the current goal, on the branch of the pose `near`."""
         return self._end_of(self.seams[0].before if self.seams else self.path, near)
 
     def end(self, near: Sequence[float]) -> Sequence[float]:
-        """Return the pose at the end of the path, the last goal's target, on the branch of the pose `near`."""
+        """Return the pose at the end of the path, where the last goal ends, on the branch of the pose `near`."""
         return self._end_of(self.path, near)
 
     def _end_of(self, path: Path, near: Sequence[float]) -> Sequence[float]:
@@ -176,7 +176,7 @@ class Run:
         return [math.nan] * 3 if code else self._out[0].tolist()
 
     def copy(self) -> Run:
-        """Return an independent copy."""
+        """Return an independent copy of the run."""
         other = Run(self._legs, self.path, self.law, self.target)
         other.time, other.seams, other._begun = self.time, self.seams.copy(), self._begun
         other.furthest[:] = self.furthest
@@ -184,9 +184,9 @@ class Run:
         return other
 
     def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
-        """Continue from a time along the path with another path, which begins in the same state of motion.
+        """Continue with another path from a time along this one. Both have the same state of motion there.
 
-        Marks of the goals before that are behind `s` are cut off, unless the new goal is dropped again.
+        Marks of earlier goals that lie after `s` are disabled; they return if the new goal is dropped.
         """
         longer = joined([cut(self.path, s), path])
         self.marks.append(marks or GoalMarks())
@@ -195,7 +195,7 @@ class Run:
         self.path = longer
 
     def drop(self, number: int) -> None:
-        """Remove the goals after a seam, counted from zero."""
+        """Remove the goals after a seam. Seams are counted from zero."""
         self.path = self.seams[number].before
         while len(self.seams) > number:
             self.seams.pop()
@@ -203,7 +203,7 @@ class Run:
                 self.marks.pop()
 
     def pass_seams(self) -> int:
-        """Remove the seams that are passed; return their number, that of the goals that ended."""
+        """Remove the seams that have been passed. Return their number, which is the number of goals that have ended."""
         s, passed = self.law_state.s, 0
         while self.seams and s >= self.seams[0].s:
             self._begun = self.seams.popleft().s
@@ -213,11 +213,11 @@ class Run:
         return passed
 
     def change_law(self, law: Path, target: float) -> None:
-        """Continue from now with another law."""
+        """Continue with another law from now on."""
         self.law, self.target, self.time = law, target, 0.0
 
     def state(self, ahead: float, near: Sequence[float]) -> MotionState:
-        """Return the state of motion at a time from now [s]; NaN for an impossible pose."""
+        """Return the state of motion `ahead` seconds from now; NaN for an impossible pose."""
         self._near[:] = near
         code = platform_at_law_time(self._legs, *self.path, *self.law[:2], self.time + ahead, self._near, self._out)
         if code:
@@ -226,14 +226,14 @@ class Run:
 
 
 def nominal_motion(path: Path, s: float) -> MotionState:
-    """Return the motion at a time along a path [s] at full speed: of the platform's centre, or of the sliders."""
+    """Return the motion of the platform's centre or of the sliders at a time along a path [s], at full speed."""
     out = np.zeros((3, 3))
     path_motion(path.knots, path.pieces, path.tools, s, out)
     return MotionState(*out.tolist())
 
 
 def arrival_time(law: Path, target: float, s: float) -> float:
-    """Return the time at which a law to the rate `target` reaches a time along the path [s]; infinite if never."""
+    """Return when a law to the rate `target` reaches a time along the path [s]; infinite if it never does."""
     last = law.pieces[-1, 0]
     begins, at, rate = float(law.knots[-2]), float(last[0]), float(last[1])
     if at >= s:
@@ -242,7 +242,7 @@ def arrival_time(law: Path, target: float, s: float) -> float:
 
 
 def from_ruckig(trajectory: Trajectory, in_sliders: bool = False, tool: Sequence[float] = ZERO_RATES[:2]) -> Path:
-    """Convert a Ruckig trajectory to a path of a tool; between switching times it is cubic."""
+    """Convert a Ruckig trajectory to a path of a tool. The path is cubic between the switching times."""
     duration: float = trajectory.duration
     times = {0.0, duration}
     for profile in trajectory.profiles[0]:
@@ -267,7 +267,7 @@ def from_ruckig(trajectory: Trajectory, in_sliders: bool = False, tool: Sequence
 
 
 def repeat_tool(tool: Sequence[float], number: int) -> Array:
-    """Return the tools of a path of `number` pieces that all move one point of the platform [m]."""
+    """Return the tools of a path with `number` pieces that all move the same point of the platform [m]."""
     return np.tile(np.array(tool, dtype=np.float64), (number, 1)) if any(tool) else CENTRE_TOOLS
 
 
@@ -280,7 +280,7 @@ def law_from_ruckig(trajectory: Trajectory, target: float) -> Path:
 
 
 def joined(paths: Sequence[Path]) -> Path:
-    """Return the paths joined in sequence."""
+    """Return one path that consists of the given paths in sequence."""
     ends = np.cumsum([path.duration for path in paths])
     knots = [paths[0].knots, *(path.knots[1:] + end for path, end in zip(paths[1:], ends, strict=False))]
     tools = CENTRE_TOOLS
@@ -298,7 +298,7 @@ def cut(path: Path, s: float) -> Path:
 
 
 def stretched(path: Path, factor: float) -> Path:
-    """Return the same path `factor` times slower; derivatives too small for a float become zero."""
-    with np.errstate(over="ignore"):  # a factor of 1e62 has no fifth power
+    """Return the path made `factor` times slower. Derivatives that are too small for a float become zero."""
+    with np.errstate(over="ignore"):  # the fifth power of a factor of 1e62 overflows
         powers = factor ** np.arange(6.0)
     return path._replace(knots=path.knots * factor, pieces=path.pieces / powers)

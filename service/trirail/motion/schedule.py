@@ -1,4 +1,4 @@
-"""Schedule of the platform: the motion under way, the motions after it, and the commanded state."""
+"""Schedule of the platform: the motion under way, the motions that follow, and the commanded state."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from trirail.motion.runs import MotionState, Run
 class Schedule:
     """Sequence of runs.
 
-    Each cycle calls `advance`, or `begin_cycle` and `end_cycle` around its own evaluation of the motion.
+    Each cycle calls either `advance`, or `begin_cycle` and `end_cycle` before and after its own evaluation of the
+    motion.
     """
 
     def __init__(self, commanded: MotionState, period: float) -> None:
         self.motion = np.zeros((2, 3, 3))
-        """Commanded motion now and in the previous cycle (2, 3, 3): rows pose, velocity, acceleration."""
+        """Commanded motion now and in the previous cycle (2, 3, 3); rows are pose, velocity, acceleration."""
         self.commanded = commanded
         self.runs: deque[Run] = deque()
-        """The motion under way, and the motions that follow at its end."""
+        """Motion under way, and the motions that follow at its end."""
         self.cycle = 0
         self.version = 0
-        """Version of the motion under way; each change to its future increases it."""
+        """Version of the motion under way. Every change to its future increases the version."""
         self._period = period
 
     @property
@@ -39,49 +40,49 @@ class Schedule:
 
     @property
     def last(self) -> Run | None:
-        """Last run, at whose end the robot stands."""
+        """Last run. The robot is at rest at its end."""
         return self.runs[-1] if self.runs else None
 
     @property
     def remaining(self) -> float:
-        """Time until the robot stands [s]."""
+        """Time until the robot is at rest [s]."""
         return sum(run.end_time - run.time for run in self.runs)
 
     @property
     def ended(self) -> bool:
-        """Whether the end of the last path is reached, so that no goal can follow in motion."""
+        """Whether the end of the last path has been reached, so that no goal can follow in motion."""
         return len(self.runs) == 1 and self.runs[0].arrived
 
     @property
     def progress(self) -> tuple[float, float]:
-        """Completed share of the time of the goal under way, and the remaining time [s]."""
+        """Elapsed share of the duration of the current goal, and the remaining time [s]."""
         if not self.runs:
             return 0.0, 0.0
         *stops, run = self.runs
         return run.progress, run.remaining + sum(stop.end_time - stop.time for stop in stops)
 
     def replace_runs(self, runs: deque[Run]) -> None:
-        """Continue with other runs, which begin in the commanded state."""
+        """Continue with other runs, the first of which begins in the commanded state."""
         self.runs = runs
         self.version += 1
 
     def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
-        """Continue from a time along the last path with another path: Run.append."""
+        """Continue with another path from a time along the last path; see Run.append."""
         self.runs[-1].append(s, path, marks)
         self.version += 1
 
     def drop(self, number: int) -> None:
-        """Remove the goals after a seam of the last path: Run.drop."""
+        """Remove the goals after a seam of the last path; see Run.drop."""
         self.runs[-1].drop(number)
         self.version += 1
 
     def change_law(self, run: Run, law: Path, target: float) -> None:
-        """Continue a run with another law: Run.change_law."""
+        """Continue a run with another law; see Run.change_law."""
         run.change_law(law, target)
         self.version += 1
 
     def stop_on_path(self) -> None:
-        """Remove all later motions and goals; the motion under way then leads to none of them."""
+        """Remove all later motions and goals. The current motion then leads to none of them."""
         while len(self.runs) > 1:
             self.runs.pop()
         for run in self.runs:
@@ -90,7 +91,7 @@ class Schedule:
         self.version += 1
 
     def advance(self) -> int:
-        """Advance the commanded state by one period; return the number of seams passed."""
+        """Advance the commanded state by one period. Return the number of seams that were passed."""
         run = self.begin_cycle()
         if run is None:
             return 0
@@ -98,7 +99,7 @@ class Schedule:
         return self.end_cycle(run)
 
     def begin_cycle(self) -> Run | None:
-        """Begin the next cycle; return its run, advanced by one period."""
+        """Begin the next cycle. Return its run, which is advanced by one period."""
         self.cycle += 1
         if not self.runs:
             return None
@@ -107,14 +108,14 @@ class Schedule:
         return run
 
     def end_cycle(self, run: Run) -> int:
-        """Remove what ended in this cycle; return the number of seams passed."""
+        """Remove the goals and runs that ended in this cycle. Return the number of seams that were passed."""
         passed = run.pass_seams()
         if run.at_rest and len(self.runs) > 1:
             self.runs.popleft()
         return passed
 
     def ahead(self, cycles: int) -> Schedule:
-        """Return a copy of the schedule, advanced by a number of cycles."""
+        """Return a copy of the schedule that is advanced by a number of cycles."""
         other = Schedule(self.commanded, self._period)
         other.runs = deque(run.copy() for run in self.runs)
         other.cycle = self.cycle

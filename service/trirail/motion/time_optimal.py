@@ -1,17 +1,18 @@
-"""Interior-point method for the shortest time from rest to rest along a line, within limits up to jerk.
+"""Interior-point method for the fastest motion along a line from rest to rest, with limits up to the jerk.
 
-sigma(t), the completed share of the line, is a cubic B-spline with n intervals of h seconds; its jerk is constant in
-each of them. Of its n + 3 coefficients the first three are zero and the last three one; the others, and ln h, are
-unknown. Each coordinate of platform and sliders is a function q(sigma), and with v, a, j
-for the derivatives of sigma in time
+sigma(t), the completed share of the line, is a cubic B-spline with n intervals of h seconds. Its jerk is constant in
+each interval. Of its n + 3 coefficients, the first three are zero and the last three are one. The other coefficients
+and ln h are the unknowns. Each coordinate of the platform and the sliders is a function q(sigma). With v, a, j for the
+derivatives of sigma with respect to time, the rates of the coordinate are
 
     velocity q' v    acceleration q' a + q'' v²    jerk q' j + 3 q'' v a + q''' v³
 
-are, as shares f of their limits, kept between -1 and 1 at moments of every interval by a barrier:
-ln h / mu - sum ln (1 - f²) is minimised for ever smaller mu (Boyd and Vandenberghe, Convex Optimization, chapter 11).
-Newton's steps omit the second derivatives of f (Gauss-Newton), which leaves a banded system, bordered by ln h.
+Each rate divided by its limit is a share f. A barrier keeps f between -1 and 1 at several moments of every interval:
+the method minimises ln h / mu - sum ln (1 - f²) for ever smaller mu (Boyd and Vandenberghe, Convex Optimization,
+chapter 11). The Newton steps omit the second derivatives of f (Gauss-Newton). This leaves a banded system that is
+bordered by ln h.
 
-The functions are compiled. motion/feasibility.py checks the result, like every other path.
+The functions are compiled. motion/feasibility.py checks the result, as it checks every other path.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from trirail.kinematics.compiled import compiled
 __all__ = ["END_COEFFICIENTS", "limit_excess", "minimise_time", "spline_states"]
 
 COEFFICIENTS_PER_INTERVAL = 4
-"""Coefficients that a cubic B-spline depends on within an interval."""
+"""Number of coefficients that a cubic B-spline depends on within an interval."""
 END_COEFFICIENTS = 3
-"""Coefficients at each end that rest determines."""
+"""Number of coefficients at each end that are fixed because the motion is at rest there."""
 CHECKS_PER_INTERVAL = 2
-"""Parts of an interval; the limits hold at the ends of each."""
+"""Number of parts into which an interval is divided. The limits are enforced at the ends of each part."""
 FIRST_MU, LAST_MU, MU_FACTOR = 1e-2, 1e-5, 0.1
-"""Weights of the barrier against ln h; the last one costs less than a thousandth of the time."""
+"""Weights of the barrier relative to ln h. The last one lengthens the motion by less than a thousandth."""
 CENTRED_GAIN = 0.5
 """Predicted gain of a Newton step below which mu is reduced."""
 ARMIJO_SHARE = 1e-4
@@ -41,26 +42,30 @@ ARMIJO_SHARE = 1e-4
 MIN_STEP_SHARE = 1e-9
 """Share of a step below which the line search ends."""
 MAX_NEWTON_STEPS = 100
-"""Bound on Newton steps; about thirty are usual."""
+"""Greatest number of Newton steps; about thirty are usual."""
 DIAGONAL_FACTOR = 1.0 + 1e-12
-"""Growth of the diagonal that keeps the system positive definite despite rounding."""
+"""Factor on the diagonal that keeps the system positive definite despite rounding."""
 
 
 class Derivatives(NamedTuple):
-    """Derivatives of the barrier by the n - 3 free coefficients and by ln h."""
+    """Derivatives of the barrier with respect to the n - 3 free coefficients and to ln h."""
 
     band: Array
-    """Hessian by the coefficients, (n - 3, 4): column d holds the d-th entry to the left of the diagonal."""
+    """Hessian with respect to the coefficients, (n - 3, 4). Column d holds the d-th entry to the left of the
+    diagonal."""
     gradient: Array
     border: Array
-    """Mixed derivatives."""
+    """Mixed derivatives with respect to the coefficients and ln h."""
     by_time: Array
-    """First and second derivative by ln h."""
+    """First and second derivative with respect to ln h."""
 
 
 @compiled()
 def _coordinate_derivatives(samples: Array, sigma: float, q: Array) -> None:
-    """Write the first four derivatives of the coordinates by sigma, (m, 4); between samples the first is a cubic."""
+    """Write the first four derivatives of the coordinates with respect to sigma, (m, 4).
+
+    Between samples, the first derivative is a cubic.
+    """
     cells = len(samples) - 1
     k = min(max(int(sigma * cells), 0), cells - 1)
     u = sigma * cells - k
@@ -76,7 +81,7 @@ def _coordinate_derivatives(samples: Array, sigma: float, q: Array) -> None:
 
 @compiled()
 def _spline_weights(u: float, h: float, out: Array) -> None:
-    """Write the weights (4, 4) of an interval's coefficients in sigma, v, a, j, at a share u of the interval."""
+    """Write the weights (4, 4) that give sigma, v, a, j from the coefficients, at a share u of an interval."""
     w = 1.0 - u
     out[0, 0], out[0, 3] = w**3 / 6.0, u**3 / 6.0
     out[0, 1], out[0, 2] = (4.0 - 3.0 * u**2 * (2.0 - u)) / 6.0, (4.0 - 3.0 * w**2 * (2.0 - w)) / 6.0
@@ -103,7 +108,7 @@ def _spline_state(c: Array, k: int, weights: Array) -> tuple[float, float, float
 
 @compiled()
 def _rate_of_coordinate(q: Array, order: int, v: float, a: float, j: float, by: Array) -> float:
-    """Return velocity, acceleration or jerk (order 0, 1, 2) of a coordinate; write its gradient by sigma, v, a, j."""
+    """Return velocity, acceleration or jerk (order 0, 1, 2) of a coordinate; write its gradient in sigma, v, a, j."""
     value: float
     if order == 0:
         by[0], by[1], by[2], by[3] = q[1] * v, q[0], 0.0, 0.0
@@ -120,7 +125,10 @@ def _rate_of_coordinate(q: Array, order: int, v: float, a: float, j: float, by: 
 
 @compiled()
 def _add_derivatives(out: Derivatives, k: int, chain: Array, slope: Array, curvature: Array) -> None:
-    """Add derivatives by sigma, v, a, j, (4,) and (4, 4); `chain` (4, 5) holds their derivatives by the unknowns."""
+    """Add derivatives with respect to sigma, v, a, j, (4,) and (4, 4), to those with respect to the unknowns.
+
+    `chain` (4, 5) holds the derivatives of sigma, v, a, j with respect to the unknowns.
+    """
     free = len(out.gradient)
     of_x = np.empty(4)
     for x in range(COEFFICIENTS_PER_INTERVAL + 1):
@@ -154,7 +162,7 @@ def _add_derivatives(out: Derivatives, k: int, chain: Array, slope: Array, curva
 
 @compiled()
 def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives) -> float:
-    """Return the barrier and write its derivatives; infinite, without derivatives, if a limit is reached."""
+    """Return the barrier and write its derivatives. At a limit it is infinite, and no derivatives are written."""
     q, by = np.empty((len(limits), 4)), np.empty(4)
     weights, chain = np.empty((4, COEFFICIENTS_PER_INTERVAL)), np.empty((4, COEFFICIENTS_PER_INTERVAL + 1))
     slope, curvature = np.empty(4), np.empty((4, 4))
@@ -164,7 +172,7 @@ def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives
     for part in range(CHECKS_PER_INTERVAL + 1):
         _spline_weights(part / CHECKS_PER_INTERVAL, h, weights)
         chain[:, :COEFFICIENTS_PER_INTERVAL] = weights
-        # At the end of an interval only jerk differs from the start of the next one.
+        # At the end of an interval, only the jerk differs from that at the start of the next interval.
         lowest = 2 if part == CHECKS_PER_INTERVAL else 0
         for k in range(len(c) - END_COEFFICIENTS):
             sigma, v, a, j = _spline_state(c, k, weights)
@@ -197,7 +205,7 @@ def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives
 
 @compiled()
 def _factorise(band: Array) -> bool:
-    """Replace a banded matrix by its Cholesky factor; return whether it is positive definite."""
+    """Replace a banded matrix by its Cholesky factor. Return whether the matrix is positive definite."""
     for row in range(len(band)):
         for d in range(min(COEFFICIENTS_PER_INTERVAL - 1, row), -1, -1):
             rest = band[row, d]
@@ -214,7 +222,7 @@ def _factorise(band: Array) -> bool:
 
 @compiled()
 def _substitute(band: Array, x: Array) -> None:
-    """Solve for the right-hand side `x` in place, with the Cholesky factor `band`."""
+    """Solve the system for the right-hand side `x` in place, given its Cholesky factor `band`."""
     n = len(band)
     for row in range(n):
         for d in range(1, min(COEFFICIENTS_PER_INTERVAL - 1, row) + 1):
@@ -228,7 +236,7 @@ def _substitute(band: Array, x: Array) -> None:
 
 @compiled()
 def _newton_step(at: Derivatives, mu: float, step: Array) -> tuple[float, float]:
-    """Write the Newton step of the coefficients; return the step of ln h and the predicted gain, NaN if singular."""
+    """Write the Newton step for the coefficients; return the step in ln h and the predicted gain (NaN if singular)."""
     at.band[:, 0] *= DIAGONAL_FACTOR
     if not _factorise(at.band):
         return 0.0, math.nan
@@ -249,18 +257,18 @@ def _newton_step(at: Derivatives, mu: float, step: Array) -> tuple[float, float]
 
 @compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)")
 def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
-    """Minimise the time of a law within limits.
+    """Minimise the duration of a law within limits.
 
     Parameters
     ----------
     samples : (k + 1, m, 2)
-        First and second derivatives by sigma of m coordinates, evenly spaced from sigma = 0 to 1.
+        First and second derivatives of m coordinates with respect to sigma, evenly spaced from sigma = 0 to 1.
     limits : (m, 3)
         Velocity, acceleration and jerk limits of the coordinates.
     c : (n + 3,)
-        Coefficients of a law within the limits; improved in place.
+        Coefficients of a law within the limits. They are improved in place.
     h : float
-        Duration of its intervals [s].
+        Duration of the law's intervals [s].
 
     Returns
     -------
@@ -283,7 +291,7 @@ def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
             then = _barrier(samples, limits, trial, math.exp(log_h + share * of_time), derivatives)
             moved = then - now + share * of_time / mu <= -ARMIJO_SHARE * share * gain
             share /= 2.0
-        if not moved:  # the remaining gain is below rounding
+        if not moved:  # the remaining gain is smaller than rounding errors
             break
         c[:] = trial
         log_h += 2.0 * share * of_time
@@ -297,7 +305,7 @@ def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
 
 @compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)")
 def limit_excess(samples: Array, limits: Array, c: Array, h: float) -> float:
-    """Return the factor by which a law must be slowed to fit; parameters as of minimise_time."""
+    """Return the factor by which a law must be slowed to fit the limits. The parameters are those of minimise_time."""
     q, by, weights, most = np.empty((len(limits), 4)), np.empty(4), np.empty((4, COEFFICIENTS_PER_INTERVAL)), 0.0
     for part in range(CHECKS_PER_INTERVAL + 1):
         _spline_weights(part / CHECKS_PER_INTERVAL, h, weights)

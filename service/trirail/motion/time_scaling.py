@@ -1,4 +1,4 @@
-"""Laws of time along a path: constant rates, and changes of rate within the limits of sliders and platform."""
+"""Laws of time along a path: constant rates, and rate changes within the limits of sliders and platform."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from trirail.motion.runs import LawState, Run, arrival_time, law_from_ruckig
 
 FINE_RATIO, COARSE_RATIO = 0.88, 0.6
 CHANGE_SHARES = (*(FINE_RATIO**k for k in range(12)), *(FINE_RATIO**11 * COARSE_RATIO**k for k in range(1, 9)))
-"""Shares of the quickest change of rate, tried in turn. The smaller the share, the longer the stop; so the steps are
-fine for quick stops, and coarse where a robot with weak sliders needs any stop at all."""
+"""Shares of the quickest rate change, tried in turn. The smaller the share, the longer the stop. The steps are
+therefore fine for quick stops, and coarse where a robot with weak sliders needs any stop at all."""
 
 
 class TimeScaling:
@@ -38,13 +38,13 @@ class TimeScaling:
         return Run(self._legs, path, constant_law(rate), rate)
 
     def possible_rate(self, path: Path, rate: float, pose: Sequence[float]) -> float:
-        """Return the rate, lowered to the greatest at which a whole path fits the limits."""
+        """Return `rate`, or the greatest rate at which the whole path fits the limits if that is lower."""
         return (
             rate if rate <= 1.0 else greatest_rate(rate, self.sample(path, constant_law(1.0), 0.0, path.duration, pose))
         )
 
     def stop(self, run: Run, pose: Sequence[float], shares: Sequence[float]) -> Path | None:
-        """Return the law of a stop from a run's present state: the first of these shares that fits, or None."""
+        """Return the first law that stops a run within the limits, trying the shares in turn; None if no share fits."""
         for share in shares:
             law = self.ramp(run.law_state, 0.0, share)
             if (
@@ -59,13 +59,14 @@ class TimeScaling:
         return min(arrival_time(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
 
     def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
-        """Sample a path under a law: Checker.sample."""
+        """Sample a path under a law; see Checker.sample."""
         return self._checker.sample(path, law, first, until, pose)
 
     def ramp(self, at: LawState, rate: float, share: float) -> Path | None:
         """Return the law from a state to a rate, at a share of the quickest change; None if there is none.
 
-        A falling rate needs enough jerk to level out before it is negative, so a small share may have no law.
+        A falling rate needs enough jerk to level out before it becomes negative, so there may be no law for a small
+        share.
         """
         request = InputParameter(1)
         request.control_interface = ControlInterface.Velocity
@@ -81,9 +82,9 @@ class TimeScaling:
 
 
 def greatest_rate(rate: float, result: SampleResult) -> float:
-    """Return the rate, lowered to the greatest that a path allows, from its samples at the nominal rate.
+    """Return `rate`, or the greatest rate that a path allows if that is lower, given its samples at the nominal rate.
 
-    Every path fits at rate 1; a higher rate uses the part of the limits that the path leaves free.
+    Every path fits at rate 1. A higher rate uses the part of the limits that the path leaves free.
     """
     return (
         min(rate, max(1.0, 1.0 / result.slowdown_factor))

@@ -20,7 +20,7 @@ class NamedFrames:
         self._table = table
 
     def frame(self, name: str) -> Triple:
-        """Return a frame: x, y [m] and angle [rad] in the base frame. Raises RefusedError for an unknown name."""
+        """Return a frame: x, y [m] and angle [rad] in the base frame. Raises RefusedError if the name is unknown."""
         if name == BASE:
             return 0.0, 0.0, 0.0
         entry = self._table.work.get(name)
@@ -29,7 +29,7 @@ class NamedFrames:
         return entry
 
     def tool(self, tool: Tool | None) -> tuple[float, float]:
-        """Return a tool: a point of the platform in its own frame [m]. Raises RefusedError for an unknown name."""
+        """Return a tool as a point of the platform in its own frame [m]. Raises RefusedError if the name is unknown."""
         if not isinstance(tool, str):
             return tool or NO_TOOL
         entry = self._table.tool.get(tool)
@@ -39,7 +39,7 @@ class NamedFrames:
 
 
 def tool_point(tool: Tool | None) -> tuple[float, float]:
-    """Return the tool of a resolved goal, as a point of the platform [m].
+    """Return the tool of a resolved goal as a point of the platform [m].
 
     Raises
     ------
@@ -60,6 +60,6 @@ def rotated(x: float, y: float, angle: float) -> tuple[float, float]:
 
 
 def unknown_name(kind: str, name: str, known: Sequence[str]) -> RefusedError:
-    """Return the refusal of an unknown tool or frame, with the known names."""
+    """Return the error that refuses an unknown tool or frame and lists the known names."""
     there_are = f"there is {', '.join(known)}" if known else "there is none in [frames.tool]: give a point, [u, v]"
     return RefusedError(RefusalCode.UNKNOWN_FRAME, f"no {kind} {name!r}: {there_are}")

@@ -1,8 +1,8 @@
-"""Planning of motion after a moving target: smooth if the target is near, as fast as the limits allow if it is far.
+"""Planning of motion towards a moving target: smooth if the target is near, as fast as the limits allow if it is far.
 
-The planner assumes that the target keeps its velocity. In the target's moving frame, a meeting ends at rest at the
-origin; accelerations and jerks are the same there, and velocity limits are shifted by the target's velocity. Every path
-ends at rest, so that the robot brakes if no further targets arrive.
+The planner assumes that the target keeps its velocity. In the frame that moves with the target, the motion that meets
+it ends at rest at the origin. Accelerations and jerks are the same in this frame, and velocity limits are shifted by
+the velocity of the target. Every path ends at rest, so the robot brakes if no further target reports arrive.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from trirail.motion.ruckig_call import Kinodynamic, solve_within
 from trirail.motion.runs import ZERO_RATES, MotionState, cut, from_ruckig, joined, nominal_motion
 
 CATCH_UP_S = 0.05
-"""Least duration of a smooth meeting. The platform lags 0.15 a CATCH_UP_S² behind a target with acceleration a; a
-shorter duration follows more closely, but passes on more of the target's noise."""
+"""Shortest duration of a smooth motion to the target [s]. The platform lags 0.15 a CATCH_UP_S² behind a target with
+acceleration a. A shorter duration follows the target more closely, but passes on more of its noise."""
 SMOOTH_DURATION_FACTOR = 1.25
-"""Least duration of a smooth meeting relative to the quickest one; from rest to rest it then keeps the same
-acceleration and jerk limits with a margin of a fifth."""
+"""Shortest duration of a smooth motion to the target, relative to the quickest one. From rest to rest, it then keeps
+the same acceleration and jerk limits with a margin of one fifth."""
 MAX_REPLANS = 3
-"""Plans of a meeting, each with lower limits."""
+"""Greatest number of plans to meet a target, each with lower limits."""
 MAX_SHORTENINGS = 2
-"""Shortenings of a path that leaves the workspace."""
+"""Greatest number of times that a path which leaves the workspace is shortened."""
 BORDER_BISECTIONS = 12
-"""Bisection steps on the line to a target out of reach, for its last pose within reach."""
+"""Number of bisection steps on the line to a target out of reach, to find the last pose within reach."""
 
 
 class _TrackTarget(NamedTuple):
     """Target within reach: its pose at the start of the path, and its constant velocity.
 
-    `bound` names the limit beyond which the requested target is.
+    `bound` names the limit that the requested target exceeds.
     """
 
     pose: Sequence[float]
@@ -49,7 +49,7 @@ class _TrackTarget(NamedTuple):
 
 
 class Tracker:
-    """Planner of motion after moving targets, within the limits of platform and sliders."""
+    """Planner of motion towards moving targets, within the limits of platform and sliders."""
 
     def __init__(self, planner: PathPlanner) -> None:
         self._planner, self._platform = planner, planner.platform
@@ -57,24 +57,24 @@ class Tracker:
         self._ruckig = Ruckig(3)
 
     def follow(self, start: MotionState, pose: Sequence[float], velocity: Sequence[float], hold: float) -> Plan:
-        """Plan to meet a target, keep its velocity, and stop.
+        """Plan to meet a target, move at its velocity, and then stop.
 
-        A target that is too fast is followed as fast as the limits allow. A target out of reach is followed as far as
-        the border, on a straight line from the platform.
+        If the target is too fast, the platform follows it as fast as the limits allow. If the target is out of reach,
+        the platform follows it up to the border, on a straight line from the platform.
 
         Parameters
         ----------
         start : MotionState
             State of the platform's centre.
         pose, velocity : (3,)
-            The target at the start of the path [m, rad, m/s, rad/s].
+            Pose and velocity of the target at the start of the path [m, rad, m/s, rad/s].
         hold : float
-            Time after which the path brakes at the latest, even before it meets the target [s].
+            Time after which the path brakes, even if it has not met the target [s].
 
         Raises
         ------
         RefusedError
-            Even a brake would leave the workspace.
+            Even braking would leave the workspace.
         """
         for target in self._reachable_targets(start, pose, velocity):
             plan = self._plan_meeting(start, target, hold)
@@ -119,7 +119,7 @@ class Tracker:
         return border, bound
 
     def _plan_meeting(self, start: MotionState, target: _TrackTarget, hold: float) -> Plan | None:
-        """Plan a meeting with ever lower limits until it fits; None if it never does."""
+        """Plan to meet the target, with lower limits each time, until the path fits. Returns None if it never does."""
         shares = np.ones(3)
         for _ in range(MAX_REPLANS):
             limits = Kinodynamic(*(np.array(self._platform) * shares[:, None]).tolist())
@@ -147,9 +147,9 @@ class Tracker:
     def _follow_and_brake(
         self, start: MotionState, meeting: Path, velocity: Sequence[float], hold: float
     ) -> tuple[Path, SampleResult, str | None]:
-        """Return the path along a meeting, with the target until `hold` [s], then to rest; its samples; and a bound.
+        """Return the path that meets the target, moves with it until `hold` [s] and brakes; its samples; and a bound.
 
-        A path that would leave the workspace after the meeting brakes before that; only then the bound is named.
+        A path that would leave the workspace after the meeting brakes earlier. The bound is named only in this case.
         """
         way, until, bound = _extend_meeting(meeting, velocity, hold), hold, None
         for _ in range(MAX_SHORTENINGS + 1):
@@ -183,13 +183,13 @@ class Tracker:
 
 
 def _smooth_meeting(start: MotionState, pose: Sequence[float], velocity: Sequence[float], duration: float) -> Path:
-    """Return the path to a target in a duration [s] with the least mean square of jerk."""
+    """Return the path that reaches a target in a duration [s] with the least mean square of the jerk."""
     met = np.add(pose, duration * np.array(velocity))
     return quintic_between(Point(0.0, *start), Point(duration, met.tolist(), velocity, ZERO_RATES))
 
 
 def _extend_meeting(meeting: Path, velocity: Sequence[float], hold: float) -> Path:
-    """Return a path to a target, extended at the target's velocity until `hold` [s]."""
+    """Return a path to a target, continued at the target's velocity until `hold` [s]."""
     if meeting.duration >= hold:
         return meeting
     going = np.zeros((1, 3, 6))

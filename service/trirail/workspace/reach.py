@@ -1,4 +1,4 @@
-"""Reach from the present pose: outline of the permitted centres at its φ, and distance of φ from a singularity.
+"""Reach from the current pose: outline of the permitted centres at its φ, and distance of φ from a singularity.
 
 Both are cached for rounded poses, so that a recorder can compute them at any rate.
 """
@@ -29,7 +29,8 @@ class Reach:
 
     def __init__(self, geometry: Geometry, limits: Limits) -> None:
         self.outline = lru_cache(_CACHE_SIZE)(lambda step: _closed_outline(geometry, limits, int(step)))
-        """Closed outline of the permitted centres at φ = `step` ANGLE_STEP_RAD, (V + 1, 2) [m]; empty for none."""
+        """Closed outline of the permitted centres at φ = `step` ANGLE_STEP_RAD, (V + 1, 2) [m]; empty if there are
+        none."""
         self._singular = lru_cache(_CACHE_SIZE)(
             lambda x, y: np.array(singular_angles(geometry, (x * CENTRE_STEP_M, y * CENTRE_STEP_M)))[:, np.newaxis]
         )

@@ -62,16 +62,16 @@ def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = Non
 
 
 def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.float64]:
-    """Return the angle [rad] by which the platform can turn in either direction before it is singular, () or (N,).
+    """Return the angle [rad] by which the platform can turn in both directions before it is singular, () or (N,).
 
-    This is the distance in phi to the nearest of singular_angles at the pose's G. It is negative for a pose of another
-    aspect than that of (0, 0, 0). Like singular_angles it can miss two zeros of det J2 that are closer together than
-    its samples, which are at most 1.2° apart.
+    This is the distance in phi to the nearest of singular_angles at the pose's G. It is negative if the pose belongs to
+    an aspect other than that of (0, 0, 0). Like singular_angles, the function can miss two zeros of det J2 that are
+    closer together than its samples, which are at most 1.2° apart.
 
     Raises
     ------
     KinematicsError
-        As from inverse, and therefore also if J1 is singular.
+        Like inverse, and therefore also if J1 is singular.
     """
     at_home, _ = jacobians(geometry, HOME)
     j1, j2 = jacobians(geometry, pose)

@@ -1,4 +1,4 @@
-"""Limits of the robot's own reach that a pose exceeds."""
+"""Limits of the robot's own reach that a pose violates."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def reachable_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
 
 
 def permitted_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
-    """Return the part of the reachable polygon within limits.platform, to which the service limits the robot."""
+    """Return the part of the reachable polygon that is within limits.platform, the limits that the service enforces."""
     window = limits.platform
     if not window.phi[0] <= phi <= window.phi[1]:
         return EMPTY_POLYGON
@@ -169,7 +169,7 @@ def _clip(polygon: Array, half_planes: Array) -> Array:
 
 
 def _last_nonempty_phi(slice_at: Callable[[float], Array], nonempty: float, empty: float) -> float:
-    """Return the phi nearest to `empty` with a non-empty slice, by bisection."""
+    """Return the phi closest to `empty` at which the slice is not empty, found by bisection."""
     while abs(empty - nonempty) > 1e-12:
         middle = (nonempty + empty) / 2.0
         nonempty, empty = (middle, empty) if len(slice_at(middle)) else (nonempty, middle)
@@ -177,7 +177,7 @@ def _last_nonempty_phi(slice_at: Callable[[float], Array], nonempty: float, empt
 
 
 def _golden_section_maximum(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Return argument and value of a function's only maximum in an interval, by golden-section search."""
+    """Return argument and value of the only maximum of a function in an interval, found by golden-section search."""
     inner = high - GOLDEN_RATIO * (high - low), low + GOLDEN_RATIO * (high - low)
     values = function(inner[0]), function(inner[1])
     while high - low > 1e-10:

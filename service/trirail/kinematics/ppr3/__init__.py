@@ -1,1 +1,1 @@
-"""The 3-PPR mechanism: the cross slide rides on the driven carriage and keeps its direction, the pivot on top of it."""
+"""3-PPR mechanism: the cross slide is on the driven carriage and keeps its direction, and the pivot is on top of it."""

@@ -1,4 +1,4 @@
-"""The closed leg of the 3-PPR mechanism, by the recursion; compiled."""
+"""Closed leg of the 3-PPR mechanism, compiled and based on the recursion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["close", "demand", "line"]
 
 @compiled()
 def close(leg: Array, pose: Vector) -> ClosedLeg:
-    """Solve the loop, linear once phi_32 = phi: how far must rail and cross slide move to bring G to the pose?"""
+    """Solve the loop, linear with phi_32 = phi, for the positions of rail and cross slide that bring G to the pose."""
     first = link(BASE, leg, 0, 0.0)
     second = link(first, leg, 1, 0.0)
     third = link(second, leg, 2, pose[2])
@@ -28,9 +28,9 @@ def close(leg: Array, pose: Vector) -> ClosedLeg:
 
 @compiled()
 def line(leg: Array, slider: float) -> SlideLine:
-    """Return the cross slide as its leg's slider leads it.
+    """Return the line of the cross slide for the position of its slider.
 
-    It keeps its normal, and the arm e from G to the pivot turns: n . G = n . carriage - n . R(phi) e.
+    The cross slide keeps its normal while the arm e from G to the pivot turns: n . G = n . carriage - n . R(phi) e.
     """
     first = link(BASE, leg, 0, slider)
     second = link(first, leg, 1, 0.0)
@@ -43,5 +43,5 @@ def line(leg: Array, slider: float) -> SlideLine:
 
 @compiled()
 def demand(line: SlideLine, cosine: float, sine: float) -> tuple[Vector, Vector, float]:
-    """Return normal and direction of the cross slide, and the n . G that the leg demands at phi."""
+    """Return the normal and the direction of the cross slide, and the n . G that the leg requires at phi."""
     return line.n, line.u, line.a * cosine + line.b * sine - line.c

@@ -26,16 +26,16 @@ __all__ = ["CrossLeg"]
 
 @dataclass(frozen=True, slots=True)
 class CrossLeg:
-    """One leg: a slider on a rail of the base carries a cross slide, on which a pivot of the platform rides.
+    """Leg with a slider on a rail of the base. It carries a cross slide, on which a pivot of the platform moves.
 
-    `anchor` is a point of the rail, `rail_angle` its direction, and the slider reads zero at `home` from the anchor.
-    `pivot` is in the platform's frame, `slide_angle` the direction of the cross slide in the base frame, at right
-    angles to the rail if it is None.
+    `anchor` is a point of the rail and `rail_angle` is its direction. The slider reads zero at the distance `home` from
+    the anchor. `pivot` is in the platform's frame, and `slide_angle` is the direction of the cross slide in the base
+    frame; None means at right angles to the rail.
     """
 
     KIND: ClassVar[str] = "3-PPR"
-    # To move the anchor is to change `home`, and the zero of lambda_21: it is not sought. Where the cross slide is at
-    # right angles to its rail, poses do not tell the rail's angle: it is left open.
+    # Moving the anchor only changes `home` and the zero of lambda_21, so it is not calibrated. If the cross slide is at
+    # right angles to its rail, the poses do not determine the angle of the rail, which is left open.
     PARAMETERS: ClassVar[tuple[str, ...]] = ("rail_angle", "home", "pivot in x", "pivot in y", "slide_angle")
     DOUBT: ClassVar[tuple[float, ...]] = (0.05, 0.01, 0.01, 0.01, 0.05)
     CROSS: ClassVar[str] = "cross slide"
@@ -56,7 +56,7 @@ class CrossLeg:
 
     @property
     def parallel_angle(self) -> None:
-        """None: cross slide and rail keep the angle between them."""
+        """None, because cross slide and rail keep the angle between them."""
         return None
 
     @property
@@ -66,15 +66,15 @@ class CrossLeg:
 
     @property
     def crossing(self) -> CrossSlide:
-        """How to draw the cross slide: on the carriage, which the pivot leaves along it."""
+        """Position and direction of the cross slide on the carriage, for drawings."""
         return CrossSlide(self.pivot, self.cross_angle, False)
 
     def keys(self) -> dict[str, Any]:
-        """Return its numbers by the keys of [[geometry.leg]] [m, rad]."""
+        """Return the numbers of the leg, by their keys in [[geometry.leg]] [m, rad]."""
         return asdict(self)
 
     def check(self, name: str) -> None:
-        """Refuse what is not finite, or a cross slide along its rail. Raises KinematicsError."""
+        """Raise KinematicsError if a number is not finite, or the cross slide is parallel to its rail."""
         check_finite(self, name)
         if abs(math.sin(self.cross_angle - self.rail_angle)) <= PARALLEL:
             raise KinematicsError(
@@ -85,7 +85,7 @@ class CrossLeg:
             )
 
     def packed(self) -> Array:
-        """Return the leg as joints for trirail.kinematics.recursion: shape (4, 13)."""
+        """Return the leg as joints for trirail.kinematics.recursion, with shape (4, 13)."""
         start = np.array([*self.anchor, 0.0]) + self.home * theta(self.rail_angle)[0]
         # Each prismatic joint's z axis is its direction; THETA_1 takes x to z, and its transpose back.
         return serial_leg(
@@ -98,7 +98,7 @@ class CrossLeg:
         )
 
     def travels(self, x: Array, y: Array, phi: Array) -> tuple[Array, Array]:
-        """Return lambda_10 and lambda_21 at poses, arrays of one shape [m]."""
+        """Return lambda_10 and lambda_21 at poses, as arrays of one shape [m]."""
         cos, sin = np.cos(phi), np.sin(phi)
         way_x = x + cos * self.pivot[0] - sin * self.pivot[1] - self.anchor[0]
         way_y = y + sin * self.pivot[0] + cos * self.pivot[1] - self.anchor[1]
@@ -132,7 +132,7 @@ class CrossLeg:
         )
 
     def parameter_derivatives(self, first: CrossLeg, phi: Array, slider: Array, passive: Array) -> Array:  # noqa: ARG002
-        """Return how F changes with corrections: (N, 5).
+        """Return the derivatives of F by corrections to the leg: (N, 5).
 
         With n = (sin, -cos)(cross_angle), F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R pivot) = 0.
         """

@@ -1,1 +1,1 @@
-"""The 3-PRP mechanism of the paper: the pivot rides on the driven carriage, the cross slide turns with the platform."""
+"""3-PRP mechanism of the paper: the pivot is on the driven carriage, and the cross slide turns with the platform."""

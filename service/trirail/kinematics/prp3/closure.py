@@ -1,4 +1,4 @@
-"""The closed leg of the 3-PRP mechanism, by the recursion; compiled."""
+"""Closed leg of the 3-PRP mechanism, compiled and based on the recursion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["close", "demand", "line"]
 
 @compiled()
 def close(leg: Array, pose: Vector) -> ClosedLeg:
-    """Solve (11), linear once phi_21 = phi by (8): how far must rail and edge move to bring G to the pose?"""
+    """Solve (11), linear with phi_21 = phi by (8), for the positions of rail and edge that bring G to the pose."""
     first = link(BASE, leg, 0, 0.0)
     third = link(link(first, leg, 1, pose[2]), leg, 2, 0.0)
     rail, edge = first.q[2], third.q[2]
@@ -28,9 +28,9 @@ def close(leg: Array, pose: Vector) -> ClosedLeg:
 
 @compiled()
 def line(leg: Array, slider: float) -> SlideLine:
-    """Return the edge, not yet turned, and the pin through which its leg's slider makes it pass.
+    """Return the edge before the platform turns, and the pin through which the slider makes the edge pass.
 
-    The normal turns with the platform, n . (pin - G) = c at every phi.
+    The normal turns with the platform, and n . (pin - G) = c at every phi.
     """
     first = link(BASE, leg, 0, slider)
     third = link(link(first, leg, 1, 0.0), leg, 2, 0.0)
@@ -43,7 +43,7 @@ def line(leg: Array, slider: float) -> SlideLine:
 
 @compiled()
 def demand(line: SlideLine, cosine: float, sine: float) -> tuple[Vector, Vector, float]:
-    """Return normal and direction of the edge at phi, and the n . G that the leg demands there."""
+    """Return the normal and the direction of the edge at phi, and the n . G that the leg requires there."""
     n = add(scale(cosine, line.n), scale(sine, line.u))
     u = subtract(scale(cosine, line.u), scale(sine, line.n))
     return n, u, dot(n, line.point) - line.c

@@ -24,16 +24,16 @@ __all__ = ["Leg"]
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One leg: a slider on a rail of the base carries a pin, along which an edge of the platform slides.
+    """Leg with a slider on a rail of the base. The slider carries a pin, along which an edge of the platform slides.
 
-    `anchor` is a point of the rail, `rail_angle` its direction, and the slider reads zero at `home` from the
-    anchor. `edge_point` is the point of the platform that is at the pin when lambda_32 is zero, `edge_angle`
+    `anchor` is a point of the rail and `rail_angle` is its direction. The slider reads zero at the distance `home` from
+    the anchor. `edge_point` is the point of the platform that is at the pin when lambda_32 is zero, and `edge_angle` is
     the direction of the edge; both are in the platform's frame.
     """
 
     KIND: ClassVar[str] = "3-PRP"
-    # To move the anchor along its rail is to change `home`, and to move the edge point along its edge only moves the
-    # zero of lambda_32: neither is sought.
+    # Moving the anchor along its rail only changes `home`, and moving the edge point along its edge only changes the
+    # zero of lambda_32. Neither is therefore calibrated.
     PARAMETERS: ClassVar[tuple[str, ...]] = (
         "anchor across the rail",
         "rail_angle",
@@ -57,7 +57,7 @@ class Leg:
 
     @property
     def parallel_angle(self) -> float:
-        """A phi at which the edge is parallel to the rail; others are pi apart [rad]."""
+        """Angle phi at which the edge is parallel to the rail, as it is every pi [rad]."""
         return self.rail_angle - self.edge_angle
 
     @property
@@ -67,15 +67,15 @@ class Leg:
 
     @property
     def crossing(self) -> CrossSlide:
-        """How to draw the edge: on the platform, from its edge point."""
+        """Position and direction of the edge on the platform, for drawings."""
         return CrossSlide(self.edge_point, self.edge_angle, True)
 
     def keys(self) -> dict[str, Any]:
-        """Return its numbers by the keys of [[geometry.leg]] [m, rad]."""
+        """Return the numbers of the leg, by their keys in [[geometry.leg]] [m, rad]."""
         return asdict(self)
 
     def check(self, name: str) -> None:
-        """Refuse what is not finite, or singular at the pose (0, 0, 0). Raises KinematicsError."""
+        """Raise KinematicsError if a number is not finite, or the leg is singular at the pose (0, 0, 0)."""
         check_finite(self, name)
         if abs(math.sin(self.edge_angle - self.rail_angle)) <= PARALLEL:
             raise KinematicsError(
@@ -86,7 +86,7 @@ class Leg:
             )
 
     def packed(self) -> Array:
-        """Return the leg as joints for trirail.kinematics.recursion: shape (4, 13)."""
+        """Return the leg as joints for trirail.kinematics.recursion, with shape (4, 13)."""
         start = np.array([*self.anchor, 0.0]) + self.home * theta(self.rail_angle)[0]
         to_centre = theta(self.edge_angle) @ [-self.edge_point[0], -self.edge_point[1], 0.0]
         return serial_leg(
@@ -99,7 +99,7 @@ class Leg:
         )
 
     def travels(self, x: Array, y: Array, phi: Array) -> tuple[Array, Array]:
-        """Return lambda_10 and lambda_32 at poses, arrays of one shape [m], by (11)."""
+        """Return lambda_10 and lambda_32 at poses, as arrays of one shape [m], by (11)."""
         cos, sin = np.cos(phi), np.sin(phi)
         (u, v), (anchor_x, anchor_y) = self.edge_point, self.anchor
         way_x, way_y = x + cos * u - sin * v - anchor_x, y + sin * u + cos * v - anchor_y
@@ -112,8 +112,8 @@ class Leg:
     def row(self, pose: tuple[float, float, float]) -> tuple[float, Array]:
         """Return the leg's diagonal element of J1 and its row (3,) of J2, (16), up to a common sign.
 
-        From (11) without lambda_32: the sine between the edge and the way from the slider's pin to
-        G + R(phi) edge_point stays zero.
+        They follow from (11) after eliminating lambda_32: the sine between the edge and the line from the slider's pin
+        to G + R(phi) edge_point stays zero.
         """
         x, y, phi = pose
         edge = theta(phi + self.edge_angle)[:2, :2]  # along the edge, and across it
@@ -146,9 +146,9 @@ class Leg:
         )
 
     def parameter_derivatives(self, first: Leg, phi: Array, slider: Array, passive: Array) -> Array:
-        """Return how F changes with corrections to `first`: (N, 5).
+        """Return the derivatives of F by corrections to `first`: (N, 5).
 
-        With n the normal of the edge, F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R edge_point) = 0.
+        With n as the normal of the edge, F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R edge_point) = 0.
         """
         psi = phi + self.edge_angle
         return np.stack(

@@ -1,1 +1,1 @@
-"""Planning of each kind of goal, one file per kind; goal_planner imports all of them."""
+"""Planning of each kind of goal, with one module per kind. goal_planner imports all of them."""

@@ -1,4 +1,4 @@
-"""Refusal of pose names that the gateway could not replace; the gateway keeps the poses."""
+"""Refusal of goals with an unknown pose name. The gateway keeps the named poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class NamedMotion(GoalMotion[NamedGoal]):
 
     @staticmethod
     def resolve(goal: NamedGoal, frames: NamedFrames, source: PoseSource) -> NoReturn:
-        """Refuse the goal: the gateway has replaced every known name by its pose."""
+        """Refuse the goal, because the gateway has already replaced every known name by its pose."""
         del frames, source
         text = f"no pose {goal.name!r}: `trirail poses` lists the saved poses"
         raise RefusedError(RefusalCode.UNKNOWN_POSE, text)

@@ -1,4 +1,4 @@
-"""Planning of pose goals: straight in pose space from rest."""
+"""Planning of pose goals. From rest, the path is straight in pose space."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class PoseMotion(GoalMotion[PoseGoal]):
         return structs.replace(goal, **there, tool=frames.tool(goal.tool), frame=BASE)
 
     def check(self, goal: PoseGoal) -> None:
-        """Refuse own limits above the platform's. Raises RefusedError."""
+        """Refuse limits of the goal that exceed those of the platform. Raises RefusedError."""
         self._limits(goal)
 
     def plan(self, goal: PoseGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan to rest at the pose."""
+        """Plan a motion that ends at rest at the pose."""
         del rate, begins
         return self._planner.plan_to_pose(
             start, (goal.x, goal.y, goal.phi), goal.speed, self._limits(goal), tool_point(goal.tool)

@@ -1,4 +1,4 @@
-"""Planning of slider goals: straight in slider space from rest."""
+"""Planning of slider goals. From rest, the path is straight in slider space."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from trirail.wire.kinds.sliders import SlidersGoal
 
 
 class SlidersMotion(GoalMotion[SlidersGoal]):
-    """Motion to positions of the sliders."""
+    """Motion to given slider positions."""
 
     kind = SlidersGoal
     examples = (SlidersGoal((0.01, 0.0, 0.0)),)
 
     def plan(self, goal: SlidersGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan to rest at the positions."""
+        """Plan a motion that ends at rest at the slider positions."""
         del rate, begins
         return self._planner.plan_to_sliders(start, goal.position, goal.speed)

@@ -12,7 +12,7 @@ from trirail.wire.packed_trajectory import PackedTrajectory, packed
 
 
 class PackedMotion(GoalMotion[TrajectoryGoal]):
-    """Packing of a trajectory before it is planned."""
+    """Trajectory that is packed before it is planned."""
 
     kind = TrajectoryGoal
 
@@ -24,7 +24,7 @@ class PackedMotion(GoalMotion[TrajectoryGoal]):
 
 
 class TrajectoryMotion(GoalMotion[PackedTrajectory]):
-    """Motion along timed points, quintic between them."""
+    """Motion through timed points, with a quintic between each two of them."""
 
     kind = PackedTrajectory
 
@@ -32,5 +32,5 @@ class TrajectoryMotion(GoalMotion[PackedTrajectory]):
         """Plan through the points."""
         del rate, begins
         points = [Point(*row) for row in goal.points]
-        first = points[0].t  # a float resolves times since 1970 to 0.2 µs only; differences are exact
+        first = points[0].t  # a float resolves times since 1970 only to 0.2 µs, but differences are exact
         return self._planner.plan_trajectory(start, [p._replace(t=p.t - first) for p in points], goal.stretch)

@@ -12,7 +12,7 @@ from trirail.wire.kinds.velocity import VelocityGoal
 
 
 class VelocityMotion(GoalMotion[VelocityGoal]):
-    """Motion at a velocity, and to rest after its time-out."""
+    """Motion at a constant velocity, which ends at rest after the time-out."""
 
     kind = VelocityGoal
 
@@ -27,7 +27,7 @@ class VelocityMotion(GoalMotion[VelocityGoal]):
         self._planner.check_velocity((goal.x, goal.y, goal.phi))
 
     def plan(self, goal: VelocityGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan to the velocity, and to rest."""
+        """Plan a motion to the velocity, and then to rest."""
         del rate, begins
         velocity = goal.x, goal.y, goal.phi
         return self._planner.plan_jog(start, velocity, goal.timeout, tool_point(goal.tool))
