@@ -1,4 +1,4 @@
-"""Check before motion whether a pose is reachable or a file can be followed; the service makes the final decision."""
+"""Check before a motion whether a pose is reachable or a file can be followed; the service decides in the end."""
 
 from __future__ import annotations
 
