@@ -36,7 +36,7 @@ HAPPENED = "happened"
 MEASURED = "measured"
 """Key of a process's measurements, for the metrics."""
 LOG_WITHIN = 0.05
-"""Longest wait for a supervisor whose own output is blocked, before a log line is dropped [s]."""
+"""Time after which a log line is dropped because the supervisor's own output is blocked [s]."""
 DRIVES: Final = "drives"
 """Name of the simulated drives' process, and of its socket in the service's folder of sockets."""
 DRIVES_WITHIN: Final = 60.0
@@ -63,7 +63,7 @@ class Child:
     def report_ready(self, content: object) -> None:
         """Report that the process is up.
 
-        The first heartbeat precedes the message, so that a hang right after it is detected.
+        The process sends its first heartbeat before this message, so that a hang right after the message is detected.
         """
         if self.name in PROCESSES:
             self.heartbeats.heart(self.name).beat()
@@ -83,7 +83,7 @@ class Child:
             self._send({HAPPENED: event})
 
     def report_measurements(self, content: msgspec.Struct) -> None:
-        """Report measurements, unless the pipe is full: new ones follow in a second."""
+        """Report measurements, or drop them if the pipe is full; new ones follow in a second."""
         line = msgspec.json.encode({MEASURED: content}) + b"\n"
         if len(line) <= select.PIPE_BUF and select.select([], [self._pipe], [], 0.0)[1]:
             with suppress(BrokenPipeError):

@@ -41,10 +41,8 @@ from trirail.wire.packets import (
 from trirail.wire.records import last_cycle
 
 GATHER = 0.14
-"""Pause in which packets accumulate before they are read [s]: waking up for each costs more than processing it.
-
-Killing the recorder loses less than 0.2 s of data: the packets of this pause, and the loop's batch.
-"""
+"""Pause in which packets accumulate before they are read [s]; waking up for each packet costs more than processing it.
+Killing the recorder loses less than 0.2 s of data: the packets of this pause and the loop's batch."""
 
 NOT_FOR_OTHERS = 0o027
 """Umask of recordings: the owner may write them, the group may read them."""

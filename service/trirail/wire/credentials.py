@@ -25,7 +25,7 @@ class Credentials(NamedTuple):
     name: str
     """Common name of the certificate: a user's or a robot's; "" if it has none."""
     expires: datetime
-    """Expiry of the certificate or that of its authority, whichever is first."""
+    """Expiry of the certificate or of its authority, whichever is earlier."""
     addresses: tuple[str, ...]
     """Host names and IP addresses at which clients connect to a robot; empty for a user."""
     serves: bool = False
@@ -37,7 +37,7 @@ class Credentials(NamedTuple):
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
-        """Paths of the authority's certificate, the own certificate, and its private key."""
+        """Paths of the authority's certificate, this certificate and its private key."""
         authority, certificate, key = self.copies or (self.folder / name for name in (AUTHORITY, CERTIFICATE, KEY))
         return authority, certificate, key
 
@@ -120,7 +120,7 @@ class Admission(NamedTuple):
 
 
 def check_private(key_file: Path) -> None:
-    """Raise ServiceError if a private key is readable by others than its owner, or than its group if root owns it."""
+    """Raise ServiceError if users other than the owner, or than the group of a key of root, can read a private key."""
     status = key_file.stat()
     if status.st_mode & (0o037 if status.st_uid == 0 else 0o077):
         raise ServiceError(
