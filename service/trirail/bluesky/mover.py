@@ -115,7 +115,7 @@ class Mover:
                 if self.pose is not None:
                     yield self.pose
         finally:
-            move.end.cancel()  # without effect on a set that has ended
+            move.end.cancel()  # has no effect on a set that has ended
         move.end.result()
 
     async def stop(self, success: bool) -> None:
@@ -141,7 +141,7 @@ class Mover:
         finally:
             ended.cancel()
             lost.cancel()
-            await asyncio.gather(ended, lost, return_exceptions=True)  # neither outlives this call
+            await asyncio.gather(ended, lost, return_exceptions=True)  # neither task may outlive this call
 
     def _start_task(self, delay: float = 0.0) -> None:
         task = asyncio.create_task(self._send_later(self._gathered, delay))
@@ -171,7 +171,7 @@ class Mover:
             result = await self.settle(motion.goal)
         except Exception as error:  # noqa: BLE001 - as above
             if self._motion is motion:
-                self._motion = None  # nobody knows whether it is still under way
+                self._motion = None  # it is unknown whether the goal is still in progress
             end_all(motion.moves, error)
             return
         motion.finish(result)
@@ -223,7 +223,7 @@ async def cancel(goal: AsyncGoalHandle) -> None:
     except RefusedError as error:
         if error.code != RefusalCode.NO_GOAL:
             raise
-    with contextlib.suppress(TimeoutError):  # its end is reported with the standstill
+    with contextlib.suppress(TimeoutError):  # the end is reported when the robot is at rest
         await goal.wait(SILENCE_S)
 
 

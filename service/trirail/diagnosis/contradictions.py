@@ -126,7 +126,7 @@ def _too_fast(config: Config, per_pose: NDArray[np.float64], quantity: str) -> I
 
 
 def _windows(config: Config) -> Iterator[Check]:
-    """Check that the following-error and in-position windows are larger than a cycle's motion, but far below the travel."""
+    """Check the following-error and in-position windows: more than a cycle's motion, far less than the travel."""
     slider, drives, settling = config.limits.slider, config.drives, config.limits.in_position
     step, travel = slider.fastest * config.period, min(high - low for low, high in slider.positions)
     for key, window in (

@@ -70,7 +70,7 @@ class Child:
         self._send(content)
 
     def _send(self, content: object) -> None:
-        with suppress(BrokenPipeError):  # the supervisor was killed: the loop ends by itself, and the others with it
+        with suppress(BrokenPipeError):  # the supervisor was killed; the loop then ends by itself, and the others with it
             os.write(self._pipe, msgspec.json.encode(content) + b"\n")
 
     def report_compiling(self, function: str) -> None:
@@ -158,7 +158,7 @@ def _plan(child: Child) -> int:
         while True:
             heart.beat()
             poll.poll(BEAT_EVERY * 1e3)
-            newest = None  # nobody waits for earlier requests any more
+            newest = None  # no process waits for earlier requests any more
             while (packet := link.receive()) is not None:
                 newest = packet
             if newest is not None:

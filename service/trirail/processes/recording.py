@@ -59,7 +59,7 @@ class Intake:
         self._loop_death = LoopDeath(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
-        sidecars = path is None  # a user who names a single file expects no others beside it
+        sidecars = path is None  # a user who names a single file does not expect others beside it
         self.recorder = recorder = Recorder(config, directory, path=path, sidecars=sidecars, warn=self._warn)
         folder = recorder.path.parent
 

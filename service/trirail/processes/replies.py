@@ -105,7 +105,7 @@ class Replies:
         self._robot = robot
         self.copies = Copies()
         self._changed = threading.Condition()
-        # Not bounded: dropping a query sends a final message to the asker, which may block as long as a reply.
+        # Not bounded: dropping a query sends a final message to the client, which may block as long as a reply.
         self._queues: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
         self._idle: deque[str] = deque()
         """Clients with waiting replies of which none is being sent, in the order of their turns."""
@@ -126,8 +126,8 @@ class Replies:
             incoming.at_door(content)
         if incoming.query is None:
             return
-        # One asker per kind and user: a user who does not read one reply does not read the next ones either.
-        # Queries about a role share one asker for all users.
+        # One queue per kind and user: a user who does not read one reply does not read the next ones either.
+        # Queries about a role share one queue for all users.
         asker = f"{incoming.kind}/{incoming.user}"
         with self._changed:
             if asker not in self._queues:
@@ -141,7 +141,7 @@ class Replies:
         if incoming.at_door is not None:
             incoming.at_door(content)
         if incoming.query is not None:
-            with contextlib.suppress(zenoh.ZError):  # the asker has disconnected
+            with contextlib.suppress(zenoh.ZError):  # the client has disconnected
                 self._answer(incoming, incoming.query, content)
 
     def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
@@ -198,7 +198,7 @@ class Replies:
         except RefusedError:
             encoding = boundary.JSON
         payload = boundary.encode(content, encoding)
-        with query:  # complete the query: the asker would otherwise wait for more replies until its time-out
+        with query:  # complete the query; the client would otherwise wait for more replies until its time-out
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:

@@ -124,7 +124,7 @@ class StopDoor:
                 connected, address = listening.accept()
             except BlockingIOError:
                 break
-            except OSError:  # another thread took the descriptor where they are short, or the caller has gone
+            except OSError:  # no descriptor is left, or the caller has disconnected
                 continue
             connected.setblocking(False)
             caller = _Caller(connected, source(connected, address))
@@ -175,7 +175,7 @@ class StopDoor:
                 answer = await self._answer(caller, user, line)
             self._check_open(caller)
             caller.connection.send(answer_with(answer))  # no line is longer than the socket's buffer
-        except (OSError, ValueError):  # it has gone, says too much or too little, or has no good certificate
+        except (OSError, ValueError):  # the caller has disconnected, sent an invalid request, or has no valid certificate
             pass
         finally:
             caller.task = None
@@ -183,7 +183,7 @@ class StopDoor:
 
     async def _request(self, caller: _Caller) -> tuple[bytes, str]:
         """Return the line of a connection, and the name in its certificate. Raises OSError or ValueError."""
-        await caller.readable.wait()  # one that says nothing costs no handshake
+        await caller.readable.wait()  # a silent connection does not cost a handshake
         user = ""
         self._enter(caller, _Stage.TALKING, caller.share)
         if self._secured is not None:
@@ -239,7 +239,7 @@ class StopDoor:
                 answered.set_result(content)
 
         def answer(content: CommandReply | ErrorReply) -> None:
-            with contextlib.suppress(RuntimeError):  # the door is closed
+            with contextlib.suppress(RuntimeError):  # the stop port is closed
                 self._loop.call_soon_threadsafe(finish, content)
 
         try:

@@ -240,7 +240,7 @@ class RouterLinks:
             router.ask_at = now + DIAGNOSIS_PERIOD_S
         if router.asked is None or not router.asked.done():
             return
-        error = router.asked.exception()  # the peer is unknown, so that no exception of its answer may end the service
+        error = router.asked.exception()  # an exception caused by an unknown peer must not end the service
         why = quoted(f"{error!r}") if error is not None else router.asked.result()
         router.asked = None
         why = why or "it answers, but opens no session: is it a router that takes this robot?"

@@ -120,7 +120,7 @@ class Admission(NamedTuple):
 
 
 def check_private(key_file: Path) -> None:
-    """Raise ServiceError if users other than the owner, or than the group of a key of root, can read a private key."""
+    """Raise ServiceError if a private key is readable by anyone but its owner; the group may read a key of root."""
     status = key_file.stat()
     if status.st_mode & (0o037 if status.st_uid == 0 else 0o077):
         raise ServiceError(

@@ -161,7 +161,7 @@ class State(Struct, frozen=True):
     """Warnings about the operation of the service, one line each. Examples are network access without certificates, a
     certificate that expires soon, and the reason why nothing is recorded."""
     lease: str | None = None
-    """User that holds the lease and whose goals alone move the robot; None if nobody holds it."""
+    """User that holds the lease and whose goals alone move the robot; None if the lease is free."""
     outputs: dict[str, bool] = {}
     """Value of each output of the configuration, as sent with the newest setpoints."""
     inputs: dict[str, bool] = {}
