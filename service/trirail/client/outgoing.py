@@ -116,7 +116,7 @@ def seconds(value: object) -> float | None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as a message's type. Raises TypeError where there is none, ValueError if it is not finite."""
+    """Return a value as a message's type. Raises TypeError if there is none, ValueError if it is not finite."""
     numpy = sys.modules.get("numpy")  # a program with numbers of numpy has imported it
     if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
         if value.dtype.kind == "f" and not numpy.isfinite(value).all():

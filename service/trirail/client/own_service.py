@@ -28,7 +28,7 @@ PATIENT = {
 }
 """Keys of a configuration that tolerates processes stalled for a second by a busy machine."""
 START_WITHIN = 300.0
-"""Time-out of the start, or, at the very first start, of the compilation of one function [s]."""
+"""Time-out of the start [s]; at the very first start, the time-out for compiling one function."""
 END_WITHIN = 20.0
 """Time-out for stopping the robot and ending [s]."""
 

@@ -70,7 +70,7 @@ class Child:
         self._send(content)
 
     def _send(self, content: object) -> None:
-        with suppress(BrokenPipeError):  # the supervisor was killed; the loop then ends by itself, and the others with it
+        with suppress(BrokenPipeError):  # the supervisor was killed; the loop ends by itself, then the others
             os.write(self._pipe, msgspec.json.encode(content) + b"\n")
 
     def report_compiling(self, function: str) -> None:

@@ -27,10 +27,10 @@ MAX_MESSAGES = 8192
 """Maximum number of unread messages; more are refused. The limit is double for commands, so goals cannot block a stop.
 """
 MAX_MESSAGES_OF_USER = 2048
-"""Most unread messages of one user; twice as many for commands."""
+"""Maximum number of one user's unread messages; the limit is double for commands."""
 TOO_MUCH = "too many unread messages: send fewer"
 MAX_MERGED_STOPS = 32
-"""Most consecutive equal stops of one user that are merged into one."""
+"""Maximum number of consecutive equal stops of one user that are merged into one."""
 
 
 class Inbox:

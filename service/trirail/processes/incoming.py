@@ -69,9 +69,9 @@ class Incoming(NamedTuple):
 
 
 BURST = 400
-"""Messages of one user that may be read in a burst."""
+"""Number of one user's messages that may be read in a burst."""
 RATE = 200.0
-"""Messages of one user that may be read per second after a burst: ten times the rate of a stream of goals or a jog."""
+"""Rate at which one user's messages are read after a burst [1/s]; ten times that of a stream of goals or a jog."""
 _MAX_BUCKETS = 1000
 """Number of users above which full buckets are forgotten."""
 
@@ -146,9 +146,9 @@ class FairQueue(Generic[T]):
 
 
 GOALS = 5_000
-"""Most waiting goals; further ones are refused."""
+"""Maximum number of waiting goals; more are refused."""
 GOALS_OF_ONE = 1_250
-"""Most waiting goals of one user, so that others always have room."""
+"""Maximum number of one user's waiting goals; it leaves room for other users."""
 GOAL_PATIENCE = 8.0
 """Longest time that a goal waits for those before it [s]; it is then withdrawn, as its sender gives up soon after."""
 

@@ -45,7 +45,7 @@ STEP_WITHIN = 500
 IN_MOTION = 20
 """Number of cycles of a jog before it is stopped."""
 SLOW = 0.1
-"""Velocity of a jog along x, as a share of the limit."""
+"""Velocity of a jog along x, as a fraction of the limit."""
 
 
 class _UnfinishedError(Exception):

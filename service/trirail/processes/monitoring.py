@@ -177,7 +177,7 @@ class Running(NamedTuple):
     pid: int | None
     """Process id; None if it is not running."""
     ready: bool
-    """Whether it has sent its ready message."""
+    """Whether the process has sent its ready message."""
     restarts: int
     """Number of restarts."""
 

@@ -88,7 +88,7 @@ class PoseFile:
     def change(self, name: str, pose: TaughtPose | None, known: Taught | None = None) -> None:
         """Save a pose under a name, or remove the name; return once the change is on the disk.
 
-        Poses written meanwhile by another service of the same robot are kept.
+        Poses that another service of the same robot has written in the meantime are kept.
 
         Parameters
         ----------

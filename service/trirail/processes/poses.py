@@ -31,7 +31,7 @@ from trirail.wire.text import check_new_pose
 from trirail.wire.vocabulary import MODES, Mode
 
 MAX_TAUGHT_POSES = 1000
-"""Most taught poses."""
+"""Maximum number of taught poses."""
 MAX_CHANGES_UNDER_WAY = 32
 """Maximum number of changes in progress; more are refused."""
 CHECK_PERIOD_S = 2.0

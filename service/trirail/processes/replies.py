@@ -208,7 +208,7 @@ class Replies:
 
 
 REFUSALS_PER_SECOND = 10
-"""Refusals per second of one user that are announced to everyone; further ones only get their error reply."""
+"""Number of one user's refusals per second that are announced to everyone; more get only their error reply."""
 REFUSALS_OF_ALL = 50
 """The same for all users."""
 

@@ -98,7 +98,7 @@ class Reports:
         now_ns
             Time at which the control has received it [ns].
         urgent
-            Whether it applies to the present cycle; otherwise it applies to the next.
+            Whether the input applies to the present cycle; otherwise it applies to the next.
         waiting
             As in ControlInput.
 

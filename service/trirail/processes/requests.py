@@ -40,7 +40,7 @@ them."""
 MAX_GOALS = 16
 """Maximum number of all users' goals in the loop, as many as it reads in four cycles."""
 MAX_COMMANDS_OF_USER = 8
-"""Most commands and checks of one user in the loop; further ones are refused, except commands that stop the robot."""
+"""Maximum number of one user's commands and checks in the loop; more are refused, except stops."""
 MAX_COMMANDS = 64
 """The same for all users."""
 REPLY_TIMEOUT_S = 15.0

@@ -35,7 +35,7 @@ REQUEST_TIMEOUT_S: Final = 10.0
 ANSWER_TIMEOUT_S: Final = 20.0
 """Time-out of the answer [s]; it normally arrives within 15 s."""
 ACCEPTED_PER_TURN: Final = 64
-"""Most connections accepted before the existing ones are served."""
+"""Maximum number of connections accepted before the existing ones are served."""
 
 T = TypeVar("T")
 Answer = Callable[[CommandReply | ErrorReply], None]
@@ -135,7 +135,7 @@ class StopDoor:
         self._reserve.refill(len(self._callers))
 
     def _enter(self, caller: _Caller, stage: _Stage, share: str) -> None:
-        """Count a connection in another share."""
+        """Count a connection in the share of another stage or source."""
         self._discount(caller)
         caller.stage, caller.share = stage, share
         self._count(caller)
@@ -175,7 +175,7 @@ class StopDoor:
                 answer = await self._answer(caller, user, line)
             self._check_open(caller)
             caller.connection.send(answer_with(answer))  # no line is longer than the socket's buffer
-        except (OSError, ValueError):  # the caller has disconnected, sent an invalid request, or has no valid certificate
+        except (OSError, ValueError):  # disconnected, invalid request, or no valid certificate
             pass
         finally:
             caller.task = None

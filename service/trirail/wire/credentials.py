@@ -29,7 +29,7 @@ class Credentials(NamedTuple):
     addresses: tuple[str, ...]
     """Host names and IP addresses at which clients connect to a robot; empty for a user."""
     serves: bool = False
-    """Whether it is a robot's or a router's certificate; a user's is valid for clients only."""
+    """Whether the certificate is a robot's or a router's; a user's is valid for clients only."""
     contents: tuple[bytes, ...] = ()
     """Contents of the three files, as checked."""
     copies: tuple[Path, ...] = ()
@@ -89,7 +89,7 @@ class Credentials(NamedTuple):
 
     @classmethod
     def read_server(cls, folder: Path) -> Self:
-        """Read the folder of a robot or router. Raises ServiceError as `read`, and for a user's."""
+        """Read the folder of a robot or router. Raises ServiceError like `read`, and for a user's folder."""
         credentials = cls.read(folder)
         if not credentials.serves:
             raise ServiceError(
@@ -139,7 +139,7 @@ def revoked(folder: Path) -> frozenset[str]:
 
 
 def with_role(users: Mapping[str, Role], folder: Path) -> dict[str, Role]:
-    """Return the roles of the users that are not revoked. Raises ServiceError as `revoked`."""
+    """Return the roles of the users that are not revoked. Raises ServiceError like `revoked`."""
     without = revoked(folder)
     return {user: role for user, role in users.items() if user not in without}
 

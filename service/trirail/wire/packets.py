@@ -204,7 +204,7 @@ class ControlInput(Struct, frozen=True, tag="Input"):  # as recordings have it
     urgent: bool = False
     """Whether the input was handled after the cycle's SYNC; otherwise before it, with the other inputs."""
     waiting: bool = False
-    """Whether it was received during the wait for the cycle's tick, after the other inputs had been handled."""
+    """Whether the input was received during the wait for the cycle's tick, after the other inputs were handled."""
 
 
 class Unrecorded(Struct, frozen=True, tag=True):

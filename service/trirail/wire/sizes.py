@@ -25,7 +25,7 @@ MAX_BESIDE = 4096
 MAX_UNREAD = 12_000_000
 """Memory of all unanswered messages in the gateway; further messages are refused [bytes]."""
 MAX_UNREAD_OF_ONE = MAX_UNREAD // 4
-"""Memory of one user's unanswered messages [bytes]."""
+"""Memory of one user's unanswered messages; further messages are refused [bytes]."""
 MAX_REFUSED = 8_388_608
 """Memory of messages whose refusal has not been sent yet: two of the largest [bytes]."""
 MAX_NAME = 64

@@ -73,7 +73,7 @@ class CommandContent(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 LOWEST_OVERRIDE = 1.0
-"""Lowest override other than 0 [%]; at 0 the robot stands still."""
+"""Lowest override other than 0 [%]; at 0 the robot does not move."""
 
 
 class Override(CommandContent, frozen=True):
@@ -83,7 +83,7 @@ class Override(CommandContent, frozen=True):
     optional = False
 
     percent: Annotated[float, Meta(ge=0.0, le=200.0)]
-    """Speed override: 0, or 1 to 200 % of full speed. The limits still apply, and at 0 the robot stands still."""
+    """Speed override: 0, or 1 to 200 % of full speed. The limits still apply, and at 0 the robot does not move."""
 
     def __post_init__(self) -> None:
         check_fields(self)
