@@ -1,4 +1,4 @@
-"""A stage for plans of Bluesky: movable axes, readings and fly scans over a running service. Needs trirail[bluesky]."""
+"""Bluesky devices for a running service: movable axes, readings and fly scans. Needs trirail[bluesky]."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fly scan: a path that is followed without a stop, and the data that are collected on it."""
+"""A fly scan: a path that the robot follows without a stop, and the data collected on it."""
 
 from __future__ import annotations
 
@@ -36,10 +36,11 @@ COLUMNS: dict[str, tuple[str, str]] = {
 
 
 class Flight(Device, Flyable, EventCollectable, Pausable):
-    """A fly scan of a stage: `kickoff` starts the path, `complete` is done with it, `collect` yields its data.
+    """A fly scan of a stage: `kickoff` starts the path, `complete` waits for its end, `collect` yields its data.
 
-    `send` sends its goal. `first` are the coordinates to which the robot moves before, by their index. A path ends at
-    the latest with the plan that has started it: the RunEngine itself stops only what was set.
+    `send` sends the goal of the path. `first` maps the index of a coordinate to the value to which the robot moves
+    first. A path ends no later than the plan that started it, because the RunEngine itself stops only devices that were
+    set.
     """
 
     def __init__(
@@ -57,10 +58,10 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         self._goal: AsyncGoalHandle | None = None
         self._sampling: asyncio.Task[None] | None = None
         self._samples: list[tuple[str, dict[str, Reading[Any]]]] = []
-        """Readings, each with the id of the goal under way: states can arrive before the acceptance of the path."""
+        """Readings, each with the id of the goal then in progress; states can arrive before the path is accepted."""
         self._sending = asyncio.Lock()
         self._interrupted: AsyncGoalHandle | None = None
-        """Goal whose stop was requested, and is no failure."""
+        """Goal whose stop was requested and is therefore not a failure."""
         self._stopped = False
         self._stopping: asyncio.Task[None] | None = None
         super().__init__(name)
@@ -76,7 +77,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
     def kickoff(self) -> AsyncStatus[None]:
         """Move to the first point; done when the service has accepted the path.
 
-        The path is stopped if it is still under way when the running task ends, which is that of the plan.
+        If the calling task, which runs the plan, ends first, the path is stopped.
         """
         status = AsyncStatus(self._kickoff())
         if (plan := asyncio.current_task()) is not None:
@@ -104,7 +105,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
 
     @AsyncStatus.wrap
     async def complete(self) -> None:
-        """Done when the robot is measured to be at the end; fails with the reason if the path ends otherwise."""
+        """Wait until the robot is measured to be at the end; fail with the reason if the path ends otherwise."""
         goal = self._goal
         if goal is None:
             raise TrirailError(f"{self.name}: complete before kickoff")
@@ -152,7 +153,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
             yield {"time": next(iter(stamps.values())), "data": values, "timestamps": stamps}
 
     def _end_with_plan(self, begun: AsyncStatus[None]) -> None:
-        """Stop what the plan that has ended leaves under way."""
+        """Stop the path if it is still in progress when its plan ends."""
         under_way = self._goal is not None and self._goal.result is None
         if under_way or not begun.done:
             self._stopping = asyncio.create_task(self._stop_late())

@@ -1,4 +1,4 @@
-"""Monitors: functions that get the readings of every state, as of bps.monitor."""
+"""Monitors: functions that receive the readings of every state, as with bps.monitor."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Monitored(Device):
         super().__init__(name)
 
     def subscribe_reading(self, function: Monitor) -> None:
-        """Call a function with the readings of every state, only the newest if it is slow, in the running event loop.
+        """Call a function with the readings of every state, in the running event loop; a slow one gets only the newest.
 
-        Raises ValueError for a function that has been subscribed already.
+        Raises ValueError if the function is already subscribed.
         """
         if function in self._monitors:
             raise ValueError(f"{self.name}: {function!r} has been subscribed already; call clear_sub first")
@@ -36,7 +36,7 @@ class Monitored(Device):
     subscribe = subscribe_reading
 
     def clear_sub(self, function: Monitor) -> None:
-        """End a subscription; from any thread. Raises KeyError for a function that is not subscribed."""
+        """End a subscription, from any thread. Raises KeyError if the function is not subscribed."""
         task = self._monitors.pop(function)
         with contextlib.suppress(RuntimeError):  # its event loop is closed, and the task with it
             task.get_loop().call_soon_threadsafe(task.cancel)
@@ -60,7 +60,7 @@ class Monitored(Device):
             self.log.exception("the monitor of %s has ended", self.name)
 
     def _call(self, function: Monitor, readings: Readings) -> None:
-        """Call a monitor; log its error, which must not end it."""
+        """Call a monitor and log its error; an error does not end the subscription."""
         try:
             function(readings)
         except Exception:

@@ -1,4 +1,4 @@
-"""Goals of a stage: sets of coupled axes that arrive together become one goal, and end with it."""
+"""Goals of a stage: sets of several axes that arrive together become one goal."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.state import Pose
 
 GATHERING_S = 0.005
-"""Time from the first set within which others join its goal: sets of one message group are within a millisecond."""
+"""Time after the first set in which others join its goal [s]; sets of one message group are within a millisecond."""
 SILENCE_S = 5.0
-"""Time without a state after which a goal under way is given up."""
+"""Time without a state after which a goal in progress is given up [s]."""
 PROGRESS_S = 0.1
-"""Interval of progress reports."""
+"""Interval of progress reports [s]."""
 
 
 class UnfinishedError(TrirailError):
-    """A goal that ended otherwise than done; `result` is its end."""
+    """Raised when a goal ends with an outcome other than done; `result` is its result."""
 
     def __init__(self, result: Result) -> None:
         super().__init__(result.message)
@@ -30,7 +30,7 @@ class UnfinishedError(TrirailError):
 
 
 def check_done(result: Result) -> None:
-    """Raise UnfinishedError where a goal is not done."""
+    """Raise UnfinishedError if a goal is not done."""
     if result.outcome != "done":
         raise UnfinishedError(result)
 
@@ -44,7 +44,7 @@ class AxisMove:
     end: asyncio.Future[None]
 
     def shares_axis(self, other: AxisMove) -> bool:
-        """Whether both set one axis."""
+        """Return whether both sets move the same axis."""
         return not self.targets.keys().isdisjoint(other.targets)
 
     def finish(self, error: Exception | None = None) -> None:
@@ -59,38 +59,38 @@ class AxisMove:
 
 @dataclass(eq=False, slots=True)
 class _Motion:
-    """A goal with the sets that it carries out."""
+    """A goal and the sets that it carries out."""
 
     target: Pose
     goal: AsyncGoalHandle
     moves: list[AxisMove] = field(default_factory=list)
     interrupted: bool = False
-    """Whether its stop was requested, and is no failure."""
+    """Whether the goal's stop was requested and is therefore not a failure."""
 
     def finish(self, result: Result) -> None:
-        """End its sets as the goal has ended."""
+        """Finish the sets of this goal with the goal's result."""
         failed = result.outcome != "done" and not self.interrupted
         end_all(self.moves, UnfinishedError(result) if failed else None)
 
 
 class Mover:
-    """Sends one goal for the sets that arrive together, and ends them with it; all in one event loop.
+    """Sender of one goal for all sets that arrive together; the goal's end finishes them. Uses one event loop.
 
-    A set of other axes while a goal is under way gives a new goal to all targets, so that each axis arrives as it
-    would with independent motors. A set of the same axis preempts the earlier one.
+    A set of other axes during a goal replaces it by a new goal to all targets, so that each axis arrives as it would
+    with independent motors. A set of the same axis preempts the earlier set.
     """
 
     def __init__(self, robot: AsyncRobot) -> None:
         self._robot = robot
         self._gathered: list[AxisMove] = []
-        """Sets that others may join; a change of the list ends that."""
+        """Sets that later sets may still join; replacing the list ends that."""
         self._unsent: list[AxisMove] = []
-        """The same, and sets that wait for their turn: a stop ends these before their goal is sent."""
+        """The gathered sets, and sets that wait for their turn; a stop ends all of these before their goal is sent."""
         self._motion: _Motion | None = None
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self.pose: Pose | None = None
-        """Measured pose in the newest state of a goal under way."""
+        """Measured pose in the newest state during a goal."""
 
     def start(self, targets: Mapping[int, float]) -> AxisMove:
         """Start to move axes to their targets; sets that follow within GATHERING_S join the goal."""
@@ -105,9 +105,9 @@ class Mover:
         return move
 
     async def progress(self, move: AxisMove) -> AsyncIterator[Pose]:
-        """Yield measured poses until a set has ended. Raises its error.
+        """Yield measured poses until a set has ended. Raises the set's error.
 
-        Cancelling it cancels a set whose goal has not been sent; a goal under way continues.
+        Cancelling the iteration cancels a set whose goal has not been sent; a goal in progress continues.
         """
         try:
             while not move.end.done():
@@ -115,13 +115,13 @@ class Mover:
                 if self.pose is not None:
                     yield self.pose
         finally:
-            move.end.cancel()  # without effect on a set that has ended
+            move.end.cancel()  # has no effect on a set that has ended
         move.end.result()
 
     async def stop(self, success: bool) -> None:
-        """Stop the goal under way; return when the robot is at rest. Goals of others continue.
+        """Stop the goal in progress; return when the robot is at rest. Goals of other clients continue.
 
-        With `success` the sets end as if they had arrived: a plan that pauses repeats them.
+        With `success`, the sets end as if they had arrived: a plan that pauses repeats them.
         """
         unsent, self._unsent, self._gathered = self._unsent, [], []
         end_all(unsent, None if success else TrirailError("stopped before its goal was sent"))
@@ -133,7 +133,7 @@ class Mover:
         await cancel(motion.goal)
 
     async def settle(self, goal: AsyncGoalHandle) -> Result:
-        """Wait for the end of a goal. Raises ServiceError if the service is lost or has restarted meanwhile."""
+        """Wait for the end of a goal. Raises ServiceError if the service is lost or restarts during the wait."""
         ended, lost = asyncio.create_task(goal.wait()), asyncio.create_task(self._watch())
         try:
             await asyncio.wait({ended, lost}, return_when=asyncio.FIRST_COMPLETED)
@@ -141,7 +141,7 @@ class Mover:
         finally:
             ended.cancel()
             lost.cancel()
-            await asyncio.gather(ended, lost, return_exceptions=True)  # neither outlives this call
+            await asyncio.gather(ended, lost, return_exceptions=True)  # neither task may outlive this call
 
     def _start_task(self, delay: float = 0.0) -> None:
         task = asyncio.create_task(self._send_later(self._gathered, delay))
@@ -151,7 +151,7 @@ class Mover:
             self._gathered = []
 
     async def _send_later(self, moves: list[AxisMove], delay: float) -> None:
-        """Send a goal for sets that are gathered during a delay, and end them with it."""
+        """Send a goal for sets that are gathered during a delay, and finish them when it ends."""
         if delay:
             await asyncio.sleep(delay)
             if moves is not self._gathered:
@@ -171,13 +171,13 @@ class Mover:
             result = await self.settle(motion.goal)
         except Exception as error:  # noqa: BLE001 - as above
             if self._motion is motion:
-                self._motion = None  # nobody knows whether it is still under way
+                self._motion = None  # it is unknown whether the goal is still in progress
             end_all(motion.moves, error)
             return
         motion.finish(result)
 
     async def _send_goal(self, moves: list[AxisMove], before: _Motion | None) -> _Motion:
-        """Send the goal of sets, and of those under way whose axes they leave alone."""
+        """Send the goal for new sets and for the sets in progress whose axes the new sets do not move."""
         carried: list[AxisMove] = []
         pose = (await self._robot.state()).commanded.pose
         if before is not None and before.goal.result is None:
@@ -200,7 +200,7 @@ class Mover:
         return _Motion(Pose(*target), goal, [*carried, *moves])
 
     async def _watch(self) -> ServiceError:
-        """Keep the measured pose; return the error when the service is lost."""
+        """Store the measured pose of each state; return the error when the service is lost."""
         cycle, self.pose = -1, None
         async with aclosing(self._robot.states(SILENCE_S)) as states:
             async for state in states:
@@ -211,19 +211,19 @@ class Mover:
 
 
 def end_all(moves: list[AxisMove], error: Exception | None) -> None:
-    """End sets, with an error or without."""
+    """End the sets, with an error or without."""
     for move in moves:
         move.finish(error)
 
 
 async def cancel(goal: AsyncGoalHandle) -> None:
-    """Stop a goal; one that has ended meanwhile is none to stop."""
+    """Stop a goal, unless it has already ended."""
     try:
         await goal.cancel()
     except RefusedError as error:
         if error.code != RefusalCode.NO_GOAL:
             raise
-    with contextlib.suppress(TimeoutError):  # its end is reported with the standstill
+    with contextlib.suppress(TimeoutError):  # the end is reported when the robot is at rest
         await goal.wait(SILENCE_S)
 
 

@@ -1,4 +1,4 @@
-"""The stage: x, y, phi and pose as movable axes of Bluesky, and everything that a state has as readings."""
+"""The stage: x, y, phi and pose as movable axes of Bluesky, and all values of a state as readings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from trirail.wire.state import Pose, State
 COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 UNNAMED = "stage"
-"""Name of a stage that is used without one."""
+"""Default name of a stage."""
 T = TypeVar("T", float, NDArray[np.float64])
 Keys = dict[str, DataKey]
 
@@ -45,8 +45,9 @@ class StageLink(NamedTuple):
 class Stage(Monitored, AsyncReadable, HasHints):
     """A robot as a device of Bluesky, with the movable axes `x`, `y`, `phi`, and `pose` for all three together.
 
-    Lengths are in metres, angles in radians. A reading is of one state, published after every event that this client
-    has received: after a move, it is of the place where the move ended. The stage neither enables nor homes the robot.
+    Lengths are in metres, angles in radians. Each reading is of one state, which the service published after every
+    event that this client has received; a reading after a move therefore shows where the move ended. The stage neither
+    enables nor homes the robot.
     """
 
     def __init__(self, robot: Robot, name: str = "") -> None:
@@ -60,15 +61,15 @@ class Stage(Monitored, AsyncReadable, HasHints):
 
     @property
     def hints(self) -> Hints:
-        """Keys that a table or a plot shows without a request."""
+        """Keys that a table or a plot shows by default."""
         return {"fields": [self.x.name, self.y.name, self.phi.name]}
 
     async def connect(self, *_: object, **__: object) -> None:
-        """Ask the service for geometry and limits, in the running event loop. Raises ServiceError if nobody answers."""
+        """Query geometry and limits in the running event loop. Raises ServiceError if the service does not answer."""
         await self.link()
 
     async def link(self) -> StageLink:
-        """Return the connection in the running event loop, made at the first call."""
+        """Return the connection for the running event loop; the first call creates it."""
         if not self.name:
             self.set_name(UNNAMED)  # documents need a name; init_devices would have given that of the variable
         loop = asyncio.get_running_loop()
@@ -101,13 +102,13 @@ class Stage(Monitored, AsyncReadable, HasHints):
         return self.readings(await (await self.link()).robot.state())
 
     async def stop(self, success: bool = True) -> None:
-        """Stop a goal of this stage's axes; return when the robot is at rest. Goals of others continue."""
+        """Stop a goal of this stage's axes; return when the robot is at rest. Goals of other clients continue."""
         await (await self.link()).mover.stop(success)
 
     async def check(self, pose: Sequence[float]) -> None:
-        """Have the service check the whole path to a pose against every limit; nothing moves.
+        """Let the service check the whole path to a pose against every limit; nothing moves.
 
-        Raises RefusedError with the limit and the value where the service would refuse the pose.
+        Raises RefusedError with the limit and the value if the service would refuse the pose.
         """
         x, y, phi = (float(value) for value in pose)
         await (await self.link()).robot.check(PoseGoal(x=x, y=y, phi=phi))
@@ -115,9 +116,9 @@ class Stage(Monitored, AsyncReadable, HasHints):
     def follow(
         self, points: Points, *, marks: Sequence[MarkLike] = (), stretch: bool = False, name: str = "flight"
     ) -> Flight:
-        """Return a fly scan along timed points, as of Robot.follow, to the first of which the robot moves before.
+        """Return a fly scan along timed points, like Robot.follow; the robot first moves to the first point.
 
-        Collected are the switches at its marks; without marks, the readings of every state on the way.
+        The scan collects the switches at its marks or, without marks, the readings of every state during the path.
         """
         rows, places = points_of(points), marks_of(marks)
         first = dict(enumerate((rows[0].x, rows[0].y, rows[0].phi)))
@@ -126,7 +127,7 @@ class Stage(Monitored, AsyncReadable, HasHints):
     def fly_to(
         self, x: float, y: float, phi: float, *, marks: Sequence[MarkLike] = (), speed: float = 1, name: str = "flight"
     ) -> Flight:
-        """Return a fly scan straight to a pose, as of Robot.move_to, with the data of `follow`."""
+        """Return a fly scan straight to a pose, like Robot.move_to, with the same data as `follow`."""
         places = marks_of(marks)
         return Flight(self, lambda robot: robot.move_to(x, y, phi, speed=speed, marks=places), bool(places), name)
 
@@ -162,13 +163,13 @@ class Stage(Monitored, AsyncReadable, HasHints):
             "dtype_numpy": "<f8",
             "shape": [],
             "units": UNITS[axis],
-            # One digit more than the window within which a goal is done.
+            # One digit finer than the window within which a goal is done.
             "precision": math.ceil(-math.log10(limits.in_position.pose[axis])) + 1,
             "limits": {"control": {"low": low, "high": high}},
         }
 
     async def _connect(self, loop: asyncio.AbstractEventLoop, before: StageLink | None) -> StageLink:
-        """Return a connection in the running event loop; close the one before, whose event loop is closed."""
+        """Return a connection in the running event loop; close the earlier one, whose event loop is closed."""
         if before is not None:
             await before.robot.close()
         robot = await self._robot._for_running_loop()
@@ -189,14 +190,14 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
 
     @property
     def name(self) -> str:
-        """Key of its reading."""
+        """Key of the axis' reading."""
         if self._name or self.parent is None:
             return self._name
         return self._stage.key(self._coordinate)
 
     @property
     def hints(self) -> Hints:
-        """Key that a table or a plot shows without a request."""
+        """Key that a table or a plot shows by default."""
         return {"fields": [self.name]}
 
     async def connect(self, *_: object, **__: object) -> None:
@@ -212,7 +213,7 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         return self._own(await self._stage.read())
 
     async def locate(self) -> Location[T]:
-        """Return the target of the goal under way, or the commanded value at rest, and the measured value."""
+        """Return the target of the goal in progress, or the commanded value at rest, and the measured value."""
         state = await (await self._stage.link()).robot.state()
         return Location(setpoint=self._value(_setpoint(state)), readback=self._value(state.pose))
 
@@ -220,8 +221,8 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:
         """Move to a value; done when the robot is measured to be there.
 
-        Fails with the reason where the goal is refused, or ends otherwise than done. Sets of several axes within some
-        milliseconds are one straight move.
+        Fails with the reason if the goal is refused or ends with another outcome than done. Sets of several axes within
+        some milliseconds become one straight move.
         """
         targets = self._targets(value)
         link = await self._stage.link()
@@ -264,7 +265,7 @@ class MovableAxis(_Movable[float]):
         super().__init__(COORDINATES[index])
 
     async def check_value(self, value: float) -> None:
-        """Check the path to a value with the other coordinates as they are commanded; see Stage.check."""
+        """Check the path to a value, with the other coordinates at their commanded values; see Stage.check."""
         pose = list(_setpoint(await (await self._stage.link()).robot.state()))
         pose[self._index] = float(value)
         await self._stage.check(pose)
@@ -295,6 +296,6 @@ class MovablePose(_Movable[NDArray[np.float64]]):
 
 
 def _setpoint(state: State) -> Pose:
-    """Return the target of the goal under way; without one the commanded pose."""
+    """Return the target of the goal in progress, or the commanded pose without one."""
     target = state.goal.target if state.goal is not None else None
     return target or state.commanded.pose

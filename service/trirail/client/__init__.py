@@ -1,1 +1,1 @@
-"""The Python client, trajectories from files, and a service of one's own for demos and tools."""
+"""The Python client, trajectories from files, and private services for demos and tools."""

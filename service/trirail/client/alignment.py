@@ -1,7 +1,7 @@
 """Alignments: procedures carried out with the user's camera and a connection to the robot.
 
-Each look is reported to the service, for recordings, reports and panels. A failed report never ends an alignment, but
-causes a single warning.
+The client reports each look to the service, for recordings, reports and panels. A failed report causes a single warning
+and never ends an alignment.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ Look = Callable[[], Marks | Awaitable[Marks]]
 it may be a coroutine function."""
 EMPTY_OBSERVATION = Observation({}, (0.0, 0.0, 0.0), 0.0)
 GOAL_WITHIN = 60.0
-"""Longest time of one motion [s]."""
+"""Time-out of one motion [s]."""
 ENDS_AT_TARGET = ("done", "unsettled")
-"""Outcomes after which the robot is at its target or near it; the next look measures the distance."""
+"""Outcomes after which the robot is at or near its target; the next look measures the remaining distance."""
 
 
 class MotionHandle(Protocol):
@@ -72,7 +72,7 @@ def drive(
 ) -> T:
     """Carry out the requests of a procedure with a Robot; return the procedure's result.
 
-    As `drive_async`, without an event loop. Ctrl-C stops the motion.
+    Like `drive_async`, but without an event loop. Ctrl-C stops the motion.
     """
 
     def call_look() -> Marks:
@@ -85,7 +85,7 @@ def drive(
 
 
 def finish(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine that never suspends, since every call in it blocks; return its result."""
+    """Run a coroutine that never suspends because all of its calls block; return its result."""
     try:
         coroutine.send(None)
     except StopIteration as end:
@@ -175,7 +175,7 @@ async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
 
 
 def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
-    """Yield the goals of a motion; with an approach, first one beyond its end."""
+    """Yield the goals of a motion; with an approach, the first goal overshoots the end."""
     by, tool, beyond = motion.by, motion.tool, motion.approach
     first = by if beyond is None else _sum(by, beyond)
     if tool is None:
@@ -205,7 +205,7 @@ class UnrecordedAlignmentWarning(UserWarning):
 
 
 class LookReports:
-    """Builder of the messages of one alignment, and of the ids of its goals, which begin with its own."""
+    """Builder of the messages of one alignment and of its goals' ids, which begin with the alignment's id."""
 
     def __init__(self) -> None:
         self.id = f"align-{uuid.uuid4().hex[:8]}"
@@ -220,7 +220,7 @@ class LookReports:
         return (f"{self.id}-{number}" for number in self._goals)
 
     def message(self, report: LookReport) -> bytes | None:
-        """Return the message of a look; None if it cannot be encoded, or an earlier one was not accepted."""
+        """Return the message of a look; None if it cannot be encoded or an earlier message was not accepted."""
         if self._last is None or self._last.purpose != report.purpose:
             self._number, self._began = 0, _time(report)
         self._number = max(1, self._number + (report.observation is not None))
@@ -232,13 +232,13 @@ class LookReports:
             return None
 
     def failure(self, error: BaseException) -> bytes | None:
-        """Return the message of an end by an error; None if the end has been reported, or before the first look."""
+        """Return the message that reports an error as the end; None before the first look or if an end was reported."""
         if self._last is None or self._last.end is not None:
             return None
         return self.message(LookReport(self._last.purpose, end="failed", words=str(error) or type(error).__name__))
 
     def lost(self, error: Exception) -> None:
-        """Warn, once, that the service does not accept the report."""
+        """Warn once that the service does not accept the report."""
         if not self._lost:
             self._lost = True
             words = f"this alignment is not in the service's recording: {error}"

@@ -1,4 +1,4 @@
-"""A client of the service for asyncio: goals, commands and states over Zenoh.
+"""Asyncio client of the service: goals, commands and states over Zenoh.
 
 async with AsyncRobot("demo") as robot:
     await robot.enable()
@@ -47,7 +47,7 @@ from trirail.wire.stop_protocol import STOPS
 from trirail.wire.text import check_name, check_new_pose
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Override, Role, SetOutput, Stop
 
-if TYPE_CHECKING:  # numpy, which most programs do without
+if TYPE_CHECKING:  # numpy, which most programs do not need
     from trirail.alignment.alignment_request import AlignmentRequest, Observation
     from trirail.alignment.camera_calibration import CameraCalibration
     from trirail.alignment.geometry_calibration import GeometryCalibration
@@ -56,18 +56,18 @@ if TYPE_CHECKING:  # numpy, which most programs do without
     from trirail.client.alignment import Look
 
 REPORT_WITHIN = 2.0
-"""Time-out of the answer to the report of a look [s]."""
+"""Time-out of the reply to an alignment report [s]."""
 HOME_WITHIN = 600.0
-"""Longest time of homing [s]: three drives with the greatest time-out."""
+"""Time-out of homing [s]; it allows for three drives with the longest homing time-out."""
 T = TypeVar("T")
 
 
 class AsyncRobot:
-    """Connection to one robot's service inside its context, for the tasks of one event loop.
+    """A connection to one robot's service inside a context, for the tasks of one event loop.
 
-    Arguments, names and errors are those of trirail.client.client.Robot, which wraps these calls for threads.
-    Cancelling a call that sends a goal stops that goal if the service has received it. An accepted goal continues, even
-    if no task waits for it.
+    Arguments, names and errors are those of trirail.client.client.Robot, which wraps these calls for threads. If you
+    cancel a call that sends a goal, the goal is stopped if the service has received it. An accepted goal continues,
+    even if no task waits for it.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class AsyncRobot:
         opening = loop.run_in_executor(None, self._connected)
         try:
             connection = await asyncio.shield(opening)
-        except asyncio.CancelledError:  # a connection that opens later is closed again
+        except asyncio.CancelledError:  # if the connection opens after the cancellation, close it
             opening.add_done_callback(lambda done: None if done.exception() else done.result().close())
             raise
         self._opened.push_async_callback(lambda: loop.run_in_executor(None, connection.close))
@@ -98,35 +98,35 @@ class AsyncRobot:
         await self.close()
 
     async def close(self) -> None:
-        """End the connection; goals under way continue."""
+        """Close the connection; accepted goals continue."""
         self._open = None
         await self._opened.aclose()
 
     def _connected(self) -> Connection:
-        """Open a connection, which may take a while. Raises ServiceError where the service cannot be reached."""
+        """Open a connection, which may block for a while. Raises ServiceError if the service cannot be reached."""
         return Connection(self.name, self._connect, self._credentials, self.user)
 
     async def _use(self, connection: Connection) -> None:
-        """Send and receive by a connection, in the running event loop."""
+        """Send and receive over a connection, in the running event loop."""
         self._open = AsyncConnection(connection)
         self._opened.enter_context(self._open.subscribe_to_events(self._on_event, history=True))
 
     async def _shared(self, connection: Connection) -> AsyncRobot:
-        """Return a robot with goals of its own by the same connection, in the running event loop."""
+        """Return a robot for the running event loop that has its own goals and shares the connection."""
         shared = copy.copy(self)
         shared._opened, shared._goals = AsyncExitStack(), OpenGoals()
         await shared._use(connection)
         return shared
 
     async def _twin(self, connection: Connection) -> AsyncRobot:
-        """Return a robot that sends commands by the same connection, in the running event loop."""
+        """Return a robot for the running event loop that only sends commands and shares the connection."""
         twin = copy.copy(self)
         twin._open = AsyncConnection(connection)
         return twin
 
     @property
     def skipped(self) -> int:
-        """Number of publications on this robot's keys that were not valid messages."""
+        """Number of invalid messages received on this robot's keys."""
         return self._connection.skipped
 
     # ------------------------------------------------------------------ goals and commands
@@ -147,18 +147,22 @@ class AsyncRobot:
         stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
-        """Send a pose goal, x, y [m] and phi [rad] in the base frame; return once it is accepted.
+        """Send a goal to a pose x, y [m], phi [rad] in the base frame; return once the service accepts it.
 
-        The platform moves straight in pose space where its start allows. `speed` is a fraction of full speed, (0, 1]:
-        0.5 takes twice as long over the same path. With `blend` [m] the next pose goal waits for this one, and begins
-        when no point of the platform is farther than that from its target; without it, the next goal preempts this
-        one. `limits` are lower than the platform's. A goal that has not begun within `valid_for` [s] expires.
-        With a `tool`, a point of the platform in its own frame, (u, v) [m], or a name of [frames.tool], this point
-        moves to x, y, straight and within the platform's limits, while the platform turns. `frame` is one of
-        [frames.work] in which x, y and phi are given.
-        Outputs switch at `marks` on the path: trirail.Mark, or dicts of its fields; the result has a row per switch.
-        At the edge `stop_at` of an input the goal ends, by a controlled stop: trirail.StopAt, or a dict.
-        The `id` must be new; one is made if absent. Raises RefusedError: out of reach, not enabled, stopping, ….
+        The platform moves on a straight line in pose space if its start allows this. `speed` is a fraction of full
+        speed, (0, 1]: at 0.5 the motion takes twice as long on the same path. With `blend` [m], the next pose goal
+        waits for this one and begins when every point of the platform is within this distance of its target; without
+        it, the next goal preempts this one. `limits` may lower the platform's limits. A goal that has not begun within
+        `valid_for` [s] expires.
+
+        `tool` is a point (u, v) [m] in the platform's frame, or the name of a point in [frames.tool]. This point then
+        moves to x, y on a straight line, within the platform's limits, while the platform turns. `frame` names the
+        frame of [frames.work] in which x, y and phi are given.
+
+        Outputs switch at the `marks` on the path, each a trirail.Mark or a dict of its fields; the result has a row for
+        each switch. The goal ends with a controlled stop at the edge `stop_at` of an input, a trirail.StopAt or a dict
+        of its fields. The `id` must be new; without it, the client generates one. Raises RefusedError, for example if
+        the pose is out of reach or the robot is not enabled or is stopping.
         """
         return await self.send(
             lambda name: PoseGoal(
@@ -195,11 +199,12 @@ class AsyncRobot:
         stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
-        """Move the platform by x, y [m] and turn it by phi [rad] about its `tool`, or its centre; return when accepted.
+        """Move the platform by x, y [m] and turn it by phi [rad]; return once the service accepts the goal.
 
-        x and y are along the axes of `frame`: base, platform (at that time), or one of [frames.work]. `origin` is the
-        start of the move: "commanded" is the end of the goals before it, so that moves add up whenever they are sent;
-        "measured" is the robot's measured pose. The rest is as for move_to.
+        The platform turns about its `tool`, or about its centre without one. x and y are along the axes of `frame`:
+        base, platform (as oriented at that time), or a frame of [frames.work]. `origin` is the start of the move.
+        "commanded" is the end of the preceding goals, so that moves add up whenever they are sent; "measured" is the
+        robot's measured pose. The other arguments are those of move_to.
         """
         return await self.send(
             lambda name: MoveGoal(
@@ -232,9 +237,9 @@ class AsyncRobot:
         stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
-        """Move the platform to a named pose, one of `poses`; the rest is as for move_to.
+        """Move the platform to a named pose, one of `poses`; the other arguments are those of move_to.
 
-        The name is resolved when the service takes the goal. Raises RefusedError `unknown_pose` for an unknown name.
+        The service looks the name up when it receives the goal. Raises RefusedError `unknown_pose` for an unknown name.
         """
         return await self.send(
             lambda goal_id: NamedGoal(
@@ -262,10 +267,10 @@ class AsyncRobot:
         stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
-        """Send a goal for the sliders A, B, C, their lambda_10 [m]; return once it is accepted.
+        """Move the sliders A, B, C to positions lambda_10 [m]; return once the service accepts the goal.
 
-        The motion is straight in slider space where the start allows; it also leads out of a pose that move_to refuses.
-        `speed`, `valid_for` and `id` are as for move_to.
+        The motion is a straight line in slider space if the start allows this. It can also leave a pose from which
+        move_to is refused. `speed`, `valid_for` and `id` are those of move_to.
         """
         return await self.send(
             lambda name: SlidersGoal(
@@ -304,24 +309,26 @@ class AsyncRobot:
     def jog(
         self, x: float = 0.0, y: float = 0.0, phi: float = 0.0, *, timeout: float = 0.2, tool: Tool | None = None
     ) -> AsyncJog:
-        """Move the platform at a velocity [m/s, rad/s] while the context lasts, renewed before each `timeout` [s].
+        """Move the platform at a velocity [m/s, rad/s] until the context ends.
 
-        The velocity is that of the `tool`, about which the platform turns; without one, that of its centre.
+        The client renews the jog before each `timeout` [s] passes. The velocity is that of the `tool`, about which the
+        platform turns, or that of the platform's centre without one.
 
         with robot.jog(x=0.01):  # of AsyncRobot: async with
             wait_for_the_key_to_be_released()
+
         """
         return AsyncJog(self.send, (x, y, phi), timeout, tool)
 
     def track(self, *, timeout: float = 0.25, id: str | None = None) -> AsyncTrack:  # noqa: A002 - the field's name on the wire
-        """Follow a moving target while the context lasts, updated 10 to 200 times a second; brake when it ends.
+        """Follow a moving target that you update 10 to 200 times a second; brake when the context ends.
 
         with robot.track() as track:  # of AsyncRobot: async with, and await
             for pose, velocity, time in camera:
                 track.update(pose, velocity, time)
 
-        The robot keeps the target's velocity between two updates, within every limit, and brakes on its path
-        when none has come for `timeout` seconds of real time. `id` is as for move_to.
+        Between two updates the robot keeps the target's velocity, within every limit. It brakes on its path if no
+        update arrives for `timeout` seconds of real time. `id` is as for move_to.
         """
 
         goal_id = id or uuid.uuid4().hex[:12]
@@ -332,14 +339,14 @@ class AsyncRobot:
         return AsyncTrack(self.send, post, goal_id, timeout)
 
     async def send(self, make: Goal | Callable[[str], Goal], id: str | None = None) -> AsyncGoalHandle:  # noqa: A002
-        """Send a trirail.wire.goals.Goal, or the one that `make` makes for an id; return once it is accepted."""
+        """Send a trirail.wire.goals.Goal, or the goal that `make` returns for an id; return once it is accepted."""
         goal_id = id or id_of(make)
         *before, last = goal_messages(make, goal_id)
         goal = self._goals.open(AsyncGoalHandle(goal_id, self.command))
         try:
             reply = await self._connection.fetch(("goal", self.user), GoalReply, last, before=before)
         except BaseException as error:
-            # A cancelled renewal of a jog does not stop the jog.
+            # If a jog's renewal is cancelled, the jog itself continues until its time-out.
             if self._goals.refuse(goal_id) and isinstance(error, asyncio.CancelledError):
                 with contextlib.suppress(ServiceError):  # the connection is closed
                     stop = msgspec.json.encode(Stop(goal_id))
@@ -349,11 +356,11 @@ class AsyncRobot:
         return goal
 
     async def check(self, goal: Goal) -> GoalReply:
-        """Plan a trirail.wire.goals.Goal without moving; return the reply of the service if it could be accepted now.
+        """Plan a trirail.wire.goals.Goal without moving; return the reply that the service would give to the goal now.
 
-        The whole path is checked against every limit. It begins at rest, at the end of the goals under way or at the
-        commanded pose. Neither mode nor lease matters. A jog or a track has no path to check; a trajectory is checked
-        up to the points of one message. Raises RefusedError as for the goal itself.
+        The service checks the whole path against every limit. The path begins at rest, at the end of the accepted goals
+        or at the commanded pose. Neither the mode nor the lease matters. Jogs and tracks have no path and cannot be
+        checked. A trajectory can be checked if it fits into one message. Raises RefusedError as for the goal itself.
         """
         return await self._connection.fetch(("check", self.user), GoalReply, check_message(goal))
 
@@ -370,16 +377,17 @@ class AsyncRobot:
         speed: float = 1.0,
         wait: float = 0.0,
     ) -> CameraCalibration:
-        """Calibrate cameras by the marks of a part on the table and moves of the stage, which returns afterwards.
+        """Calibrate cameras from the marks of a part on the table; the stage makes test moves and returns to its start.
 
-        `look` takes a picture, or one of each camera, and returns {mark: (u, v)} in pixels; marks that it does not
-        find are missing. `moves` are x, y [m] and phi [rad] from the robot's pose, ±1 mm and ±1° if absent; each must
-        leave the marks in the picture. `views` names for each mark the view that shows it: without it each has one of
-        its own, as with two cameras, or one that is moved to each mark. A `lens` perspective or radial needs more
-        moves, radial also the `centre` of its picture [pixel]. `looks` pictures are taken at each place, `wait` seconds
-        after the robot is at rest; with an `approach`, x, y [m] and phi [rad], it overshoots by that first and returns,
-        so that backlash is on the same side each time. Ctrl-C stops the robot. Raises AlignmentError where the looks do
-        not suffice, RefusedError where a move is refused.
+        `look` takes a picture, or one with each camera, and returns {mark: (u, v)} in pixels without the marks that it
+        does not find. `moves` are x, y [m] and phi [rad] relative to the robot's pose, by default ±1 mm and ±1°; the
+        marks must stay in the picture in each of them. `views` gives the view that shows each mark; by default each
+        mark has a view of its own, as with two cameras, or with one camera that is moved to each mark. A perspective or
+        radial `lens` needs more moves, and a radial one also the `centre` of its picture [pixel]. At each pose the
+        client takes `looks` pictures, `wait` seconds after the robot is at rest. With an `approach` of x, y [m] and phi
+        [rad], the robot first overshoots by this amount and then returns, so that the backlash is always on the same
+        side. Ctrl-C stops the robot. Raises AlignmentError if the looks are not sufficient, and RefusedError if a move
+        is refused.
         """
         from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves
 
@@ -403,12 +411,12 @@ class AsyncRobot:
     ) -> Alignment:
         """Move a part until its marks are at their `targets`, {mark: (u, v)} in pixels; return the alignment's result.
 
-        Measure, correct about the marks' middle from the robot's measured pose, measure again, until every mark is
-        within `tolerance` [m] of its place by the best rigid motion and the part within `angle` [rad], or
-        `corrections` have been made, or the error grows. The first correction with an unconfirmed calibration is
-        limited to twice its moves. Without a `calibration` one is made first, by moves of ±1 mm and ±1°. Marks whose
-        distance is wrong by more than `distance`, a share, are refused, and nothing moves. The rest is as for
-        calibrate_camera.
+        The procedure measures the marks, corrects the pose about the marks' centroid from the measured pose, and
+        measures again. It ends when the best rigid motion places every mark within `tolerance` [m] and the part within
+        `angle` [rad], after `corrections` corrections, or when the error grows. With an unconfirmed calibration the
+        first correction is limited to twice the moves of the calibration. Without a `calibration`, the procedure first
+        makes one with moves of ±1 mm and ±1°. If the distance between marks is wrong by more than the fraction
+        `distance`, the marks are refused and nothing moves. The other arguments are those of calibrate_camera.
         """
         from trirail.alignment.procedure import AlignmentTask, align, calibrate_and_align
 
@@ -431,15 +439,18 @@ class AsyncRobot:
         speed: float = 1.0,
         wait: float = 0.0,
     ) -> GeometryCalibration:
-        """Find the stage's own geometry, encoder scales and cameras by the marks of a part; return what to change.
+        """Identify the stage's geometry, encoder scales and cameras from the marks of a part; return the corrections.
 
-        `field` is the size of the pictures, (columns, rows) in pixels. The stage looks at its pose and after moves of
-        1 mm and 1°, then at poses all over its travel at which marks stay in the pictures: `poses` looks in all, 12 at
-        least; then it returns. They are chosen by the information matrix. `.parameters` are corrections to the
-        configuration by name [m, rad, share], `.deviations` their standard deviations, `.undetermined` the names of
-        those that the looks do not tell, `.residual` how well looks that were held out are predicted, before and
-        after. Nothing is written, and the service keeps its geometry: `trirail align geometry` writes a configuration
-        for its next start. The rest is as for calibrate_camera; needs trirail[analysis].
+        `field` is the size of the pictures, (columns, rows) in pixels. The stage takes a look at its present pose,
+        after moves of 1 mm and 1°, and then at poses all over its travel at which the marks stay in the pictures. There
+        are `poses` looks in total, at least 12; the information matrix determines the poses. The stage then returns to
+        its start.
+
+        `.parameters` are corrections to the configuration by name [m, rad, or a fraction], and `.deviations` their
+        standard deviations. `.undetermined` names the parameters that the looks do not determine. `.residual` is the
+        prediction error for looks held out of the fit, before and after. This call writes nothing, and the service
+        keeps its geometry; `trirail align geometry` writes a configuration for its next start. The other arguments are
+        those of calibrate_camera. Needs trirail[analysis].
         """
         from trirail.client.alignment import completed
         from trirail.client.stage_geometry import geometry_task
@@ -453,41 +464,44 @@ class AsyncRobot:
     async def _converse(
         self, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
     ) -> T:
-        """Carry out the requests of a conversation of trirail.alignment.procedure; return its result."""
+        """Carry out the requests of a procedure of trirail.alignment.procedure; return the procedure's result."""
         from trirail.client.alignment import drive_async
 
         return await drive_async(self, look, requests, speed, wait)
 
     async def _report_look(self, look: bytes) -> None:
-        """Report a look of an alignment to the service: a trirail.wire.looks.AlignmentLook as JSON."""
+        """Report a look of an alignment to the service; `look` is a trirail.wire.looks.AlignmentLook as JSON."""
         await self._connection.fetch(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
     async def enable(self) -> None:
-        """Power the drives up; return when the robot holds, immediately if it does already."""
+        """Enable the drives; return when the robot holds its position, immediately if it already does."""
         await self.command(Command.ENABLE)
 
     async def disable(self) -> None:
-        """Stop, then power the drives down; return when none has power."""
+        """Stop the robot, then disable the drives; return when no drive has power."""
         await self.command(Command.DISABLE)
 
     async def stop(self) -> None:
-        """Stop on the path within the limits' jerk; return when the robot is at rest. Until then goals are refused."""
+        """Stop on the path within the jerk limits; return when the robot is at rest. Goals are refused until then."""
         await self.command(Command.STOP)
 
     async def quick_stop(self) -> None:
-        """Stop every drive by its own ramp, as fast as it can; the robot is in fault until reset, without power."""
+        """Stop each drive with its own quick-stop ramp, as fast as it can.
+
+        The robot then has no power, and is in fault until it is reset.
+        """
         await self.command(Command.QUICK_STOP)
 
     async def reset(self) -> None:
-        """Clear a fault whose cause is gone; leave the robot disabled. Raises RefusedError while the cause lasts."""
+        """Clear a fault whose cause is gone; the robot stays disabled. Raises RefusedError if the cause persists."""
         await self.command(Command.RESET)
 
     async def home(self) -> None:
-        """Home the drives whose positions are not absolute; return when all are and the robot holds."""
+        """Home the drives that have no absolute position; return when all are homed and the robot holds."""
         await self.command(Command.HOME)
 
     async def pause(self) -> None:
-        """Stop on the path; return when the robot is at rest. The goal is kept for resume, a jog is not."""
+        """Stop on the path; return when the robot is at rest. `resume` continues the goal, unless it is a jog."""
         await self.command(Command.PAUSE)
 
     async def resume(self) -> None:
@@ -495,45 +509,46 @@ class AsyncRobot:
         await self.command(Command.RESUME)
 
     async def override(self, percent: float) -> None:
-        """Set the speed override of this and later motions, 0 or 1 to 200 % of full speed, within the limits."""
+        """Set the speed override of current and later motions: 0, or 1 to 200 % of full speed, within the limits."""
         content = made_content(Command.OVERRIDE, lambda: Override(number(percent, "override")))
         await self.command(Command.OVERRIDE, content)
 
     async def set_output(self, name: str, value: bool) -> None:
-        """Set a digital output of the configuration, from the next setpoints on.
+        """Set a digital output of the configuration, starting with the next setpoints.
 
-        Raises RefusedError: `unknown_output`; `not_enabled` or `fault` while the robot is disabled or in fault, unless
-        the output is configured as `always = true`.
+        Raises RefusedError `unknown_output` for an unknown name. Raises `not_enabled` or `fault` if the robot is
+        disabled or in fault, unless the configuration has `always = true` for the output.
         """
         content = made_content(Command.SET_OUTPUT, lambda: SetOutput(name, value))
         await self.command(Command.SET_OUTPUT, content)
 
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> AsyncLease:
-        """Hold the lease while the context lasts: only this user's goals and commands move the robot.
+        """Hold the lease until the context ends: only this user's goals and commands move the robot.
 
-        Signs of life keep it, regardless of the rest of the program. When these cease for `timeout` [s], and when the
-        context ends, the robot stops within its limits and the lease is free. `force` takes it over from its holder,
-        if the user's role allows. Entering raises RefusedError `leased` where somebody else holds it. Everybody can
-        still send stop, quick_stop and disable.
+        A background task renews the lease, whatever the rest of the program does. If the renewals cease for `timeout`
+        [s], or the context ends, the robot stops within its limits and the lease is released. With `force` the client
+        takes the lease over from its holder, if the user's role allows it. Entering raises RefusedError `leased` if
+        another user holds the lease. All users can still send stop, quick_stop and disable.
 
         with robot.lease():  # of AsyncRobot: async with, and await
             robot.move_to(x=0.02, y=0.0, phi=0.0).wait()
+
         """
         return AsyncLease(self.command, force=force, timeout=timeout)
 
     async def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
-        """Take the lease, or keep it by one sign of life; the context of `lease` sends such signs itself."""
+        """Acquire the lease, or renew it once; the context manager `lease` renews it automatically."""
         return await self.command(Command.ACQUIRE, lease)
 
     async def release(self) -> None:
-        """Release the lease of this user, whichever client keeps it; return when the robot is at rest."""
+        """Release this user's lease, whichever client holds it; return when the robot is at rest."""
         await self.command(Command.RELEASE)
 
     async def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
-        """Send a command by its name on the wire; return once the service confirms that it has been carried out.
+        """Send a command by its name on the wire; return once the service confirms that it has carried the command out.
 
-        `content` is of the type that trirail.wire.vocabulary.Command has for it, or that as JSON. Commands that stop
-        the robot are also sent to the service's door for stops, which other connections cannot block.
+        `content` is an object of the command's content type in trirail.wire.vocabulary.Command, or its JSON. The client
+        sends commands that stop the robot to the service's stop port as well, which other connections cannot block.
         """
         payload = content_message(name, content)
         if name in STOPS:
@@ -542,40 +557,43 @@ class AsyncRobot:
         return await self._connection.fetch(("cmd", self.user, name), CommandReply, payload, within)
 
     async def info(self) -> Info:
-        """Return geometry, limits, rates and versions."""
+        """Return the robot's geometry, limits, rates and versions."""
         return await self._connection.fetch(("info",), Info)
 
     async def role(self) -> Role | None:
-        """Return this user's role; None where they have none. Without certificates every user is a maintainer."""
+        """Return this user's role, or None without one.
+
+        If the service requires no certificates, every user is a maintainer.
+        """
         role = (await self._connection.fetch(("role", self.user), RoleReply)).role
         return None if role is None else Role(role)
 
     async def users(self) -> list[str]:
-        """Return the names of the users connected to the robot now, this one included."""
+        """Return the names of the users who are connected to the robot, including this one."""
         return await self._connection.users()
 
     async def poses(self) -> dict[str, NamedPose]:
-        """Return the named poses: those of the configuration, and those that were taught."""
+        """Return the named poses, both those of the configuration and taught ones."""
         return {pose.name: pose for pose in (await self._connection.fetch(("poses",), NamedPoses)).poses}
 
     async def teach(self, name: str) -> NamedPose:
-        """Save the robot's measured pose, with power or without, under a name; return that pose.
+        """Save the robot's measured pose under a name, with power or without; return the pose.
 
-        It is on the service's disk when this returns. A taught pose of that name is replaced.
-        Raises RefusedError where the robot moves, is in fault or has not been homed, and for names of [poses].
+        The service has written the pose to its disk when this returns. A taught pose with the same name is replaced.
+        Raises RefusedError if the robot moves, is in fault or has not been homed, and for names in [poses].
         """
         return await self._connection.fetch(("teach", self.user, check_new_pose(name)), NamedPose)
 
     async def forget(self, name: str) -> NamedPose:
-        """Remove a taught pose, and return it. Raises RefusedError where none of that name was taught."""
+        """Remove a taught pose and return it. Raises RefusedError if no pose with this name was taught."""
         return await self._connection.fetch(("forget", self.user, check_name(name, "pose")), NamedPose)
 
-    # ------------------------------------------------------------------ what the service tells
+    # ------------------------------------------------------------------ states, events and records
 
     async def state(self, timeout: float = 2.0) -> State:
-        """Return the next published state; after an answer or an event, none that is older than that.
+        """Return the next published state; it is never older than the latest reply or event of this client.
 
-        Raises ServiceError if none comes within `timeout` seconds.
+        Raises ServiceError if no state arrives within `timeout` seconds.
         `pose` is computed from the measured sliders; `commanded` is the setpoint of the drives. SI units and radians.
         """
         async with aclosing(self.states(timeout)) as states:
@@ -585,17 +603,23 @@ class AsyncRobot:
         raise await self._connection.nobody("state")
 
     def states(self, timeout: float | None = None) -> AsyncGenerator[State]:
-        """Yield states as they arrive, only the newest for a slow caller; end after `timeout` seconds without one."""
+        """Yield states as they arrive; a slow caller gets only the newest.
+
+        End after `timeout` seconds without a state.
+        """
         return self._connection.states(seconds(timeout))
 
     def events(self, history: bool = False, timeout: float | None = None) -> AsyncGenerator[Event]:
-        """Yield events in order, each once, with `history` past ones first; end after `timeout` seconds without one."""
+        """Yield each event once, in order; `history` yields past ones first.
+
+        End after `timeout` seconds without an event.
+        """
         return self._connection.events(history, seconds(timeout))
 
     def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
-        """Deliver every batch of records as it arrives, until the context ends; wire.records.unpack reads them.
+        """Deliver every batch of records as it arrives, until the context ends; wire.records.unpack decodes a batch.
 
-        `deliver` is called in the event loop: it must be quick.
+        The event loop calls `deliver`, which must return quickly.
         """
         return self._connection.records(deliver)
 

@@ -1,4 +1,4 @@
-"""A connection for asyncio: Zenoh's own threads pass each message to the event loop, and no call has a thread."""
+"""Connection for asyncio: Zenoh's own threads pass each message to the event loop, and calls need no threads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Item = TypeVar("Item")
 
 
 class AsyncConnection:
-    """Queries and subscriptions by a connection; all of it belongs to the event loop in which it is made.
+    """Queries and subscriptions over a connection, for the event loop in which the object is created.
 
     Cancelling a call cancels its query or its subscription.
     """
@@ -33,7 +33,7 @@ class AsyncConnection:
 
     @property
     def skipped(self) -> int:
-        """Number of publications on this robot's keys that were not valid messages."""
+        """Number of invalid messages received on this robot's keys."""
         return self._connection.skipped
 
     async def fetch(
@@ -45,13 +45,13 @@ class AsyncConnection:
         before: Sequence[bytes] = (),
         copy: str | None = None,
     ) -> T:
-        """Query the key of these parts and decode the first reply that can be read as a message of `kind`.
+        """Query the key made of `parts` and decode the first valid reply as a message of `kind`.
 
-        `before` are parts of the message that are sent before the last one, and answered like it. `copy` is the id that
-        the copies of a stop share.
+        `before` are parts of the message that are sent before the last one; each of them gets a reply as well. `copy`
+        is the id that the copies of a stop share.
 
-        Raises RefusedError where the service refuses, ServiceError where nobody answers in time: nobody is there, or
-        the user may not ask.
+        Raises RefusedError if the service refuses, and ServiceError if no reply arrives in time, because the service is
+        absent or the user's role does not allow the query.
         """
         unreadable: ServiceError | None = None
         for part in before:
@@ -66,15 +66,15 @@ class AsyncConnection:
         raise unreadable or await self.nobody(*parts)
 
     async def users(self) -> list[str]:
-        """Return the users who have a session to this robot, by name."""
+        """Return the names of the users who have a session to this robot."""
         get, key = self._connection.session.liveliness().get, self._connection.key("here", "*")
         async with aclosing(self._replies(get, key_expr=key, timeout=HERE_WITHIN)) as here:
             return sorted({str(reply.ok.key_expr).rpartition("/")[2] async for reply in here if reply.ok is not None})
 
     async def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
-        """Request a stop, quick_stop or disable, over Zenoh and at the door beside it; return the first answer.
+        """Request a stop, quick_stop or disable, over Zenoh and at the stop port; return the first reply.
 
-        Raises as `fetch`.
+        Raises the same errors as `fetch`.
         """
         came: asyncio.Queue[Outcome] = asyncio.Queue()
         stop = StopOrder.create(self._connection.robot, user, name, content, within)
@@ -89,15 +89,15 @@ class AsyncConnection:
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
-        """Query the key of these parts, and deliver the outcome in the event loop; see Connection.post."""
+        """Query the key made of `parts`, and deliver the outcome in the event loop; see Connection.post."""
         self._connection.post(parts, kind, payload, self._in_loop(deliver))
 
     def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
-        """Query the key of these parts without waiting for an answer."""
+        """Query the key made of `parts` without waiting for a reply."""
         self._connection.query_unanswered(parts, payload)
 
     async def nobody(self, *parts: str) -> ServiceError | RefusedError:
-        """Return the error to raise where nobody answers on the key of these parts."""
+        """Return the error to raise if there is no reply on the key made of `parts`."""
         reply = None
         if user := self._connection.to_be_asked_for_role(*parts):
             with contextlib.suppress(ServiceError, RefusedError):
@@ -105,7 +105,10 @@ class AsyncConnection:
         return self._connection.why_nobody(parts, reply)
 
     async def states(self, timeout: float | None) -> AsyncGenerator[State]:
-        """Yield states as they arrive, only the newest for a slow caller; end after `timeout` seconds without one."""
+        """Yield states as they arrive; a slow caller gets only the newest.
+
+        End after `timeout` seconds without a state.
+        """
         newest: asyncio.Queue[State] = asyncio.Queue()
 
         def keep_newest(state: State) -> None:
@@ -118,18 +121,21 @@ class AsyncConnection:
                 yield state
 
     async def events(self, history: bool, timeout: float | None) -> AsyncGenerator[Event]:
-        """Yield events in order, each once, with `history` past ones first; end after `timeout` seconds without one."""
+        """Yield each event once, in order; `history` yields past ones first.
+
+        End after `timeout` seconds without an event.
+        """
         received: asyncio.Queue[Event] = asyncio.Queue()
         with self.subscribe_to_events(once(received.put_nowait), history=history):
             async for event in _items_until_timeout(received, timeout):
                 yield event
 
     def overtaken(self, state: State) -> bool:
-        """Whether a state is older than this client's newest answer or event."""
+        """Return whether a state is older than this client's newest reply or event."""
         return self._connection.overtaken(state)
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AbstractContextManager[Any]:
-        """Deliver every event in the event loop, with `history` past ones too."""
+        """Deliver every event in the event loop; `history` delivers past events as well."""
         return self._connection.subscribe_to_events(self._in_loop(deliver), history=history)
 
     def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
@@ -137,7 +143,7 @@ class AsyncConnection:
         return self._connection.records(self._in_loop(deliver))
 
     async def _replies(self, get: Callable[..., object], **query: Any) -> AsyncGenerator[zenoh.Reply]:
-        """Yield the replies to a query by a `get` of Zenoh; leaving cancels the query."""
+        """Yield the replies to a query sent with Zenoh's `get`; closing the generator cancels the query."""
         replies: asyncio.Queue[zenoh.Reply | None] = asyncio.Queue()
         left = zenoh.CancellationToken()
         over = self._in_loop(lambda: replies.put_nowait(None))
@@ -153,14 +159,14 @@ class AsyncConnection:
         """Return a callback for Zenoh's threads that delivers in the event loop."""
 
         def deliver_in_loop(*what: object) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to take it
+            with contextlib.suppress(RuntimeError):  # the loop is closed, so nothing can receive it
                 self._loop.call_soon_threadsafe(deliver, *what)
 
         return deliver_in_loop
 
 
 async def _items_until_timeout(received: asyncio.Queue[Item], timeout: float | None) -> AsyncGenerator[Item]:
-    """Yield received items, until none arrives for `timeout` seconds."""
+    """Yield received items until none arrives for `timeout` seconds."""
     while True:
         try:
             async with asyncio.timeout(timeout):

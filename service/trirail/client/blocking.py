@@ -1,4 +1,4 @@
-"""Event loop in a thread of its own, with blocking goals, jogs, leases and tracks for other threads."""
+"""Event loop in its own thread, and blocking goals, jogs, leases and tracks for other threads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Held = TypeVar("Held", bound=AsyncJog | AsyncLease | AsyncTrack)
 
 
 class LoopThread:
-    """Event loop in a thread of its own, which runs coroutines for other threads."""
+    """Event loop in its own thread that runs coroutines for other threads."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -35,9 +35,9 @@ class LoopThread:
         self._thread.start()
 
     def call(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """Return the result of a coroutine. It is cancelled if the waiting thread is interrupted, as by Ctrl-C.
+        """Run a coroutine and return its result; an interrupt of the waiting thread, such as Ctrl-C, cancels it.
 
-        Raises ServiceError where the loop is closed before the coroutine's end.
+        Raises ServiceError if the loop is closed before the coroutine ends.
         """
         future = self._submit(coroutine)
         try:
@@ -49,16 +49,16 @@ class LoopThread:
             raise
 
     def start(self, coroutine: Coroutine[Any, Any, object]) -> Future[object]:
-        """Run a coroutine in the background; its errors are logged. Cancelling the future cancels it.
+        """Run a coroutine in the background and log its errors. Cancelling the future cancels the coroutine.
 
-        Raises ServiceError where the loop is closed.
+        Raises ServiceError if the loop is closed.
         """
         future = self._submit(coroutine)
         future.add_done_callback(lambda done: None if done.cancelled() else done.result())
         return future
 
     def iterate(self, items: AsyncGenerator[T]) -> Iterator[T]:
-        """Yield the items of a generator. The loop closes it when this one is left, as any dropped generator."""
+        """Yield the items of an asynchronous generator; the loop closes it when the caller stops iterating."""
 
         async def next_item() -> T | None:
             return await anext(items, None)
@@ -94,7 +94,7 @@ class LoopThread:
 
 
 class GoalHandle:
-    """Handle of a goal that the service has accepted; dropping the handle does not stop the goal."""
+    """Handle of an accepted goal; discarding the handle does not stop the goal."""
 
     def __init__(
         self, goal: AsyncGoalHandle, loop: LoopThread, command: Callable[[str, CommandContent], object]
@@ -125,8 +125,7 @@ class GoalHandle:
 
     @property
     def duration(self) -> float | None:
-        """Expected time from acceptance to the end of its path [s], to which settling adds; None while the override is
-        zero."""
+        """Expected time from acceptance to the end of the path, without settling [s]; None at override zero."""
         return self._goal.duration
 
     @property
@@ -135,15 +134,15 @@ class GoalHandle:
         return self._goal.expected
 
     def cancel(self) -> None:
-        """Stop this goal, whether it is under way or waits; return when the robot is at rest, or the goal has ended.
+        """Stop this goal, whether it is running or queued; return when the robot is at rest or the goal has ended.
 
-        Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
-        ServiceError if nobody answers.
+        Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if the goal has
+        ended, and ServiceError if the service does not answer.
         """
         self._command(Command.STOP, Stop(self.id))
 
     def wait(self, timeout: float | None = None) -> Result:
-        """Wait for the end of the goal and return its result, whose `outcome` tells success from failure.
+        """Wait until the goal ends; return its result, whose `outcome` tells success from failure.
 
         Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
         """
@@ -152,7 +151,7 @@ class GoalHandle:
 
 
 class Blocking(Generic[Held]):
-    """Context manager of the event loop that another thread can enter and leave, blocking meanwhile."""
+    """Blocking wrapper with which other threads can enter and leave a context manager of the event loop."""
 
     def __init__(self, held: Held, loop: LoopThread) -> None:
         self._held = held
@@ -167,14 +166,14 @@ class Blocking(Generic[Held]):
 
 
 class Jog(Blocking[AsyncJog]):
-    """Jog at a velocity inside the context; `result` is its result afterwards.
+    """Jog at a velocity while the context lasts; `result` is available afterwards.
 
-    The jog is renewed three times per time-out, which is real time at every override: if the program hangs or dies, the
-    robot brakes. A jog that was paused or has timed out has ended; begin a new one. Leaving the context brakes
-    immediately and waits for standstill.
+    The client renews the jog three times per time-out, which counts real time at every override: if the program hangs
+    or dies, the robot brakes. A jog that was paused or has timed out has ended; begin a new one. Leaving the context
+    brakes immediately and waits until the robot is at rest.
 
     Raises RefusedError on entering if the service refuses the jog, and TimeoutError on leaving if the service does not
-    report its end.
+    report the jog's end.
     """
 
     @property
@@ -194,10 +193,11 @@ class Jog(Blocking[AsyncJog]):
 
 
 class Lease(Blocking[AsyncLease]):
-    """Lease held inside the context; `lost` is the error if it was taken over, released or timed out earlier.
+    """Lease held while the context lasts; `lost` is the error if it was taken over, released or timed out earlier.
 
     Entering returns when the motions of other users have stopped. If the program hangs or dies, the lease is not
-    renewed: the robot stops, and the lease is free. Leaving releases the lease, and returns when the robot is at rest.
+    renewed; the robot then stops and the lease is released. Leaving releases the lease, and returns when the robot is
+    at rest.
 
     Raises RefusedError on entering if another client holds the lease.
     """
@@ -212,14 +212,14 @@ class Lease(Blocking[AsyncLease]):
         return self._loop.call(self._held.wait(timeout))
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(ServiceError):  # the connection is closed: then it ends by its time-out
+        with contextlib.suppress(ServiceError):  # the connection is closed, so the wait ends with its time-out
             super().__exit__()
 
 
 class Track(Blocking[AsyncTrack]):
     """Sender of a target's pose, 10 to 200 times a second; the robot follows the target.
 
-    Only `update` sends anything: if its calls cease for any reason, the robot brakes on its path after the time-out.
+    Only `update` sends messages. If its calls cease for any reason, the robot brakes on its path after the time-out.
     """
 
     @property
@@ -229,7 +229,7 @@ class Track(Blocking[AsyncTrack]):
 
     @property
     def lag(self) -> float | None:
-        """Greatest distance of a point of the platform from its target, in the latest reply [m]."""
+        """Greatest distance between a point of the platform and its place at the target, in the latest reply [m]."""
         return self._held.lag
 
     @property
@@ -240,15 +240,16 @@ class Track(Blocking[AsyncTrack]):
     def update(
         self, pose: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), time: float | None = None
     ) -> None:
-        """Send the target's pose and velocity at a time: x, y [m], phi [rad], and per second.
+        """Send the target's pose x, y [m], phi [rad] and its velocity [m/s, m/s, rad/s] at a time.
 
-        `time` is that of the wall clock [s since 1970], now if absent; on another machine than the service's the
-        clocks must agree. Until the next call the robot keeps that velocity. The first call returns when the track is
-        accepted, the others immediately: the next call raises a refusal. Raises RefusedError, also once the track has
-        ended (a stop, a pause, another goal, a time-out), and ServiceError where nobody answers.
+        `time` is wall-clock time [s since 1970] and defaults to now; the clocks must agree if the service runs on
+        another machine. The robot keeps the velocity until the next call. The first call returns when the service
+        accepts the track. Later calls return immediately, so the next call raises an earlier refusal. Raises
+        RefusedError, also if the track has ended because of a stop, a pause, another goal or a time-out, and
+        ServiceError if the service does not answer.
         """
         self._loop.call(self._held.update(pose, velocity, time))
 
     def close(self) -> None:
-        """Brake on the path, if the robot still follows; return when it is at rest."""
+        """Brake on the path if the robot still follows; return when it is at rest."""
         self._loop.call(self._held.close())

@@ -58,7 +58,7 @@ def write(
 def keep_old(path: Path) -> Path | None:
     """Save a copy of an existing file as NAME.old, for the taught targets; return its path. Raises FileError.
 
-    Return None where there is no file.
+    Return None if there is no file.
     """
     if not path.exists():
         return None

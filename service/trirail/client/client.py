@@ -1,4 +1,4 @@
-"""A client of the service: goals, commands and states over Zenoh.
+"""Blocking client of the service: goals, commands and states over Zenoh.
 
 with Robot("demo") as robot:
     robot.enable()
@@ -27,14 +27,14 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.stop_protocol import STOPS
 from trirail.wire.vocabulary import CommandContent
 
-if TYPE_CHECKING:  # numpy, which most programs do without
+if TYPE_CHECKING:  # numpy, which most programs do not need
     from trirail.alignment.alignment_request import AlignmentRequest, Observation
     from trirail.client.alignment import Look
 
 __all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
 SEEN_WITHIN = 1.0
-"""Longest wait for the state in the text of a robot [s]."""
+"""Time-out for the state that the text form of a Robot shows [s]."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -44,7 +44,7 @@ Held = TypeVar("Held")
 def _call(
     method: Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot that waits for one of AsyncRobot."""
+    """Return the method of Robot that runs a method of AsyncRobot and waits for its result."""
 
     @functools.wraps(method)
     def call(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -56,7 +56,10 @@ def _call(
 def _stop(
     method: Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot that waits for a stop of AsyncRobot; calls that wait for the link do not delay it."""
+    """Return the method of Robot that runs a stop of AsyncRobot and waits for its result.
+
+    The stop has its own event loop, so calls that wait for a congested link do not delay it.
+    """
 
     @functools.wraps(method)
     def call(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -68,7 +71,7 @@ def _stop(
 def _command(
     method: Callable[[AsyncRobot, str, CommandContent | bytes | None], Coroutine[Any, Any, CommandReply]],
 ) -> Callable[..., CommandReply]:
-    """Return the method of Robot that sends a command by its name, stops by `_stop`."""
+    """Return the method of Robot that sends a command by name; commands that stop the robot use `_stop`."""
     send, stop = _call(method), _stop(method)
 
     @functools.wraps(method)
@@ -81,7 +84,7 @@ def _command(
 def _goal(
     method: Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, AsyncGoalHandle]],
 ) -> Callable[Concatenate[Robot, P], GoalHandle]:
-    """Return the method of Robot that sends a goal by one of AsyncRobot."""
+    """Return the method of Robot that sends a goal through a method of AsyncRobot."""
 
     @functools.wraps(method)
     def send(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> GoalHandle:
@@ -93,7 +96,7 @@ def _goal(
 def _context(
     method: Callable[Concatenate[AsyncRobot, P], Held], kind: Callable[[Held, LoopThread], T]
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot for the context of one of AsyncRobot, of a `kind`."""
+    """Return the method of Robot that wraps a context manager of AsyncRobot as a `kind`."""
 
     @functools.wraps(method)
     def hold(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -105,7 +108,7 @@ def _context(
 def _iterator(
     method: Callable[Concatenate[AsyncRobot, P], AsyncGenerator[T]],
 ) -> Callable[Concatenate[Robot, P], Iterator[T]]:
-    """Return the method of Robot that yields the items of one of AsyncRobot."""
+    """Return the method of Robot that yields the items of an asynchronous generator of AsyncRobot."""
 
     @functools.wraps(method)
     def iterate(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> Iterator[T]:
@@ -117,7 +120,7 @@ def _iterator(
 def _conversation(
     method: Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot for a procedure of AsyncRobot, with the pictures taken in the caller's thread."""
+    """Return the method of Robot for a procedure of AsyncRobot; the caller's thread takes the pictures."""
 
     @functools.wraps(method)
     def converse(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -129,7 +132,7 @@ def _conversation(
 
 
 def _returning(method: Callable[P, T], kind: object) -> Callable[P, T]:
-    """Give the signature of a method its return type; return the method."""
+    """Set the return type in a method's signature; return the method."""
     name = getattr(kind, "__name__", str(kind))
     vars(method)["__signature__"] = inspect.signature(method).replace(return_annotation=name)
     return method
@@ -138,13 +141,15 @@ def _returning(method: Callable[P, T], kind: object) -> Callable[P, T]:
 class Robot:
     """A connection to one robot's service; several threads may share it.
 
-    `name` is that of the robot's configuration, `connect` the Zenoh locator of its service or of a router, both from
-    TRIRAIL_ROBOT and TRIRAIL_CONNECT if absent, or demo on this machine; `user` is the sender of goals and commands
-    (the login name if absent). At a locator tls/HOST:PORT the folder `tls`, TRIRAIL_TLS or ~/.config/trirail/<name> if
-    absent, has ca.pem, cert.pem and key.pem, and the user is the name in the certificate; RefusedError not_allowed
-    names the role that would be needed. Poses are x, y [m] of the platform's centre in the base frame and its angle
-    phi [rad], counterclockwise. Any call raises ServiceError where nobody answers and RefusedError, with code, slider,
-    value and limit, where the service refuses; nothing moves because of that call.
+    `name` is the name in the robot's configuration, and `connect` is the Zenoh locator of its service or of a router.
+    They default to TRIRAIL_ROBOT and TRIRAIL_CONNECT, or else to the robot demo on this machine. `user` sends the goals
+    and commands, and defaults to the login name. For a locator tls/HOST:PORT, the folder `tls` must contain ca.pem,
+    cert.pem and key.pem; it defaults to TRIRAIL_TLS or else to ~/.config/trirail/<name>. The user is then the name in
+    the certificate, and a RefusedError `not_allowed` names the role that the call requires.
+
+    A pose is x, y [m] of the platform's centre in the base frame and the platform's angle phi [rad], counterclockwise.
+    Every call raises ServiceError if the service does not answer. If the service refuses the call, nothing moves, and
+    the call raises RefusedError with a code, slider, value and limit.
     """
 
     def __init__(
@@ -159,7 +164,8 @@ class Robot:
         self._connection = self._robot._connected()
         self._loop = LoopThread()
         self._loop.call(self._robot._use(self._connection))
-        # A call that waits for a congested link, in the thread of its loop, must not hold up a stop.
+        # A call that waits for a congested link blocks its event loop's thread. Stops have a second loop, so that such
+        # a call cannot delay them.
         self._stop_loop = LoopThread()
         self._stopping = self._stop_loop.call(self._robot._twin(self._connection))
 
@@ -181,7 +187,7 @@ class Robot:
             return f"<Robot {self.name}: {error}>"
 
     def _repr_html_(self) -> str:
-        """Return mode and pose with a drawing, for notebooks."""
+        """Return the robot's mode and pose with a drawing, for notebooks."""
         from trirail.client import picture
 
         try:
@@ -190,18 +196,18 @@ class Robot:
             return escape(f"<Robot {self.name}: {error}>")
 
     def close(self) -> None:
-        """End the connection; goals under way continue."""
+        """Close the connection; accepted goals continue."""
         self._connection.close()
         self._loop.close()
         self._stop_loop.close()
 
     async def _for_running_loop(self) -> AsyncRobot:
-        """Return a robot for the running event loop that shares this connection, until either of them is closed."""
+        """Return a robot for the running event loop; it shares this connection until either of the two is closed."""
         return await self._robot._shared(self._connection)
 
     @property
     def skipped(self) -> int:
-        """Number of publications on this robot's keys that were not valid messages."""
+        """Number of invalid messages received on this robot's keys."""
         return self._connection.skipped
 
     # ------------------------------------------------------------------ goals and commands
@@ -251,18 +257,19 @@ class Robot:
         stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> GoalHandle:
-        """Send a timed trajectory that begins at the robot's pose; return once it is accepted.
+        """Send a timed trajectory that begins at the robot's pose; return once the service accepts it.
 
-        With `go_there` the robot first moves to its first point, by a goal as of move_to: this waits for its end, and
-        raises RefusedError `wrong_start` where its outcome is not done.
+        With `go_there`, the robot first moves to the first point, with a goal like that of move_to. The call waits for
+        the end of this goal, and raises RefusedError `wrong_start` if its outcome is not done.
 
-        A point is t [s], x, y [m] and phi [rad], and, if known, velocity and acceleration of the three.
-        `points` may be rows of these four, as an array (N, 4), or the path of a CSV or JSON file.
-        The path is quintic between the points; a missing velocity is that between the neighbours, zero at the ends. A
-        trajectory that is too fast for a slider is refused, or slowed as a whole with `stretch`. With `settle` False it
-        is done when its path has ended, whether or not the robot is measured to be there.
+        A point consists of t [s], x, y [m] and phi [rad], and optionally of the velocity and acceleration of x, y and
+        phi. `points` may be rows of t, x, y and phi, such as an array (N, 4), or the path of a CSV or JSON file.
+        Quintic polynomials join the points. A missing velocity is the mean velocity between the neighbouring points,
+        and zero at both ends. The service refuses a trajectory that is too fast for a slider; with `stretch`, it slows
+        the whole trajectory down instead. With `settle` False, the goal is done when its path ends, even if the robot
+        is not yet measured to be in position.
         """
-        points = points_of(points)  # in the caller's thread: an iterator of theirs may call this robot
+        points = points_of(points)  # in the caller's thread: the caller's iterator may itself call this robot
         how: dict[str, Any] = {
             "stretch": stretch,
             "settle": settle,
@@ -279,9 +286,9 @@ class Robot:
     events = _iterator(AsyncRobot.events)
 
     def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
-        """Deliver every batch of records as it arrives, until the context ends; wire.records.unpack reads them.
+        """Deliver every batch of records as it arrives, until the context ends; wire.records.unpack decodes a batch.
 
-        `deliver` is called by the connection's own thread: it must be quick.
+        The connection's own thread calls `deliver`, which must return quickly.
         """
         return self._connection.records(deliver)
 
@@ -290,7 +297,7 @@ class Robot:
     async def _converse(
         self, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
     ) -> T:
-        """Carry out the requests of a trirail.alignment procedure in this thread; return its result."""
+        """Carry out the requests of a trirail.alignment procedure in this thread; return the procedure's result."""
         from trirail.client.alignment import drive
 
         return drive(self, look, requests, speed, wait)

@@ -1,4 +1,4 @@
-"""Zenoh session of one client of one robot: queries to the service, and its publications by callbacks."""
+"""Zenoh session of one client of one robot: queries to the service, and callbacks for its publications."""
 
 from __future__ import annotations
 
@@ -25,21 +25,20 @@ from trirail.wire.text import is_name, quoted
 from trirail.wire.vocabulary import Role
 
 ROLE_WITHIN = 0.8
-"""Time-out of the answer with a user's role [s]."""
+"""Time-out of the reply with a user's role [s]."""
 REPLY_WITHIN = 20.0
 """Time-out for carrying out a command [s]."""
 HERE_WITHIN = 1.0
-"""Time-out of the answer with the connected users [s]."""
+"""Time-out of the reply with the connected users [s]."""
 POST_WITHIN = 2.0
-"""Time-out of the answer to a posted query [s]."""
+"""Time-out of the reply to a posted query [s]."""
 CLOSED = "the connection is closed: open a new one, as Robot(…)"
 ZENOHS_TIMEOUT = b"Timeout"
-"""Answer of Zenoh itself to a query after its time-out."""
+"""Reply with which Zenoh itself ends a query after its time-out."""
 MAX_OVERTAKEN_S = 1.0
-"""Longest delay of a state that an answer or an event has overtaken [s].
+"""Longest delay of a state behind the reply or event that overtook it [s].
 
-States of a service that was restarted within it, and counts from one, are accepted after it.
-"""
+After this time the client accepts the states of a restarted service, which counts from one again."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 Message = TypeVar("Message")
@@ -50,7 +49,7 @@ class SilenceError(ServiceError):
 
 
 class Connection:
-    """Session to the service of a robot at a Zenoh locator; its user, if given, is visible to others while it is open.
+    """Session to a robot's service at a Zenoh locator. Others can see the user, if given, while the session is open.
 
     Raises ServiceError if the locator cannot be reached.
     """
@@ -77,12 +76,12 @@ class Connection:
     # ------------------------------------------------------------------ asking
 
     def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
-        """Query the key of these parts without waiting for an answer."""
+        """Query the key made of `parts` without waiting for a reply."""
         handler = zenoh.handlers.Callback(_ignore, indirect=False)
         self.session.get(**self.query(parts, payload, REPLY_WITHIN), handler=handler)
 
     def query(self, parts: tuple[str, ...], payload: bytes | None, within: float) -> dict[str, Any]:
-        """Return the query of the key of these parts, as arguments of a session's `get`.
+        """Return the arguments of a session's `get` for a query of the key made of `parts`.
 
         A reply has the quality of service of its query: the reply to a droppable query would be droppable.
         """
@@ -99,7 +98,7 @@ class Connection:
         }
 
     def read(self, reply: zenoh.Reply, kind: type[T]) -> T | ServiceError:
-        """Return the message of a reply; ServiceError where it holds none. Raises RefusedError for a refusal."""
+        """Return the message in a reply, or a ServiceError if it contains none. Raises RefusedError for a refusal."""
         if reply.ok is not None:
             try:
                 answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
@@ -132,9 +131,9 @@ class Connection:
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
-        """Query the key of these parts without waiting: `deliver` gets a message of `kind`, or the error.
+        """Query the key made of `parts` without waiting; `deliver` receives a message of `kind` or the error.
 
-        It is called once, by a thread of the connection: it must be quick.
+        A thread of the connection calls `deliver` once; it must return quickly.
         """
         query = self.query(parts, payload, POST_WITHIN) | {"congestion_control": zenoh.CongestionControl.DROP}
         self._post(query, kind, deliver)
@@ -156,15 +155,15 @@ class Connection:
         self.session.get(**query, handler=handler)
 
     def to_be_asked_for_role(self, *parts: str) -> str | None:
-        """Return the user whose role may explain why nobody answers on the key of these parts; None for no user."""
+        """Return the user whose role may explain a missing reply on the key made of `parts`; None if there is none."""
         user = self._credentials.name if self._credentials is not None else ""
         return user if is_name(user) and parts[0] != "role" else None
 
     def why_nobody(self, parts: tuple[str, ...], reply: RoleReply | None) -> ServiceError | RefusedError:
-        """Return the error to raise where nobody answers, by the reply to the query for the user's role.
+        """Return the error to raise for a missing reply, given the reply to the query for the user's role.
 
-        Zenoh silently drops queries that a role does not allow, as it does those without a receiver. Every certificate
-        may ask for its role: the answer, within ROLE_WITHIN, distinguishes the two.
+        Zenoh silently drops queries that a role does not allow, as it drops those without a receiver. Every certificate
+        may query its role; whether a reply arrives within ROLE_WITHIN distinguishes the two cases.
         """
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
             self._no_answer_message(
@@ -179,7 +178,7 @@ class Connection:
         return f"no robot {self.robot!r} answers at {self._connect}: {why}"
 
     def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:
-        """Return the refusal if the user's role does not allow the key of these parts, else None."""
+        """Return the refusal if the user's role does not allow the key made of `parts`, else None."""
         needed = least_role(*parts)
         if role is None:
             problem = f"{user} has no role at {self.robot}: [zenoh.users] does not list this user, or it is revoked"
@@ -192,7 +191,7 @@ class Connection:
     # ------------------------------------------------------------------ subscriptions
 
     def overtaken(self, state: State) -> bool:
-        """Whether a state is older than this client's newest answer or event."""
+        """Return whether a state is older than this client's newest reply or event."""
         return state.seq < self._known[0] and not self._known_is_old()
 
     def subscribe_to_states(self, deliver: Callable[[State], None]) -> zenoh.Subscriber[None]:
@@ -200,7 +199,7 @@ class Connection:
         return self.session.declare_subscriber(self.key("state"), self._reader.messages(State, deliver))
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
-        """Deliver every event, with `history` past ones too, also those of a restarted gateway."""
+        """Deliver every event, including those of a restarted gateway; `history` delivers past events as well."""
         return declare_advanced_subscriber(
             self.session,
             self.key("event"),
@@ -236,7 +235,7 @@ class Connection:
 
 
 def _ignore(_reply: zenoh.Reply) -> None:
-    """Discard an answer that is not needed."""
+    """Discard a reply that is not needed."""
 
 
 def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:

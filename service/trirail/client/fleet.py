@@ -18,14 +18,13 @@ from trirail.wire.state import RobotSummary
 from trirail.wire.vocabulary import Mode
 
 MAX_SILENCE_S: Final = 3.0
-"""Age of a robot's newest data above which the robot counts as silent [s]; a summary arrives once a second.
+"""Age of a robot's newest data at which the robot counts as silent [s]; a summary arrives once a second.
 
-Zenoh's liveliness tokens are not used, since they outlive a killed process.
-"""
+Zenoh's liveliness tokens are not used, since they outlive a killed process."""
 
 
 class Attention(IntEnum):
-    """Need of a robot for attention, in falling order."""
+    """Urgency with which a robot needs attention, in falling order."""
 
     SILENT = 0
     FAULT = 1
@@ -38,7 +37,7 @@ class Member(NamedTuple):
     robot: str
     summary: RobotSummary
     heard: float
-    """Arrival of the summary, on the monotonic clock of this machine [s]."""
+    """Arrival time of the summary, on this machine's monotonic clock [s]."""
 
     def age(self, now: float) -> float:
         """Return the age of the newest data of the robot's loop [s]."""
@@ -52,7 +51,7 @@ class Member(NamedTuple):
 
 
 class Fleet:
-    """Subscription to every robot's summary while the context lasts. Raises ServiceError where nobody answers."""
+    """Subscription to the summaries of all robots. Raises ServiceError if the locator cannot be reached."""
 
     def __init__(
         self,

@@ -19,86 +19,86 @@ from trirail.wire.messages import Event, GoalReply, Residual
 from trirail.wire.vocabulary import Command, Stop
 
 STANDS_WITHIN = 10.0
-"""Time that the end of a jog may take beyond its own time-out [s]."""
+"""Time that the end of a jog may take in addition to the jog's own time-out [s]."""
 BRAKE_RENEWAL_S = 0.05
-"""Time-out of a jog's last renewal, whose velocity is zero [s]."""
+"""Time-out of a jog's last renewal, which requests zero velocity [s]."""
 
 Velocity = tuple[float, float, float]
 """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
 
 
 class Result(NamedTuple):
-    """End of a goal; every goal has exactly one."""
+    """Result of a goal; every goal has exactly one."""
 
     id: str
     outcome: str
     """One of done, rejected, preempted, stopped, expired, faulted and unsettled."""
     message: str
-    """Reason, in one line for people."""
+    """Reason in one line, for people."""
     settle: float | None = None
-    """Time of a goal that is done from the end of its path until the robot was in position, to the first cycle of the
-    dwell [s]. None, as the two below, for goals that do not settle: a jog, a goal that was passed on the way to the
-    next, a trajectory with `settle` False."""
+    """Time from the end of the path to the first cycle of the dwell in position, for a goal that is done [s]. This
+    field and the two below are None for goals that do not settle: a jog, a goal that blends into the next one, and a
+    trajectory with `settle` False."""
     residual: Residual | None = None
-    """Distance from the target at its end, done or unsettled: `sliders` [m], and `pose` [m, m, rad]."""
+    """Distance from the target at the end of a goal that is done or unsettled: `sliders` [m], and `pose` [m, m, rad].
+    """
     overshoot: tuple[float, float, float] | None = None
     """Greatest overshoot of the sliders A, B, C since the end of the path [m]."""
     marks: tuple[Switch, ...] = ()
-    """Switches of outputs on its path, in the order in which they happened."""
+    """Output switches on the path, in the order in which they happened."""
 
 
 def result_of(event: Event) -> Result | None:
-    """Return the result in an event of a goal's end; None for any other event."""
+    """Return the result that an event reports; None if the event is not the end of a goal."""
     if event.id is None or event.outcome is None:
         return None
     return Result(event.id, event.outcome, event.message, event.settle, event.residual, event.overshoot)
 
 
 class AsyncGoalHandle:
-    """Handle of a goal that the service has accepted; dropping the handle does not stop the goal.
+    """Handle of an accepted goal; discarding the handle does not stop the goal.
 
-    `command` sends a command with its content: AsyncRobot.command.
+    `command` sends a command with its content, as AsyncRobot.command does.
     """
 
     def __init__(self, goal_id: str, command: Callable[[Command, bytes], Awaitable[object]]) -> None:
         self.id = goal_id
         self.reply = GoalReply(goal_id, 0.0)
-        """Reply of the service to the goal."""
+        """Reply of the service that accepted the goal."""
         self._command = command
         self._result: Result | None = None
         self._ended = asyncio.Event()
 
     def __repr__(self) -> str:
-        """Return class, id and, once there is one, the outcome."""
+        """Return the class name and id, and the outcome once there is one."""
         outcome = f" {self._result.outcome}" if self._result is not None else ""
         return f"<{type(self).__name__} {self.id}{outcome}>"
 
     @property
     def result(self) -> Result | None:
-        """Result of the goal; None before its end."""
+        """Result of the goal; None until the goal ends."""
         return self._result
 
     @property
     def duration(self) -> float | None:
-        """Expected time from acceptance to the end of its path [s], to which settling adds; None while the override is
-        zero."""
+        """Expected time from acceptance to the end of the path, without settling [s]; None at override zero."""
         return self.reply.duration
 
     @property
     def expected(self) -> str:
-        """Expected duration, for people."""
+        """Expected duration as text, for people."""
         return f"{self.duration:.2f} s" if self.duration is not None else "no expected end while the override is 0"
 
     async def cancel(self) -> None:
-        """Stop this goal, whether it is under way or waits; return when the robot is at rest, or the goal has ended.
+        """Stop this goal, whether it is running or queued; return when the robot is at rest or the goal has ended.
 
-        Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if it has ended,
-        ServiceError if nobody answers. Cancelling a task that waits for it does not stop it.
+        Other goals continue, except those that wait for this one. Cancelling a task that waits for the goal does not
+        stop it. Raises RefusedError (`no_goal`) if the goal has ended, and ServiceError if the service does not answer.
         """
         await self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
 
     async def wait(self, timeout: float | None = None) -> Result:
-        """Wait for the end of the goal and return its result, whose `outcome` tells success from failure.
+        """Wait until the goal ends; return its result, whose `outcome` tells success from failure.
 
         Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
         """
@@ -111,17 +111,17 @@ class AsyncGoalHandle:
         return self._result
 
     def end(self, result: Result) -> None:
-        """Set the result, and wake the waiting tasks."""
+        """Set the result and wake the waiting tasks."""
         self._result = result
         self._ended.set()
 
 
 class OpenGoals:
-    """Registry of the handles of goals that a client has sent and that have not ended yet.
+    """Registry of the handles of goals that a client has sent and that have not ended.
 
-    Calls with one id share one handle: renewals of a jog, and goals that the service refuses because their id has been
-    used. A refusal concerns its own call alone, so a handle is kept while another call with its id is under way or has
-    been accepted.
+    Calls with the same id share a handle. These are the renewals of a jog, and goals that the service refuses because
+    their id is already in use. A refusal concerns only its own call, so a handle stays registered while another call
+    with its id is pending or accepted.
     """
 
     def __init__(self) -> None:
@@ -134,7 +134,7 @@ class OpenGoals:
         return len(self._handles)
 
     def open(self, handle: AsyncGoalHandle) -> AsyncGoalHandle:
-        """Register a goal that is about to be sent; return its handle, or the existing one with the same id."""
+        """Register a goal before it is sent; return its handle, or the existing handle with the same id."""
         self._calls[handle.id] += 1
         return self._handles.setdefault(handle.id, handle)
 
@@ -142,11 +142,11 @@ class OpenGoals:
         """Keep the handle of an accepted goal until the goal ends."""
         handle.reply = reply
         self._end_call(handle.id)
-        if self._handles.get(handle.id) is handle:  # else it has ended already
+        if self._handles.get(handle.id) is handle:  # otherwise the goal has already ended
             self._accepted.add(handle.id)
 
     def refuse(self, goal_id: str) -> bool:
-        """Forget a call that was refused or not answered; return whether its handle is forgotten with it."""
+        """Unregister a call that was refused or not answered; return whether this also removed its handle."""
         self._end_call(goal_id)
         if goal_id in self._accepted or goal_id in self._calls:
             return False
@@ -154,13 +154,13 @@ class OpenGoals:
         return self._handles.pop(goal_id, None) is not None
 
     def end(self, result: Result) -> None:
-        """End the handle of a goal, if it is one of these."""
+        """Set the result of a goal's handle, if the goal is registered."""
         self._accepted.discard(result.id)
         if (handle := self._handles.pop(result.id, None)) is not None:
             handle.end(result._replace(marks=tuple(self._switches.pop(result.id, ()))))
 
     def note_switches(self, switches: Iterable[Switch]) -> None:
-        """Add switches to the results of their goals, of those that are followed here."""
+        """Add output switches to the results of their goals; ignore those of goals that are not registered."""
         for switch in switches:
             if switch.goal in self._handles:
                 self._switches.setdefault(switch.goal, []).append(switch)
@@ -172,14 +172,14 @@ class OpenGoals:
 
 
 class AsyncJog:
-    """Jog at a velocity inside the context; `result` is its result afterwards.
+    """Jog at a velocity while the context lasts; `result` is available afterwards.
 
     A task renews the jog three times per time-out; see trirail.client.blocking.Jog.
 
     Parameters
     ----------
     send
-        Function that sends a goal with an id: AsyncRobot.send.
+        Function that sends a goal with an id, such as AsyncRobot.send.
     velocity
         Velocity of the tool: x, y [m/s] and phi [rad/s] in the base frame.
     timeout
@@ -203,16 +203,16 @@ class AsyncJog:
         self._over = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
         self.error: Exception | None = None
-        """Error of the last renewal, if it failed."""
+        """Error of the last renewal, if that failed."""
 
     @property
     def reply(self) -> GoalReply | None:
-        """Latest reply of the service, with `slowed` for one; None before the first."""
+        """Latest reply of the service, which may contain `slowed`; None before the first reply."""
         return self._goal.reply if self._goal else None
 
     @property
     def result(self) -> Result | None:
-        """Result of the goal; None before its end."""
+        """Result of the jog; None until the jog ends."""
         return self._goal.result if self._goal else None
 
     async def __aenter__(self) -> Self:
@@ -223,9 +223,9 @@ class AsyncJog:
     async def __aexit__(self, *_: object) -> None:
         self._over.set()
         if self._renewing is not None:
-            await self._renewing  # a renewal that has been sent is not cancelled
+            await self._renewing  # do not cancel a renewal that has been sent
         if self._goal is not None and self.result is None and self.error is None:
-            with contextlib.suppress(TrirailError):  # it has ended, or will by its time-out
+            with contextlib.suppress(TrirailError):  # the jog has ended, or its time-out will end it
                 await self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S)
             await self._goal.wait(self._timeout + STANDS_WITHIN)
 
@@ -240,7 +240,7 @@ class AsyncJog:
                 await self._send(self._velocity, self._timeout)
             except TrirailError as error:
                 at_limit = isinstance(error, RefusedError) and error.code is RefusalCode.AT_LIMIT
-                self.error = None if at_limit else error  # the end at a limit is regular
+                self.error = None if at_limit else error  # reaching a limit is a regular end
                 return
 
     async def _is_over(self, within: float) -> bool:

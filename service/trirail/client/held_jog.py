@@ -22,18 +22,18 @@ USUAL = 3
 
 
 class HeldJog:
-    """Hold-to-run control: a thread sends a short velocity goal for each key event, and the service's time-out brakes.
+    """Hold-to-run control: a thread sends a short velocity goal for each key event.
 
-    The jog is renewed only by key events: when the key, the program or the network fails, the time-out of the service
-    brakes. A key event older than that time-out is discarded. A jog that the service has refused or ended (a stop, a
-    limit, another user's goal) begins again only after a release.
+    Only key events renew the jog. When the key is released or the program or the network fails, the service's time-out
+    brakes the robot. A key event older than that time-out is discarded. After the service has refused or ended a jog
+    (with a stop, at a limit, or for another user's goal), a new jog begins only after the key was released.
 
     Parameters
     ----------
     send
         Function that sends a goal with an id, such as Robot.send.
     ended
-        Called with the reason of the end, in one line.
+        Function that is called with the reason for the end, in one line.
 
     """
 
@@ -48,12 +48,12 @@ class HeldJog:
         self._tool: Tool | None = None
         self._over = False
         self.error: TrirailError | None = None
-        """Error that ended the last jog; None where the service ended it otherwise."""
+        """Error that ended the last jog; None if the service ended it for another reason."""
         self._thread = threading.Thread(target=self._run, name="held jog", daemon=True)
         self._thread.start()
 
     def hold(self, velocity: Velocity, tool: Tool | None = None) -> None:
-        """Renew the jog by a key event, with the requested velocity of the tool."""
+        """Extend the jog on a key event, with the requested velocity of the tool."""
         with self._changed:
             self._sign = velocity, tool, time.monotonic()
             self._changed.notify()

@@ -1,4 +1,4 @@
-"""Robot, locator, user and credentials of a client: as given, else from the environment."""
+"""Robot, locator, user and credentials of a client, from arguments or else from the environment."""
 
 from __future__ import annotations
 

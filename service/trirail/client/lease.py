@@ -20,10 +20,10 @@ SIGNS = 4
 
 
 class AsyncLease:
-    """Lease held inside the context, renewed by a task; as trirail.client.blocking.Lease.
+    """Lease held while the context lasts and renewed by a task; see trirail.client.blocking.Lease.
 
-    If entering is cancelled, the lease is not renewed, and ends by its time-out. `command` sends a command with its
-    content: AsyncRobot.command.
+    If entering is cancelled, the lease is not renewed and times out. `command` sends a command with its content, as
+    AsyncRobot.command does.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Stop by a program without a session, which does not wait for a session: a flooded port may not accept one."""
+"""Stop for a program without a session; it does not wait for one, since a flooded port may not accept a session."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from trirail.wire.messages import CommandReply
 
 
 class NewStop:
-    """Stop, quick_stop or disable, requested at the door for stops and by a session that opens meanwhile.
+    """Stop, quick_stop or disable, sent to the stop port and over a session that opens in the meantime.
 
-    Raises as Robot does.
+    Raises the same errors as Robot.
     """
 
     def __init__(

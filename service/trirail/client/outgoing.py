@@ -1,6 +1,6 @@
-"""Messages from a program's values: numbers and arrays of any library, checked as by the service.
+"""Messages from a program's values: numbers and arrays of any library, checked as the service checks them.
 
-A number has `__float__` or `__index__`, as those of numpy and fractions; truth values and texts are no numbers.
+A number has `__float__` or `__index__`, as do those of numpy and fractions; booleans and strings are not numbers.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _itself(goal: Goal) -> Goal:
 
 
 def too_many(number: int) -> str:
-    """Return why a trajectory with this number of points cannot be sent, and what to do; "" where it can."""
+    """Return why a trajectory with this many points cannot be sent and what to do; "" if it can be sent."""
     if number <= MAX_POINTS:
         return ""
     step = -(-number // MAX_POINTS)
@@ -116,7 +116,7 @@ def seconds(value: object) -> float | None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as a message's type. Raises TypeError where there is none, ValueError if it is not finite."""
+    """Return a value as a message's type. Raises TypeError if there is none, ValueError if it is not finite."""
     numpy = sys.modules.get("numpy")  # a program with numbers of numpy has imported it
     if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
         if value.dtype.kind == "f" and not numpy.isfinite(value).all():

@@ -1,4 +1,4 @@
-"""Private service in a process of its own, for demos, tools and tests: start, wait until it is up, end."""
+"""Private service in its own process, for demos, tools and tests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PATIENT = {
 }
 """Keys of a configuration that tolerates processes stalled for a second by a busy machine."""
 START_WITHIN = 300.0
-"""Time-out of the start, or, at the very first start, of the compilation of one function [s]."""
+"""Time-out of the start [s]; at the very first start, the time-out for compiling one function."""
 END_WITHIN = 20.0
 """Time-out for stopping the robot and ending [s]."""
 
@@ -37,13 +37,13 @@ Process = subprocess.Popen[bytes]
 
 @contextlib.contextmanager
 def service(config: Path, recording: Path, report_start: Callable[[str], None] = lambda _: None) -> Iterator[Process]:
-    """Run a service with a configuration file, which records to a file; end it when the context ends.
+    """Run a service with a configuration file, recording to a file; end the service when the context ends.
 
-    The context begins when the service is up. `report_start` gets its messages about the start: the progress of
-    compilation at the very first one.
+    The context begins when the service is up. `report_start` receives messages about the start, such as the progress of
+    the compilation at the very first start.
 
-    Raises ServiceError if it cannot start. If the context ends with an error that is no refusal, the service's output
-    is first written to standard error.
+    Raises ServiceError if the service cannot start. If the context ends with an error that is not a refusal, the
+    service's output is first written to standard error.
     """
     with tempfile.TemporaryFile() as log:
         process = None
@@ -70,9 +70,10 @@ def start(
 ) -> Process:
     """Start a service, and wait until it is up; the caller must `end` it.
 
-    `arguments` are added to `trirail run`, `environment` to the variables; its output is written to `log`. It is up
-    when it reports so, as to systemd: a query on its port could find another service, and move that. Raises
-    ServiceError if it ends before it is up, or makes no progress for START_WITHIN seconds; then it has been ended.
+    `arguments` are added to `trirail run`, and `environment` to its environment variables; the output is written to
+    `log`. The service is up when it reports so, as it does to systemd. A query on its port could instead reach another
+    service, and move that robot. Raises ServiceError if the service ends before it is up, or makes no progress for
+    START_WITHIN seconds; the service has then been ended.
     """
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
         ready.bind(f"{folder}/ready")

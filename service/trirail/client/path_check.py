@@ -1,4 +1,4 @@
-"""Check before motion whether a pose is reachable or a file can be followed; the service makes the final decision."""
+"""Check before a motion whether a pose is reachable or a file can be followed; the service decides in the end."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Obstacle(Struct, frozen=True, omit_defaults=True):
 
     message: str
     on_way: bool = False
-    """Whether it is on the way, before the end."""
+    """Whether the obstacle is on the way to the end, and not at the end itself."""
     code: str = ""
     """Name of the exceeded limit, "unreachable", or a RefusalCode."""
     what: str = ""

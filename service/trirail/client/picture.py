@@ -19,9 +19,9 @@ from trirail.workspace.part_positions import RobotParts
 WIDTH_PX = 360
 """Width of the drawing [px]."""
 MARGIN = 0.08
-"""Margin around the drawing, as a share of the robot's size."""
+"""Margin around the drawing, as a fraction of the robot's size."""
 LINE, THICK = 0.005, 0.02
-"""Widths of lines, as shares of the robot's size."""
+"""Widths of lines, as fractions of the robot's size."""
 
 
 def line(name: str, state: State) -> str:

@@ -18,9 +18,9 @@ _LOG = logging.getLogger("trirail")
 
 
 class SampleReader:
-    """Decoder of samples for one client; each of its callbacks for Zenoh is for one kind of content.
+    """Decoder of samples for one client; each of its Zenoh callbacks handles one kind of content.
 
-    Any program on the network may publish anything on any key, so that invalid content must never raise an error.
+    Any program on the network may publish anything on any key, so invalid content must never raise an error.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class SampleReader:
     def messages(self, kind: type[T], deliver: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
         """Return a callback that decodes messages of a `kind`, JSON or msgpack by their encoding, for `deliver`.
 
-        `deliver` is called directly in the connection's own thread: it must be quick.
+        The connection's own thread calls `deliver`, which must return quickly.
         """
 
         def read(sample: zenoh.Sample) -> T:
@@ -41,7 +41,7 @@ class SampleReader:
         return self._handler(read, deliver)
 
     def batches(self, deliver: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return a callback that delivers whole batches of records, packed as in wire.records, in the same way."""
+        """Return a callback that passes whole batches of records, packed as in wire.records, to `deliver`."""
         from trirail.wire import records  # with numpy, which most commands do without
 
         return self._handler(lambda sample: records.checked(sample.payload.to_bytes()), deliver)

@@ -1,6 +1,6 @@
 """True pose of a stage that differs from its service's model, in its geometry and by backlash in its drives.
 
-For simulated cameras: it takes the encoders' measurements from the records that a service publishes.
+Used for simulated cameras. The encoder measurements are from the records that a service publishes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from trirail.wire.records import unpack
 HISTORY = 5000
 """Number of cycles that are kept."""
 COMES_WITHIN = 2.0
-"""Time-out of the arrival of a time's records [s]."""
+"""Longest wait for the records of a given time [s]."""
 
 
 def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, angles: float) -> Geometry:
@@ -44,11 +44,11 @@ def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, an
 
 
 class StageAsBuilt:
-    """Sliders and table of a robot, from its records: `robot.records(stage.add_records)`.
+    """Sliders and table of a robot, computed from its records: `robot.records(stage.add_records)`.
 
-    `built` is the geometry of the stage itself, with its own errors as a correction; `play` is the backlash of each
-    slider [m]: the distance that its motor moves after a reversal before the slider follows. Motors begin in its
-    middle.
+    `built` is the geometry of the stage itself, with its own errors as a correction. `play` is the backlash of each
+    slider [m]: the distance that its motor moves after a reversal before the slider follows. Each motor starts in the
+    middle of its backlash.
     """
 
     def __init__(self, built: Geometry, play: Triple = (0.0, 0.0, 0.0)) -> None:
@@ -59,7 +59,7 @@ class StageAsBuilt:
         self._sliders: np.ndarray[tuple[int], np.dtype[np.float64]] | None = None
 
     def add_records(self, batch: bytes) -> None:
-        """Take a batch of records."""
+        """Add a batch of records."""
         rows = unpack(batch)
         motors = rows["position"]
         sliders = np.array(motors[0]) if self._sliders is None else self._sliders
@@ -71,9 +71,9 @@ class StageAsBuilt:
             self._changed.notify_all()
 
     def sliders_at(self, time: float) -> Triple:
-        """Return the positions of the sliders [m] at a time of the monotonic clock [s], linear between two cycles.
+        """Return the positions of the sliders [m] at a monotonic time [s], interpolated linearly between two cycles.
 
-        It waits for records of that time. Raises ServiceError where none arrive, or they are no longer kept.
+        Waits for records of that time. Raises ServiceError if none arrive or the records are no longer stored.
         """
         with self._changed:
             if not self._changed.wait_for(lambda: self._cycles and self._cycles[-1][0] >= time, COMES_WITHIN):

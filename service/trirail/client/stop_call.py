@@ -1,7 +1,7 @@
-"""Stop requested in two ways in parallel, at the service's door for stops and over Zenoh; the first answer counts.
+"""Stop sent in two ways in parallel, to the service's stop port and over Zenoh; the first reply counts.
 
-Both copies have the same id, so that the service carries out the stop once. A separate thread connects to the door,
-repeatedly if the door closes the connection without an answer, as it may under a flood.
+Both copies have the same id, so the service carries out the stop once. A separate thread connects to the stop port, and
+tries again if the port closes the connection without a reply, as it may under a flood.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
 
 HEARD_WITHIN: Final = 2.0
-"""Time-out of the connection to the door before another attempt [s]."""
+"""Time-out of a connection to the stop port before another attempt [s]."""
 AGAIN_AFTER: Final = 0.05
 """Delay between two attempts [s]."""
 
@@ -33,7 +33,7 @@ Outcome = CommandReply | TrirailError
 
 
 class NoDoorError(ServiceError):
-    """Error of a stop that got no answer at the door for stops."""
+    """Raised when a stop gets no reply at the stop port."""
 
 
 class StopOrder(NamedTuple):
@@ -61,7 +61,7 @@ class StopOrder(NamedTuple):
     def at_door(
         self, locator: str, credentials: Credentials | None, deliver: Callable[[Outcome], None]
     ) -> StopCall | None:
-        """Send the stop to the door beside a locator, and deliver the outcome; return None if there is no door."""
+        """Send the stop to the stop port of a locator, and deliver the outcome; return None if it has no port."""
         address = stop_address(locator)
         content = (self.content or b"").decode()
         line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
@@ -78,9 +78,9 @@ class Outcomes:
         self._errors: list[TrirailError] = []
 
     def decide(self, outcome: Outcome) -> CommandReply | None:
-        """Add an outcome; return the reply, or None while another copy may bring one.
+        """Add an outcome; return the reply, or None while another copy may still bring one.
 
-        Raises RefusedError or ServiceError if there is no reply. A refusal as busy does not decide while another copy
+        Raises RefusedError or ServiceError if no copy got a reply. A refusal as busy does not count while another copy
         is pending.
         """
         if isinstance(outcome, CommandReply):
@@ -94,7 +94,7 @@ class Outcomes:
 
 
 class StopCall:
-    """Stop at the door beside a locator, in a thread that delivers the outcome once."""
+    """Stop sent to the stop port of a locator; a thread delivers the outcome once."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class StopCall:
         self._thread.join()
 
     def cancel(self) -> None:
-        """Stop trying to reach the door."""
+        """Stop trying to reach the stop port."""
         self._cancelled.set()
 
     def _run(self) -> None:

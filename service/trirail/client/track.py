@@ -21,9 +21,9 @@ Taker = Callable[[GoalReply | TrirailError], None]
 class AsyncTrack:
     """Sender of a target's pose, 10 to 200 times a second; the robot follows the target.
 
-    `begin` sends a goal and returns its handle once it is accepted: AsyncRobot.send; `post` sends one and returns
-    immediately. Only `update` sends anything: if its calls cease, for whatever reason, the robot brakes on its path
-    after the time-out.
+    `begin` sends a goal and returns its handle once the service accepts it, as AsyncRobot.send does; `post` sends a
+    goal and returns immediately. Only `update` sends messages. If its calls cease for any reason, the robot brakes on
+    its path after the time-out.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class AsyncTrack:
 
     @property
     def lag(self) -> float | None:
-        """Greatest distance of a point of the platform from its target, in the latest reply [m]."""
+        """Greatest distance between a point of the platform and its place at the target, in the latest reply [m]."""
         return self._lag
 
     @property
@@ -63,12 +63,13 @@ class AsyncTrack:
     async def update(
         self, pose: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), time: float | None = None
     ) -> None:
-        """Send the target's pose and velocity at a time: x, y [m], phi [rad], and per second.
+        """Send the target's pose x, y [m], phi [rad] and its velocity [m/s, m/s, rad/s] at a time.
 
-        `time` is that of the wall clock [s since 1970], now if absent; on another machine than the service's the
-        clocks must agree. Until the next call the robot keeps that velocity. The first call returns when the track is
-        accepted, the others immediately: the next call raises a refusal. Raises RefusedError, also once the track has
-        ended (a stop, a pause, another goal, a time-out), and ServiceError where nobody answers.
+        `time` is wall-clock time [s since 1970] and defaults to now; the clocks must agree if the service runs on
+        another machine. The robot keeps the velocity until the next call. The first call returns when the service
+        accepts the track. Later calls return immediately, so the next call raises an earlier refusal. Raises
+        RefusedError, also if the track has ended because of a stop, a pause, another goal or a time-out, and
+        ServiceError if the service does not answer.
         """
         self._check()
         goal = self._goal_of(pose, velocity, clocks.time() if time is None else time)
@@ -79,7 +80,7 @@ class AsyncTrack:
             self._post(goal, functools.partial(self._on_answer, next(self._numbers)))
 
     async def close(self) -> None:
-        """Brake on the path, if the robot still follows; return when it is at rest."""
+        """Brake on the path if the robot still follows; return when it is at rest."""
         if self._goal is None:
             return
         if self._goal.result is None:
@@ -103,7 +104,7 @@ class AsyncTrack:
             raise error
 
     def _on_answer(self, number: int, answer: GoalReply | TrirailError) -> None:
-        """Take the outcome of an update; the loss of one is ignored if a later one was answered."""
+        """Handle the reply to an update; ignore a lost reply if a later one has arrived."""
         if isinstance(answer, ServiceError) and number < self._answered:
             return
         self._answered = max(self._answered, number)

@@ -26,15 +26,15 @@ POINTS_FORMAT = (
     "TrajectoryPoints, rows of t [s], x, y [m], phi [rad], as an array (N, 4), or the path of a CSV or JSON file"
 )
 MIN_POINTS = 2
-"""Least number of points of a trajectory; the first is the robot's pose."""
+"""Minimum number of points of a trajectory; the first is the robot's pose."""
 prepare(list[TrajectoryPoint])
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
 
 
 def points_of(source: Points) -> tuple[TrajectoryPoint, ...]:
-    """Return the points of a trajectory, given as points, rows of t [s], x, y [m], phi [rad], or the path of a file.
+    """Return the points of a trajectory. Raises TrirailError for an invalid source.
 
-    Raises TrirailError for anything else.
+    `source` may be a sequence of points, an array of rows t [s], x, y [m], phi [rad], or the path of a file.
     """
     if isinstance(source, str | os.PathLike):
         return tuple(read(Path(source)))
@@ -50,7 +50,7 @@ def points_of(source: Points) -> tuple[TrajectoryPoint, ...]:
 
 
 def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint:
-    """Return a point, or the point of a row. Raises TypeError if it is no row, RefusedError for invalid values."""
+    """Return a point as it is, or make one of a row. Raises TypeError if it is no row, RefusedError for bad values."""
     if isinstance(row, TrajectoryPoint):  # its goal computes with its time
         return row if isinstance(row.t, float) else structs.replace(row, t=number(row.t, f"points: t of point {n}"))
     values = [] if isinstance(row, str | bytes | Mapping) else list(row)
@@ -62,7 +62,7 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
 
 
 def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
-    """Return a function of an id that returns the goal to the first pose of a trajectory."""
+    """Return a function that returns, for an id, the goal to the first pose of a trajectory."""
     if not points:
         raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; expected {POINTS_FORMAT}")
     x, y, phi = points[0].x, points[0].y, points[0].phi
@@ -77,12 +77,12 @@ def check_arrived(result: Result) -> None:
 
 
 def read(path: Path) -> list[TrajectoryPoint]:
-    """Read the points of a trajectory. Raises TrirailError with file, line and the expected value."""
+    """Read the points of a trajectory. Raises TrirailError with the file, the line and the expected value."""
     return parse(path, files.text(path))
 
 
 def parse(name: Path | str, text: str) -> list[TrajectoryPoint]:
-    """Return the points in the text of a file named .json, or otherwise for CSV. Raises TrirailError as `read`."""
+    """Parse the points in a text, as JSON if the file's name ends in .json, otherwise as CSV. Raises TrirailError."""
     path = Path(name)
     points = _points(path, text)
     if len(points) < MIN_POINTS:

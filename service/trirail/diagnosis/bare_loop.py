@@ -1,8 +1,9 @@
-"""Bare loop, which only exchanges a cycle's frames in one compiled call: the best timing that this machine allows.
+"""Bare loop that only exchanges a cycle's frames in one compiled call: the best timing that this machine allows.
 
-Each cycle waits for an absolute deadline, sends SYNC, reads the frames that arrived and sends three setpoints, with the
-same compiled functions as the service's cycle. A separate process, on another processor if there is one, stands in for
-the drives: it answers each SYNC with three positions over a pair of AF_UNIX sockets, so that each SYNC wakes a process.
+Each cycle waits for an absolute deadline, sends SYNC, reads the frames that have arrived and sends three setpoints,
+with the same compiled functions as the service's cycle. A separate process, on another processor if there is one,
+replaces the drives. It answers each SYNC with three positions over a pair of AF_UNIX sockets, so that each SYNC wakes a
+process.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ BATCH_S: Final = 0.25
 """Duration of one compiled call, after which Python handles signals and progress [s]."""
 _MODULE: Final = "trirail.diagnosis.bare_loop"
 _SYNC, _SETPOINT, _POSITION = 0x080, 0x201, 0x181
-"""Identifiers of CiA 301's predefined connections, of the first node."""
+"""Identifiers of SYNC, setpoint and position of the first node, from CiA 301's predefined connection set."""
 _DATA: Final = bytes(8)
 
 
@@ -40,13 +41,13 @@ class Cycles(NamedTuple):
     """Measured times of the cycles."""
 
     lateness: NDArray[np.int64]
-    """Lateness of each start, missed ticks included, (n,) [ns]."""
+    """Delay of each cycle's start, including ticks missed before it, (n,) [ns]."""
     work: NDArray[np.int64]
     """Time from the start until the setpoints were sent, (n,) [ns]."""
     period: int
     """Cycle period [ns]."""
     answers: int
-    """Number of positions received, three per cycle if none is lost."""
+    """Number of positions received; three per cycle if none is lost."""
 
     @property
     def missed(self) -> NDArray[np.int64]:
@@ -55,7 +56,7 @@ class Cycles(NamedTuple):
 
 
 class _Bus:
-    """Memory for the frames of a cycle, as trirail.processes.cycle_frames exchanges them over a socket."""
+    """Buffers and socket with which trirail.processes.cycle_frames exchanges the frames of a cycle."""
 
     def __init__(self, descriptor: int) -> None:
         self._bus = np.array(BusAccess(descriptor), np.int64)
@@ -65,7 +66,7 @@ class _Bus:
         self._times, self._moment = np.zeros(1, TIMES), np.zeros(2, np.int64)
 
     def exchange(self, period_ns: int, lateness: NDArray[np.int64], work: NDArray[np.int64]) -> int:
-        """Fill `lateness` and `work`, (n,) each, by n cycles; return the number of frames received."""
+        """Run n cycles and fill `lateness` and `work`, (n,) each; return the number of frames received."""
         # Loading compiled code takes seconds, and only a measurement needs it.
         from trirail.processes.cycle_frames import exchange_frames
 
@@ -82,7 +83,7 @@ def prepare() -> None:
 
 
 def measure(loop: LoopTable, rate_hz: int, seconds: float, progress: Callable[[float], None] | None = None) -> Cycles:
-    """Run the bare loop for `seconds` [s], with this process's rights; `progress` receives the share completed."""
+    """Run the bare loop for `seconds` [s] with this process's rights; `progress` receives the completed fraction."""
     period = 1_000_000_000 // rate_hz
     cycles = max(1, round(seconds * rate_hz))
     lateness, work = np.zeros(cycles, np.int64), np.zeros(cycles, np.int64)
@@ -107,7 +108,7 @@ def measure_alone(loop: LoopTable, rate_hz: int, seconds: float) -> Cycles:
 
 @contextlib.contextmanager
 def _drives(loop: LoopTable) -> Iterator[socket.socket]:
-    """Start the process that stands in for three drives; it ends when its socket is closed."""
+    """Start the process that replaces three drives; it ends when its socket is closed."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     processor, priority = realtime.processor(loop), max(1, loop.priority - realtime.DRIVES_BELOW)
     command = python("-m", _MODULE, *(str(each) for each in (theirs.fileno(), processor, priority)))

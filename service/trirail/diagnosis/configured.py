@@ -1,4 +1,4 @@
-"""All checks of a configuration, and the mistakes of a file as failed checks."""
+"""All checks of a configuration, and the errors in a file as failed checks."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CONFIG_CHECKS = (
 
 
 def diagnose(config: Config, impossible: Sequence[str] = ()) -> list[Check]:
-    """Return the results of all checks that read no `impossible` key."""
+    """Return the results of all checks that do not read an `impossible` key."""
     return [check for each in CONFIG_CHECKS if not overlap(each.reads, impossible) for check in each.run(config)]
 
 
 def failed_checks(path: Path, mistakes: Sequence[Mistake]) -> list[Check]:
-    """Return each mistake of a file as a check that failed."""
+    """Return each error in a file as a failed check."""
     return [
         Check("configuration", "failure", shortened(f"{path}: {text}"), key=shortened(key)) for key, text in mistakes
     ]

@@ -19,11 +19,11 @@ RAMP_TIMES_S = 1e-3, 10.0
 MAX_ASYMMETRY = 300.0
 """Plausible ratio of a range's two sides."""
 MAX_RATE_MISMATCH = 30.0
-"""Plausible ratio of a slider's limit to the rate that the platform's limits need, either way."""
+"""Plausible ratio between a slider's limit and the rate that the platform's limits require, in either direction."""
 MAX_RATE_EXCESS = 5.0
-"""Plausible ratio of an axis' limit to the rate that the sliders reach; the shipped robots have 0.7."""
+"""Plausible ratio of an axis' limit to the rate that the sliders reach; it is 0.7 for the shipped robots."""
 MIN_REACHED_SHARE = 0.1
-"""Plausible minimum of the share of the platform's limits that the sliders reach."""
+"""Plausible minimum of the fraction of the platform's limits that the sliders reach."""
 MAX_WINDOW_SHARE = 0.02
 """Plausible maximum of an in-position window, relative to its range."""
 _SAMPLES = 15
@@ -38,7 +38,7 @@ def _each(slider: SliderLimits, quantity: str) -> Triple:
 
 
 def _ramps(config: Config) -> Iterator[Check]:
-    """Check the times to reach the velocity limit by the acceleration limit, and that by the jerk limit."""
+    """Check the time in which acceleration reaches the velocity limit, and jerk the acceleration limit."""
     slider, platform = config.limits.slider, config.limits.platform
     for rate, by, _, _ in _ORDERS:
         sliders = list(zip(_each(slider, rate), _each(slider, by), strict=True))
@@ -80,7 +80,7 @@ def _ranges(config: Config) -> Iterator[Check]:
 
 
 def _reached(config: Config) -> Iterator[Check]:
-    """Check that the sliders and passive joints reach a good part of the platform's limits."""
+    """Check that the sliders and passive joints reach a sufficient part of the platform's limits."""
     platform = config.limits.platform
     axes = [np.linspace(*each, _SAMPLES) for each in (platform.x, platform.y, platform.phi)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -94,7 +94,7 @@ def _reached(config: Config) -> Iterator[Check]:
 
 
 def _rates(config: Config) -> Iterator[Check]:
-    """Compare the sliders' limits of velocity, acceleration and jerk with the rates that the platform's limits need."""
+    """Compare the sliders' velocity, acceleration and jerk limits with the rates that the platform's limits require."""
     platform, slider = config.limits.platform, config.limits.slider
     middle = [sum(each) / 2.0 for each in (platform.x, platform.y, platform.phi)]
     try:
@@ -113,7 +113,7 @@ def _rates(config: Config) -> Iterator[Check]:
 
 
 def _too_fast(config: Config, per_pose: NDArray[np.float64], quantity: str) -> Iterator[Check]:
-    """Find rates of the platform that are far beyond the sliders, as if given in mm or degrees."""
+    """Find platform limits far beyond what the sliders reach, which may have been given in mm or degrees."""
     limits = getattr(config.limits.platform, quantity)
     shares = (per_pose * limits / np.array(_each(config.limits.slider, quantity))[:, None]).max(axis=0).tolist()
     per = dict(zip(("velocity", "acceleration", "jerk"), ("/s", "/s²", "/s³"), strict=True))[quantity]
@@ -126,7 +126,7 @@ def _too_fast(config: Config, per_pose: NDArray[np.float64], quantity: str) -> I
 
 
 def _windows(config: Config) -> Iterator[Check]:
-    """Check the following-error and in-position windows: larger than a cycle's motion, much smaller than the travel."""
+    """Check the following-error and in-position windows: more than a cycle's motion, far less than the travel."""
     slider, drives, settling = config.limits.slider, config.drives, config.limits.in_position
     step, travel = slider.fastest * config.period, min(high - low for low, high in slider.positions)
     for key, window in (
@@ -154,7 +154,7 @@ def _windows(config: Config) -> Iterator[Check]:
 
 
 def _simulated(config: Config) -> Iterator[Check]:
-    """Check that simulated servos can follow: they lag by the motion that feed-forward leaves, for a time constant."""
+    """Check that simulated servos can follow: their lag is the motion without feed-forward during a time constant."""
     if not is_simulated(config.can):
         return
     slider, servo = config.limits.slider, config.can.simulated

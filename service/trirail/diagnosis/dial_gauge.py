@@ -1,4 +1,4 @@
-"""Slider travels for small motions of a stage's table, to identify its kind with a dial gauge."""
+"""Slider travels for small motions of a stage's table, with which a dial gauge can identify the stage's kind."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOTIONS = (
 )
 """Motions from x = y = φ = 0 [m, rad]."""
 GAUGE_RESOLUTION_M = 1e-6
-"""Difference of the two kinds that a dial gauge shows [m]."""
+"""Difference between the two kinds that a dial gauge can resolve [m]."""
 _KINDS = {"3-PRP": "pivots on the carriages", "3-PPR": "cross slides on the carriages"}
 
 
@@ -34,7 +34,7 @@ def _format(robot: Geometry, distances: list[float]) -> str:
 
 
 def _kind(config: Config) -> Iterator[Check]:
-    """Report the slider travels of the configured mechanism, and of the other kind with the same carriages."""
+    """Report the slider travels of the configured mechanism and of the other kind with the same carriages."""
     robot = geometry(config.geometry)
     motions = [f"{name} moves {_format(robot, _travel(robot, pose))}" for name, pose in MOTIONS]
     turned = MOTIONS[-1][1]

@@ -15,7 +15,7 @@ from trirail.diagnosis.check import Check, ConfigCheck
 from trirail.diagnosis.stopping import stops
 
 MAX_SCALE_RATIO = 8.0
-"""Plausible ratio of the scales of two drives of one robot."""
+"""Plausible ratio between the scales of two drives of one robot."""
 _NUMBERS = ("counts_per_metre", "revolutions_per_metre")
 _UNITS = ("velocity_unit", "acceleration_unit")
 
@@ -51,7 +51,7 @@ def _alike(config: Config) -> Iterator[Check]:
 
 
 def _zero(config: Config) -> Iterator[Check]:
-    """Check that the zero of a drive, or its home, is on the rail; an absolute encoder's zero may be elsewhere."""
+    """Check that a drive's zero or home is on the rail; the zero of an absolute encoder may be elsewhere."""
     stop = stops(config)
     low, high = stop.rail or stop.travel
     for name, drive in zip(NAMES, config.drives.each, strict=True):
@@ -66,7 +66,7 @@ def _zero(config: Config) -> Iterator[Check]:
 
 
 def protections(config: Config) -> Iterator[Check]:
-    """List the protections that the configuration lets drives lack: they stop a drive when the service cannot."""
+    """List the protections that the configuration does not require; they stop a drive when the service cannot."""
     known = PROTOCOLS[config.drives.protocol].protections
     drives: dict[str, list[str]] = {}
     for name, drive in zip(NAMES, config.drives.each, strict=True):
@@ -81,7 +81,10 @@ def protections(config: Config) -> Iterator[Check]:
 
 
 def windows(config: Config) -> Iterator[Check]:
-    """Check that the service detects a following error before a drive does: it stops all three, a drive only itself."""
+    """Check that the service detects a following error before a drive does.
+
+    The service stops all three drives, but a drive stops only itself.
+    """
     ours, theirs = config.limits.slider.following_error, config.drives.following_error
     if theirs > ours:
         return
@@ -91,7 +94,7 @@ def windows(config: Config) -> Iterator[Check]:
 
 
 def load(config: Config) -> Iterator[Check]:
-    """Check the worst-case share of the bus that the cycle takes."""
+    """Check the fraction of the bus capacity that the cycle uses in the worst case."""
     rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
     outputs = sum(bool(each.outputs) for each in config.drive_io)
     traffic = PROTOCOLS[drives.protocol].traffic.with_outputs(outputs)

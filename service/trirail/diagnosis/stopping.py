@@ -25,21 +25,21 @@ class Stops(Struct, frozen=True):
     quick_time: float
     """Duration of that ramp [s]."""
     travel: tuple[float, float]
-    """limits.slider.position [m]."""
+    """Travel from limits.slider.position [m]."""
     rail: tuple[float, float] | None
-    """Ends of the rails [m]; None for measured legs, which do not contain them."""
+    """Ends of the rail [m]; None for measured legs, whose configuration does not contain them."""
 
     @property
     def left(self) -> float | None:
-        """Rail beyond the travel, on the side with less [m]."""
+        """Length of rail beyond the travel, on the side with less [m]."""
         return None if self.rail is None else min(self.travel[0] - self.rail[0], self.rail[1] - self.travel[1])
 
 
 def stops(config: Config) -> Stops:
-    """Return the stops of the slider that needs the largest share of its travel for them.
+    """Return the stops of the slider that needs the largest part of its travel for them.
 
     A controlled stop from v, limited in acceleration a and jerk j, takes t = v / a + a / j, or 2 sqrt(v / j) if a is
-    not reached, over v t / 2. A quick stop at deceleration q takes v / q, over v² / 2q.
+    not reached, over a distance v t / 2. A quick stop at deceleration q takes v / q, over v² / 2q.
     """
     slider, quick = config.limits.slider, config.drives.quick_stop_deceleration
     rail = None
@@ -54,7 +54,7 @@ def stops(config: Config) -> Stops:
 
 
 def _rail(config: Config) -> Iterator[Check]:
-    """Check that a slider at full velocity at the end of its travel, from a wrong scale or home, stops on the rail."""
+    """Check that a slider at full velocity at the end of its travel, after a wrong scale or home, stops on the rail."""
     stop = stops(config)
     speed = f"from {stop.velocity * 1e3:g} mm/s"
     ways = f"{speed} a quick stop takes {stop.quick_way * 1e3:.3g} mm, a controlled stop {stop.way * 1e3:.3g} mm"
@@ -93,7 +93,7 @@ def _travel(config: Config) -> Iterator[Check]:
 
 
 def _quick_stop(config: Config) -> Iterator[Check]:
-    """Check the duration of a quick stop: beyond stop_timeout power is cut in motion, with a fault."""
+    """Check the duration of a quick stop; after stop_timeout, power is cut during the motion, with a fault."""
     stop, timeout = stops(config), config.drives.stop_timeout
     key = "drives.quick_stop_deceleration"
     ramp = format_value(key, config.drives.quick_stop_deceleration, "m/s²")

@@ -19,7 +19,7 @@ class _Bounds(NamedTuple):
     value: float
     """Value in the file."""
     time: float
-    """The same as a time [s]."""
+    """The value as a time [s]."""
     low: float
     """Shortest plausible time [s]."""
     high: float
@@ -76,7 +76,7 @@ def _times(config: Config) -> Iterator[Check]:
 
 
 def _sizes(config: Config) -> Iterator[Check]:
-    """Check the size of a recording's files: below the total that is kept, and not in thousands of files."""
+    """Check the size of a recording's files: smaller than the total that is kept, and not thousands of files."""
     rotate, keep = config.telemetry.rotate_mb, config.telemetry.keep_mb
     if rotate > keep:
         finding = f"telemetry.rotate_mb = {rotate:g} exceeds telemetry.keep_mb = {keep:g}, the total of all recordings"
@@ -89,7 +89,7 @@ def _sizes(config: Config) -> Iterator[Check]:
 
 
 def _homing(config: Config) -> Iterator[Check]:
-    """Check that homing reaches its switch within the time-out, and stops shortly behind it."""
+    """Check that homing reaches its switch within the time-out, and stops shortly beyond the switch."""
     slider = config.limits.slider
     for name, drive, (low, high), limit in zip(
         NAMES, config.drives.each, slider.positions, slider.velocities, strict=True

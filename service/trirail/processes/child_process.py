@@ -36,7 +36,7 @@ HAPPENED = "happened"
 MEASURED = "measured"
 """Key of a process's measurements, for the metrics."""
 LOG_WITHIN = 0.05
-"""Longest wait for a supervisor whose own output is blocked, before a log line is dropped [s]."""
+"""Time after which a log line is dropped because the supervisor's own output is blocked [s]."""
 DRIVES: Final = "drives"
 """Name of the simulated drives' process, and of its socket in the service's folder of sockets."""
 DRIVES_WITHIN: Final = 60.0
@@ -63,14 +63,14 @@ class Child:
     def report_ready(self, content: object) -> None:
         """Report that the process is up.
 
-        The first heartbeat precedes the message, so that a hang right after it is detected.
+        The process sends its first heartbeat before this message, so that a hang right after the message is detected.
         """
         if self.name in PROCESSES:
             self.heartbeats.heart(self.name).beat()
         self._send(content)
 
     def _send(self, content: object) -> None:
-        with suppress(BrokenPipeError):  # the supervisor was killed: the loop ends by itself, and the others with it
+        with suppress(BrokenPipeError):  # the supervisor was killed; the loop ends by itself, then the others
             os.write(self._pipe, msgspec.json.encode(content) + b"\n")
 
     def report_compiling(self, function: str) -> None:
@@ -83,7 +83,7 @@ class Child:
             self._send({HAPPENED: event})
 
     def report_measurements(self, content: msgspec.Struct) -> None:
-        """Report measurements, unless the pipe is full: new ones follow in a second."""
+        """Report measurements, or drop them if the pipe is full; new ones follow in a second."""
         line = msgspec.json.encode({MEASURED: content}) + b"\n"
         if len(line) <= select.PIPE_BUF and select.select([], [self._pipe], [], 0.0)[1]:
             with suppress(BrokenPipeError):
@@ -158,7 +158,7 @@ def _plan(child: Child) -> int:
         while True:
             heart.beat()
             poll.poll(BEAT_EVERY * 1e3)
-            newest = None  # nobody waits for earlier requests any more
+            newest = None  # no process waits for earlier requests any more
             while (packet := link.receive()) is not None:
                 newest = packet
             if newest is not None:

@@ -29,7 +29,7 @@ SPARE_NS: Final = 500_000
 """Time that Python needs to serve a call [ns]; with less time before the deadline, a call waits for the next cycle."""
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
-"""TIMER_ABSTIME of clock_nanosleep."""
+"""TIMER_ABSTIME of clock_nanosleep(2)."""
 _INTERRUPTED: Final = 4
 """EINTR of errno.h."""
 _POLLIN: Final = 1
@@ -45,7 +45,7 @@ def now_ns(moment: NDArray[np.int64]) -> int:
 
 @compiled()
 def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
-    """Sleep until the deadline, through interruptions; `moment` as in `now_ns`."""
+    """Sleep until the deadline and resume after interruptions; `moment` is as in `now_ns`."""
     moment[0], moment[1] = deadline_ns // _SECOND, deadline_ns % _SECOND
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, moment.ctypes.data, 0) == _INTERRUPTED:
         pass
@@ -53,13 +53,13 @@ def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
 
 @compiled(b1(POLLFDS))
 def called(pollfds: NDArray[np.int32]) -> bool:
-    """Return whether a neighbour calls; `pollfds` (n, 2) is an array of struct pollfd."""
+    """Return whether a neighbour has called; `pollfds` (n, 2) is an array of struct pollfd."""
     return bool(_poll(pollfds.ctypes.data, np.uint64(len(pollfds)), 0) != 0)
 
 
 @compiled(b1(i8, POLLFDS, i8[::1]), releases=True)
 def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
-    """Wait for the deadline, or for a call that arrives more than SPARE_NS before it; return whether there is a call.
+    """Wait for the deadline or for a call more than SPARE_NS before it; return whether there is a call.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class PollSet:
         return bool(called(self.pollfds))
 
     def wait(self, deadline_ns: int) -> bool:
-        """Wait for the deadline or an early call, as in `wait`."""
+        """Wait for the deadline or an early call, like the function `wait`."""
         self.refresh()
         return bool(wait(deadline_ns, self.pollfds, self._moment))
 
@@ -111,11 +111,11 @@ class Tick(NamedTuple):
     """One tick of the loop."""
 
     deadline_ns: int
-    """Time at which it was due [ns]."""
+    """Time at which the tick was due [ns]."""
     lateness_ns: int
-    """Delay after the deadline [ns]."""
+    """Delay of the tick after its deadline [ns]."""
     missed: int
-    """Number of ticks skipped before it."""
+    """Number of ticks skipped before this one."""
 
 
 class Overruns:

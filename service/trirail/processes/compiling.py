@@ -18,7 +18,7 @@ QUARTERS = 4
 
 
 class Progress:
-    """Progress of the compilation, reported to users, and to systemd, which waits meanwhile."""
+    """Progress of the compilation, reported to users and to systemd, which waits for the service meanwhile."""
 
     def __init__(self, say: Callable[[str], None], patience: float) -> None:
         self._say = say
@@ -34,7 +34,7 @@ class Progress:
         return f"compiling is interrupted at function {place}: those before it are kept, the next start continues there"
 
     def begin(self, name: str) -> None:
-        """Report that a function is being compiled; the next one may follow after the patience [s]."""
+        """Report that a function is being compiled; the next report may take up to the patience [s]."""
         from trirail.kinematics.compiled import FUNCTIONS  # with numba, which a start without compiling does not need
 
         before = len(self._begun)
@@ -49,11 +49,11 @@ class Progress:
 
 
 class NotKeptError(Exception):
-    """A function would have to be compiled."""
+    """Raised when a function is not in the cache and would have to be compiled."""
 
 
 def load() -> bool:
-    """Import the compiled modules, which takes a second; return False if a function is not cached yet."""
+    """Import the compiled modules, which takes a second; return False if a function is not in the cache."""
     if LAST_MODULE in sys.modules:
         return True
     # numba imports scipy if it is installed, 0.15 s and 10 MB, for linear algebra that no compiled function here uses.
@@ -74,7 +74,7 @@ def load() -> bool:
 
 
 def compile_all(begin: Callable[[str], None]) -> None:
-    """Compile functions that are not cached yet; call `begin` with the name of each before it."""
+    """Compile the functions that are not in the cache; call `begin` with the name of each one first."""
     from trirail.kinematics.compiled import on_compile
 
     on_compile(begin)
@@ -86,7 +86,7 @@ def _import_rooms() -> None:
 
 
 def main() -> int:
-    """Compile functions that are not cached yet."""
+    """Compile the functions that are not in the cache."""
     progress = Progress(lambda words: print(f"trirail: {words}", flush=True), 0.0)  # noqa: T201
     try:
         compile_all(progress.begin)

@@ -1,8 +1,9 @@
 """Compiled exchange of a cycle's CAN frames: send, receive, recognise expected frames, encode setpoints.
 
-The code knows no drive protocol, only the tables of trirail_drivers.driver.cyclic: `axes` (3,) of AXIS, `expected` (n,)
-of EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. Each driver fills these tables.
-Frames pass through libc on the socket of the bus, or through Python functions for a bus without a socket.
+The code does not know any drive protocol. It uses only the tables of trirail_drivers.driver.cyclic, which each driver
+fills: `axes` (3,) of AXIS, `expected` (n,) of EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct
+can_frame`. Frames are sent and received by libc on the socket of the bus, or by Python functions if the bus has no
+socket.
 """
 
 from __future__ import annotations
@@ -237,9 +238,9 @@ def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
 
 @compiled(i8(AXES, TIMINGS, f8[:, ::1], f8))
 def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, now: float) -> int:
-    """Record that the frames of a cycle are in, if every drive has sent all that it should, and follows.
+    """Record that a cycle's frames have arrived, if every drive has sent all its frames and follows its setpoints.
 
-    Return whether that is so; else do nothing.
+    Return whether that is the case; otherwise do nothing.
     """
     for i in range(3):
         axis = axes[i]

@@ -1,10 +1,10 @@
 """Fork server: imports the modules that the service's processes share, once, and forks the processes from itself.
 
-The supervisor forks the fork server before starting a thread, so that shared modules are in memory once. Over a
+The supervisor forks the fork server before it starts a thread, so that shared modules are in memory once. Over a
 SEQPACKET socket the fork server receives requests (`Fork`, with the descriptor for the child's messages), and reports
-each start (`ChildStart`, with a pidfd) and each end (`ChildEnd`). It must have no thread, since fork(2) copies only the
-calling one: Zenoh and Rerun, which start threads, are imported by the children that need them. It compiles nothing
-itself: a child compiles functions that are not cached.
+each start (`ChildStart`, with a pidfd) and each end (`ChildEnd`). The fork server must not have other threads, since
+fork(2) copies only the calling one. The children that need Zenoh and Rerun therefore import them themselves, because
+both start threads. The fork server compiles nothing; a child compiles the functions that are not in the cache.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from trirail.wire.decoding import decoded, prepare
 MATHEMATICS = ("loop", "drives", "planner")
 """Processes that need the compiled modules; the others are forked before these modules are imported."""
 WITH_PARENT: Final = {"loop": signal.SIGTERM, "drives": signal.SIGTERM, "planner": signal.SIGKILL}
-"""Signal from the kernel to a child when this process ends. Gateway and recorder have none: they end by themselves
-after the loop, once its last messages are published and on disk."""
+"""Signal that the kernel sends to a child when this process ends. Gateway and recorder have none: they end by
+themselves after the loop, once its last messages are published and on disk."""
 TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 """Signals that a terminal sends to all of its processes, on Ctrl-C and when it closes."""
 ALLOCATOR_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
@@ -118,7 +118,7 @@ class ForkServer:
         return bool(packet)
 
     def _can_be_met(self, request: _Request) -> bool:
-        """Return whether the child can be forked now, or must wait for the compilation."""
+        """Return whether the child can be forked now; otherwise it must wait for the compilation."""
         if request.fork.name not in MATHEMATICS or not self._cache_works:
             return True
         if self._compiler is None and not compiling.load():
@@ -133,7 +133,7 @@ class ForkServer:
     def _fork(
         self, request: _Request, work: Callable[[Child], int], with_parent: signal.Signals | None
     ) -> tuple[int, int]:
-        """Fork a child; return its pidfd and process id. The kernel sends it `with_parent` when this process ends."""
+        """Fork a child; return its pidfd and process id. The kernel sends it the signal `with_parent` when we end."""
         parent = os.getpid()
         gc.freeze()  # a child's collector would touch, and so copy, memory shared with this process
         pid = os.fork()

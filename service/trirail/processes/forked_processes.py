@@ -1,6 +1,6 @@
-"""Supervisor's side of the fork server and of the processes forked by it.
+"""Supervisor's side of the fork server and of the processes that it forks.
 
-Each child reports on a pipe that it is ready, and its measurements; the pipe closes when the child ends.
+Each child writes its ready message and its measurements to a pipe, which closes when the child ends.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from trirail.wire.messages import Event
 END_REPORT_TIMEOUT_S = 1.0
 """Longest wait for the fork server's report after a child has ended [s]."""
 IMPORT_TIMEOUT_S = 6.0
-"""The same while the fork server may be importing the compiled modules [s]."""
+"""The same time-out while the fork server may be importing the compiled modules [s]."""
 EXIT_CODE_UNKNOWN = os.EX_UNAVAILABLE
-"""Exit code of a child whose end the fork server does not report; no child exits with it by itself."""
+"""Exit code of a child whose end the fork server does not report; no child returns this code itself."""
 
 prepare(ChildStart | ChildEnd)
 
@@ -124,7 +124,7 @@ class ForkServerLink:
         return heard
 
     def describe_end(self) -> str:
-        """Return the manner of the fork server's end, for people."""
+        """Describe how the fork server ended, for people."""
         return describe_exit(self._process.wait(), self._hung_for)
 
     def kill(self) -> None:
@@ -243,13 +243,13 @@ class ChildProcess:
 
     @property
     def end_description(self) -> str:
-        """Manner of the child's end, for people."""
+        """Description of how the child ended, for people."""
         code = self.returncode
         return describe_exit(code, self._hung_for) if code else "another process sent it SIGTERM"
 
 
 def describe_exit(code: int, hung_for: float) -> str:
-    """Return the manner of a process's end, for people.
+    """Describe how a process ended, for people.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Gateway process between Zenoh and the loop: it checks and translates messages, and decides nothing."""
+"""Gateway process between Zenoh and the loop: it checks and translates messages, but makes no decisions."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Mode, NoContent
 
 SWITCH_EVERY = 0.0005
-"""Interval after which a thread yields the interpreter: Zenoh's threads need it to hand a message over [s]."""
+"""Interval after which a thread yields the interpreter, so that Zenoh's threads can hand over a message [s]."""
 MESSAGES_PER_TURN = 256
 """Messages from Zenoh handled between two reads of the loop's messages."""
 NOT_CHECKED = "not a goal to check"
@@ -84,7 +84,7 @@ class Gateway:
         *,
         again: bool = False,
     ) -> None:
-        """Connect the gateway's parts; `again` is whether the service has had a gateway before this one."""
+        """Connect the gateway's parts; `again` says whether the service has already had a gateway."""
         self._log = log
         self._robot = config.robot.name
         self._link = link
@@ -180,7 +180,7 @@ class Gateway:
     # ------------------------------------------------------------------ Zenoh to loop
 
     def _handle(self, incoming: Incoming) -> None:
-        """Handle a message; an error is answered, and announced to everyone since a put has no answer."""
+        """Handle a message. The reply contains any error, and everyone is notified of it, since a put has no reply."""
         try:
             route = ROUTES[incoming.kind]
             if (reply := route.handle(self, route.read(incoming, self._robot))) is not None:
@@ -232,7 +232,7 @@ class Gateway:
             raise RefusedError(RefusalCode.MALFORMED, problem)
 
     def _announce(self, notice: Notice) -> bool:
-        """Have the loop announce a notice; return whether it accepts that now."""
+        """Request that the loop announces a notice; return whether the loop can accept it now."""
         return self._link.send(message(Announcement(notice)))
 
     # ------------------------------------------------------------------ loop to Zenoh
@@ -290,14 +290,14 @@ class Gateway:
             self._publications.state(self._states.newest(self.warnings()))
 
     def _summarize(self) -> None:
-        """Publish the summary if it is due, also while the loop is silent: it shows the age of the state."""
+        """Publish the summary if it is due, even while the loop is silent, since it contains the age of the state."""
         now = time.monotonic()
         if now >= self._summary_due and self._states.cycle:
             self._summary_due = now + SUMMARY_EVERY
             self._publications.summary(summary_of(self._states.newest(), now - self._records_at, self._info.version))
 
     def _handle_event(self, event: Event) -> None:
-        """Publish and log an event; a new lease withdraws the waiting goals of all users except its holder."""
+        """Publish and log an event; for a new lease, withdraw the waiting goals of all users except its holder."""
         if event.kind == "lease":
             self._requests.backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
@@ -314,7 +314,7 @@ class Gateway:
                     self._handle_packet(packet, ready)
 
     def _announce_loop_death(self) -> None:
-        """Announce the end of the loop, unless the loop has said farewell."""
+        """Announce that the loop has died, unless it has sent its farewell."""
         for event in self._loop_death.events(self._states.cycle):
             self._handle_event(event)
         if (reason := self._loop_death.reason) and self._states.cycle:

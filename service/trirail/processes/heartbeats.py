@@ -1,11 +1,11 @@
 """Heartbeats and urgent requests between the service's processes, as counters in shared memory, and detection of hangs.
 
-A beat and a check cost 0.1 µs and never wait: unlike packets, counters do not queue, and a frozen process fills no
+A beat and a check cost 0.1 µs and never wait. Unlike packets, counters do not queue, so a frozen process fills no
 buffer. A process beats in the thread that does its work, so that a hung process stops beating.
 
-A hung process is distinguished from one that a busy machine keeps waiting: killing the latter would only add load.
-Silence therefore counts only the time in which a process could have beaten: the processor time of its main thread, and
-the checks that found it stopped or asleep. Time spent waiting for a processor or a disk does not count.
+A process can also be silent because a busy machine keeps it waiting, and killing it would only add load. Silence
+therefore counts only the time in which a process could have beaten: the processor time of its main thread, and the
+checks that found it stopped or asleep. Time spent waiting for a processor or a disk does not count.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 PROCESSES = ("loop", "gateway", "planner", "recorder")
-"""Processes that beat in shared memory; simulated drives send heartbeats on their bus instead."""
+"""Processes that beat in shared memory; the simulated drives send heartbeats on their bus instead."""
 URGENT_INDEX = len(PROCESSES)
 """Index of the counter of urgent requests."""
 BEAT_EVERY = 0.05
-"""Longest interval between two beats of a process, also while it is idle [s]."""
+"""Longest interval between two beats of a process, even while it is idle [s]."""
 
 
 class Heartbeats:
-    """Shared counters, one per process; a counter is 0 while no beat is expected of its process."""
+    """Shared counters, one per process; a counter is 0 while its process is not expected to beat."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -79,12 +79,12 @@ class Heart:
         self._counts[self._place] += 1
 
     def rest(self) -> None:
-        """Reset the counter: no beat is expected until the next one."""
+        """Reset the counter; the process is not expected to beat until its next beat."""
         self._counts[self._place] = 0
 
     @property
     def count(self) -> int:
-        """Number of beats; 0 while none is expected."""
+        """Number of beats; 0 while the process is not expected to beat."""
         return self._counts[self._place]
 
 
@@ -106,7 +106,7 @@ class Watch:
     """Time-out on the heartbeat of another process.
 
     The time-out counts the watcher's own checks, not wall time, so that a stalled machine does not look like a frozen
-    process. `patience` is the number of checks without a beat that is tolerated.
+    process. `patience` is the number of checks without a beat that are tolerated.
     """
 
     def __init__(self, heart: Heart, patience: int) -> None:
@@ -115,7 +115,7 @@ class Watch:
         self.seen = 0
         """Count at the last check."""
         self.silent_turns = 0
-        """Number of checks since the count has changed."""
+        """Number of checks since the count last changed."""
 
     def silent(self) -> bool:
         """Check the heartbeat; return whether it has been missing for more than `patience` checks."""
@@ -149,7 +149,7 @@ class Effort(NamedTuple):
 
     @property
     def kept_waiting(self) -> bool:
-        """Whether the thread runs, or waits for a processor or a disk."""
+        """Whether the thread is running or is ready to run but waits for a processor or a disk."""
         return self.state in (READY, ON_DISK)
 
 
@@ -191,7 +191,7 @@ class HangWatch:
         self._used: float | None = None
 
     def hangs(self, pid: int) -> bool:
-        """Check the process; return whether it has been silent for longer than the patience."""
+        """Check the process; return whether it has been silent for longer than the allowed time."""
         count = self._heart.count
         if count != self._seen or not count:
             self._seen, self._silent_s, self._used = count, 0.0, None

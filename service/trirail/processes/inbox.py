@@ -24,12 +24,13 @@ from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest
 from trirail.wire.text import is_id
 
 MAX_MESSAGES = 8192
-"""Most unread messages; further ones are refused. Twice as many for commands, so that goals cannot keep a stop out."""
+"""Maximum number of unread messages; more are refused. The limit is double for commands, so goals cannot block a stop.
+"""
 MAX_MESSAGES_OF_USER = 2048
-"""Most unread messages of one user; twice as many for commands."""
+"""Maximum number of one user's unread messages; the limit is double for commands."""
 TOO_MUCH = "too many unread messages: send fewer"
 MAX_MERGED_STOPS = 32
-"""Most consecutive equal stops of one user that are merged into one."""
+"""Maximum number of consecutive equal stops of one user that are merged into one."""
 
 
 class Inbox:
@@ -66,7 +67,7 @@ class Inbox:
         self._budget = Budget(MAX_UNREAD, MAX_UNREAD_OF_ONE)
         self._lock = threading.Lock()
         self._stops: FairQueue[list[Incoming]] = FairQueue()
-        """Stops, each with the equal ones merged into it."""
+        """Stops; each contains the equal stops that were merged into it."""
         self._newest: dict[str, list[Incoming]] = {}
         """Waiting stops that are the newest message of their user, with the equal ones merged into them."""
         self._others: FairQueue[Incoming] = FairQueue()
@@ -101,7 +102,7 @@ class Inbox:
         ]
 
     def next_messages(self, at_most: int) -> Iterator[Incoming]:
-        """Yield at most `at_most` messages that may be read now, stops first, users in turn."""
+        """Yield at most `at_most` messages that may be read now, stops first; users take turns."""
         for _ in range(at_most):
             with self._lock:
                 incoming = self._next(self._clock())
@@ -151,7 +152,7 @@ class Inbox:
         return min((*stops, *others), default=math.inf)
 
     def stop_at_door(self, request: StopRequest, answer: Answer) -> None:
-        """Enqueue a request from the door for stops; safe from any thread."""
+        """Enqueue a request from the stop port; safe from any thread."""
         content = request.content.encode()
         stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns(), at_door=answer)
         self._keep(_named(stop._replace(held=len(content) + OVERHEAD), request.id))
@@ -228,12 +229,12 @@ class Inbox:
 
 
 def _stops(incoming: Incoming) -> bool:
-    """Return whether a message stops the robot, whatever its content."""
+    """Return whether a message stops the robot, regardless of its content."""
     return incoming.kind == "cmd" and incoming.key.rpartition("/")[2] in STOPS
 
 
 def _named(stop: Incoming, name: str) -> Incoming:
-    """Return a stop with its id, if valid; a stop too large for the door cannot have a copy there, and gets none."""
+    """Return a stop with its id, if valid. A stop too large for the stop port has no copy there, and gets no id."""
     return stop._replace(id=name) if is_id(name) and stop.size <= MAX_LINE else stop
 
 

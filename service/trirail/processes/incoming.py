@@ -1,6 +1,6 @@
-"""Queues in the gateway: messages not decoded yet, and goals not sent to the loop yet; users take turns.
+"""Queues of the gateway for messages that are not decoded yet and goals that the loop does not have yet.
 
-The gateway sends the loop only a few goals at a time, so that it can withdraw the others itself.
+Users take turns. The gateway sends the loop only a few goals at a time, so that it can withdraw the others itself.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trirail.wire.sizes import MAX_UNREAD
 
 
 class Incoming(NamedTuple):
-    """Query or put as received from Zenoh, or a request at the door for stops."""
+    """Query or put as received from Zenoh, or a request at the stop port."""
 
     kind: str
     """Kind, a key of trirail.processes.gateway.ROUTES."""
@@ -31,10 +31,10 @@ class Incoming(NamedTuple):
     size: int
     """Size of the payload [bytes]."""
     payload: bytes
-    """Empty if it is too large to be decoded."""
+    """Payload; empty if it is too large to be decoded."""
     encoding: str
     query: zenoh.Query | None
-    """Query to answer; None for a put and for a request at the door."""
+    """Query to answer; None for a put and for a request at the stop port."""
     arrived_ns: int
     """Arrival time on the monotonic clock [ns]."""
     number: int = 0
@@ -42,17 +42,17 @@ class Incoming(NamedTuple):
     id: str = ""
     """Id of a stop, the same in all of its copies; "" for none."""
     at_door: Callable[[Any], None] | None = None
-    """Receiver of the answer to a request at the door."""
+    """Receiver of the answer to a request at the stop port."""
     held: int = 0
     """Memory that the message holds in Zenoh and in this process: payload, key, parameters and attachment [bytes]."""
     hold: Reservation | None = None
     """Reservation of that memory; None for a message that is not kept."""
     alike: tuple[Incoming, ...] = ()
-    """Equal stops of the same user, merged into this one: it is carried out once for all of them."""
+    """Equal stops of the same user that were merged into this one, which is carried out once for all of them."""
 
     @property
     def user(self) -> str:
-        """User named by the key; "" for none, and for a query about a role, whose key names any user."""
+        """User named by the key; "" without one, and for a query about a role, whose key may name any user."""
         return self.key.split("/")[3] if self.kind != "role" and self.key.count("/") > 2 else ""
 
     def content(self, kind: Any, what: str) -> Any:
@@ -64,20 +64,20 @@ class Incoming(NamedTuple):
         return boundary.decode(self.payload, kind, what, self.encoding)
 
     def unanswered(self) -> Incoming:
-        """Return a copy of the message to which no answer is sent."""
+        """Return a copy of the message that will not be answered."""
         return self._replace(query=None, at_door=None, alike=(), held=len(self.payload) + OVERHEAD)
 
 
 BURST = 400
-"""Messages of one user that may be read in a burst."""
+"""Number of one user's messages that may be read in a burst."""
 RATE = 200.0
-"""Messages of one user that may be read per second after a burst: ten times the rate of a stream of goals or a jog."""
+"""Rate at which one user's messages are read after a burst [1/s]; ten times that of a stream of goals or a jog."""
 _MAX_BUCKETS = 1000
 """Number of users above which full buckets are forgotten."""
 
 
 class Pace:
-    """Token bucket for each user, as in the generic cell rate algorithm: it keeps a time instead of a count."""
+    """Token bucket for each user, as in the generic cell rate algorithm; it stores a time instead of a count."""
 
     def __init__(self, burst: int = BURST, rate: float = RATE) -> None:
         self._burst, self._rate = burst, rate
@@ -123,7 +123,7 @@ class FairQueue(Generic[T]):
         return len(self._queues.get(user, ()))
 
     def put(self, user: str, item: T) -> None:
-        """Put an item behind the user's own."""
+        """Append an item to those of its user."""
         self._queues.setdefault(user, deque()).append(item)
         self._length += 1
 
@@ -146,22 +146,22 @@ class FairQueue(Generic[T]):
 
 
 GOALS = 5_000
-"""Most waiting goals; further ones are refused."""
+"""Maximum number of waiting goals; more are refused."""
 GOALS_OF_ONE = 1_250
-"""Most waiting goals of one user, so that others always have room."""
+"""Maximum number of one user's waiting goals; it leaves room for other users."""
 GOAL_PATIENCE = 8.0
-"""Longest wait of a goal for those before it, after which it is withdrawn: its sender gives up soon after [s]."""
+"""Longest time that a goal waits for those before it [s]; it is then withdrawn, as its sender gives up soon after."""
 
 
 class WaitingGoal(NamedTuple):
-    """Goal, and the message that contained it, without the payload."""
+    """A goal and the message that contained it, without the payload."""
 
     incoming: Incoming
     request: GoalRequest
 
 
 class Backlog:
-    """Queue of goals, bounded in number and in bytes: each user's in the order of arrival, users in turn.
+    """Queue of goals, bounded in number and in bytes. A user's goals keep their order of arrival; users take turns.
 
     Each goal leaves the queue exactly once, by `drop_first`. A withdrawn goal keeps its place, so that the loop reports
     its end in the right order.

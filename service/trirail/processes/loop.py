@@ -1,4 +1,4 @@
-"""Control loop: the only process with deadlines; it waits for nothing except its next tick."""
+"""Control loop: the only process with deadlines, which waits for nothing except its next tick."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from trirail.wire.vocabulary import Mode
 DECISION_BUDGET_NS = 300_000
 """Time that handling requests needs before the next tick [ns]; with less, they wait until its setpoints are sent."""
 REPORT_BUDGET_NS = 150_000
-"""The same for sending events and answers [ns]."""
+"""Time that sending events and answers needs before the next tick [ns]."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
 """Shortest time-out of the gateway, in cycles."""
 MAX_SHUTDOWN_S = 3.0
-"""Longest controlled stop at the end of the service, after which the drives stop by themselves [s]."""
+"""Longest controlled stop at the end of the service [s]; after this time the drives stop by themselves."""
 
 
 class Loop:
@@ -87,7 +87,7 @@ class Loop:
         self._listened = self._never_listens
         """Whether no further call is served before the next tick."""
         self._reports_postponed = False
-        """Whether events and answers wait, for lack of time before a tick."""
+        """Whether events and answers wait because too little time was left before a tick."""
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
             beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
@@ -120,7 +120,8 @@ class Loop:
     def turn(self, ticker: Ticker) -> None:
         """Run the cycles without events by the compiled call, or one cycle with an event; then handle requests.
 
-        If a neighbour calls during the wait for a tick, only serve that call: at most once before each tick.
+        If a neighbour calls during the wait for a tick, serve only that call, and at most one such call before each
+        tick.
         """
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._gateway.frozen or not self._planner.idle
@@ -188,7 +189,7 @@ class Loop:
 
     @property
     def _postponed(self) -> bool:
-        """Whether work was postponed until after the newest setpoints, for lack of time."""
+        """Whether work was postponed until the newest setpoints have been sent, for lack of time."""
         return self._reports_postponed or self._gateway.postponed
 
     def _decide(self, next_ns: int, called: bool = True) -> None:

@@ -1,6 +1,6 @@
 """Events that report the death of the loop, which normally issues all events.
 
-Gateway and recorder receive the same messages from the loop, so that each derives the same missing events by itself.
+Gateway and recorder receive the same messages from the loop, so each can derive the missing events by itself.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from trirail.wire.packets import Answer, ControlInput, EventReport, Farewell, Go
 from trirail.wire.vocabulary import FaultCause, Mode
 
 FROZEN, CYCLES = 0.5, 3
-"""Silence before the loop's end that shows it was frozen [s, cycles]; it sends records every 20 ms, or every cycle."""
+"""Silence before the loop's end that shows that it was frozen [s, cycles]; it sends records every 20 ms, or every
+cycle."""
 
 
 class LoopDeath:
-    """Observer of the loop's messages, which derives the events that are missing when the loop has died."""
+    """Observer of the loop's messages that derives the missing events when the loop has died."""
 
     def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._period = period

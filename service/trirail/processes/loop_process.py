@@ -1,7 +1,7 @@
 """Loop process: rehearses, connects the drives, acquires real-time rights, and runs the loop until it must end.
 
-Everything that must happen without delay (stop, quick stop, fault, lost gateway, end) runs once on simulated drives of
-the configured kind before the first cycle on the real ones, so that its memory pages are loaded and locked.
+Before the first cycle on the real drives, everything that must happen without delay runs once on simulated drives of
+the configured kind: stop, quick stop, fault, lost gateway and end. Its memory pages are then loaded and locked.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from trirail.wire.vocabulary import Command, Mode
 PLANNER_WITHIN = 120.0
 """Longest time for the planner to come up [s]: the first start compiles the kinematics."""
 STEP_WITHIN = 500
-"""Most cycles of a step; the rehearsal of a robot that is too slow for that ends at this step."""
+"""Maximum number of cycles of a step; the rehearsal of a robot that needs more ends at this step."""
 IN_MOTION = 20
-"""Cycles of a jog before it is stopped."""
+"""Number of cycles of a jog before it is stopped."""
 SLOW = 0.1
-"""Velocity of a jog along x, as a share of the limit."""
+"""Velocity of a jog along x, as a fraction of the limit."""
 
 
 class _UnfinishedError(Exception):
-    """Step that has taken longer than STEP_WITHIN."""
+    """Raised when a step has taken more than STEP_WITHIN cycles."""
 
 
 class _RehearsedTime:
@@ -185,7 +185,7 @@ class _Rehearsal:
 
 
 def rehearse(config: Config) -> tuple[str, ...]:
-    """Rehearse stops, faults and the end; return the reason if the rehearsal failed, else nothing."""
+    """Rehearse stops, faults and the end; return the reason if the rehearsal failed, otherwise nothing."""
     each = {name: structs.replace(drive, homing=None) for name, drive in zip(NAMES, config.drives.each, strict=True)}
     config = structs.replace(config, drives=structs.replace(config.drives, **each))
     with files.temporary_folder() as folder:

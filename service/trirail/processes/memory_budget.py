@@ -13,7 +13,7 @@ from typing import Final
 from trirail.processes.realtime import return_free_memory
 
 OVERHEAD: Final = 1024
-"""Memory of a message besides its content: Zenoh's query and the objects of this process [bytes]."""
+"""Memory that a message needs in addition to its content, for Zenoh's query and this process's objects [bytes]."""
 
 
 class Reservation:
@@ -29,7 +29,7 @@ class Reservation:
 
 
 class Budget:
-    """Budget of bytes held at a time, in total and per user."""
+    """Budget of bytes that may be held at one time, in total and per user."""
 
     def __init__(self, total: int, of_one: int) -> None:
         self._total, self._of_one = total, of_one

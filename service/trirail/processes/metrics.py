@@ -175,7 +175,7 @@ def _used(pid: int) -> tuple[float, float] | None:
 REQUEST_TIMEOUT_S: Final = 2.0
 """Longest time for a connection to send a request [s]."""
 MAX_CONNECTIONS: Final = 16
-"""Most connections served at a time; further ones are closed."""
+"""Maximum number of connections served at a time; more are closed."""
 
 _Start = Callable[..., Any]
 

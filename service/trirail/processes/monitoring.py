@@ -1,7 +1,7 @@
 """Measurements of gateway and recorder, and the health of all processes, kept by the supervisor for monitoring.
 
 Measurements are totals since the loop began, sent once a second. The supervisor checks all processes periodically.
-Other threads answer the requests of monitoring, so that they can also report a supervisor that is blocked itself.
+Separate threads answer monitoring requests, so that they can report a blocked supervisor as well.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CYCLE_BOUNDS: Final = (1e-6, 2e-6, 5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-
 SETTLE_BOUNDS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Bounds of the histogram of settle times [s]."""
 MAX_FAULT_KINDS: Final = 20
-"""Most faults distinguished by cause, drive and code; all others count as OTHER."""
+"""Maximum number of faults distinguished by cause, drive and code; all others count as OTHER."""
 OTHER: Final = FaultDetail("other")
 
 
@@ -37,7 +37,7 @@ class Histogram(Struct):
     bounds: tuple[float, ...]
     """Upper bounds, rising."""
     counts: list[int]
-    """Number of values up to each bound and above the previous one; the last counts those above all bounds."""
+    """Number of values up to each bound and above the previous one; the last count is for values above all bounds."""
     total: float = 0.0
     """Sum of all values."""
 
@@ -55,7 +55,7 @@ class Histogram(Struct):
 
 
 class FaultCount(Struct, frozen=True):
-    """Number of faults of a kind."""
+    """Number of faults of one kind."""
 
     fault: FaultDetail
     times: int
@@ -67,7 +67,7 @@ class ServiceMeasurements(Struct, frozen=True):
     mode: str
     """A trirail.wire.vocabulary.Mode."""
     cycles: int
-    """Fields `cycles` to `bus_load_measured` are as in trirail.wire.state.LoopState."""
+    """This field and those up to `bus_load_measured` are as in trirail.wire.state.LoopState."""
     overruns: int
     bus_load: float
     bus_load_measured: float
@@ -85,7 +85,7 @@ class ServiceMeasurements(Struct, frozen=True):
     use: ResourceUse
     """Use of limited resources."""
     warnings: tuple[str, ...]
-    """Warnings of resources nearly used up."""
+    """Warnings about resources that are nearly used up."""
     outputs: dict[str, bool] = {}
     """Value of each output of the configuration."""
     inputs: dict[str, bool] = {}
@@ -177,7 +177,7 @@ class Running(NamedTuple):
     pid: int | None
     """Process id; None if it is not running."""
     ready: bool
-    """Whether it has sent its ready message."""
+    """Whether the process has sent its ready message."""
     restarts: int
     """Number of restarts."""
 

@@ -102,7 +102,7 @@ def notify(state: str) -> None:
     """Notify systemd of a state, such as `READY=1`."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
-        # A failure of systemd must not keep the robot from being stopped.
+        # A failure of systemd must not prevent a stop of the robot.
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, contextlib.suppress(OSError):
             sender.settimeout(SEND_WITHIN)
             sender.connect("\0" + address[1:] if address.startswith("@") else address)

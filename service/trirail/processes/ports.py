@@ -23,12 +23,12 @@ class Ports(NamedTuple):
 
 
 REQUESTS_A_CYCLE = 4
-"""Most requests handled in one cycle: at 1 kHz more than the gateway sends on average."""
+"""Maximum number of requests handled in one cycle; at 1 kHz this is more than the gateway sends on average."""
 URGENT_REQUESTS_A_CYCLE = 128
-"""Most requests handled in a cycle with an urgent stop: more than the gateway can have under way, so that the stop
-does not wait for earlier requests, and none of them begins after it."""
+"""Maximum number of requests handled in a cycle with an urgent stop. The gateway never has more requests in progress,
+so the stop does not wait for earlier requests, and none of them begins after it."""
 ANSWERS_A_CYCLE = 2
-"""Most packets of the planner handled in one cycle; it has one request at a time."""
+"""Maximum number of the planner's packets handled in one cycle; the planner has one request at a time."""
 
 
 class GatewayLink:
@@ -44,7 +44,7 @@ class GatewayLink:
 
     @property
     def ended(self) -> bool:
-        """Whether it has disconnected, before a receive or send has noticed."""
+        """Whether the gateway has disconnected and no receive or send has noticed it yet."""
         return self._port.ended
 
     @property
@@ -53,7 +53,7 @@ class GatewayLink:
         return bool(self._in_hand)
 
     def read(self, limit: int = REQUESTS_A_CYCLE) -> None:
-        """Read at most `limit` requests: no more than a cycle has time for.
+        """Read at most `limit` requests, as many as a cycle has time for.
 
         Nothing is read from a frozen gateway until its heartbeat returns. A gateway that sends an invalid packet is
         disconnected; the supervisor then restarts it.
@@ -73,9 +73,9 @@ class GatewayLink:
             yield self._in_hand.pop(0)
 
     def lost(self) -> EventText | None:
-        """Check the gateway, once per cycle; return the message of a loss in this cycle, else None.
+        """Check the gateway, once per cycle; return a message if it was lost in this cycle, else None.
 
-        Requests that were read but not handled are dropped: no client could stop their effects.
+        Requests that were read but not handled are dropped, because no client could stop their effects.
         """
         if self._port.clear_lost():
             self.frozen = False
@@ -101,7 +101,7 @@ class PlannerLink:
 
     @property
     def idle(self) -> bool:
-        """Whether no failure to send a request waits to be reported."""
+        """Whether all failures to send a request have been reported."""
         return self._unsent is None
 
     def request_plan(self, request: PlanRequest) -> None:
@@ -114,7 +114,7 @@ class PlannerLink:
             self._awaited = request.number
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
-        """Yield the planner's answers and losses for the control; ignore answers without a request."""
+        """Yield the planner's answers and losses to the control; ignore answers without a request."""
         if self._unsent is not None:
             unsent, self._unsent = self._unsent, None
             yield PlannerLost(unsent)

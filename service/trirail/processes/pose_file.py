@@ -1,4 +1,4 @@
-"""File of taught poses in the service's state directory, written so that a power cut at any time leaves it intact."""
+"""File of taught poses in the service's state directory; a power cut during a write leaves it intact."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TaughtPose(NamedTuple):
     phi: Coordinate
     """[rad]."""
     geometry: str = ""
-    """Checksum of the [geometry] in force when it was taught; "" in files of earlier versions."""
+    """Checksum of the [geometry] with which the pose was taught; "" in files of earlier versions."""
 
     @property
     def pose(self) -> Coordinates:
@@ -79,13 +79,16 @@ class PoseFile:
 
     @property
     def gone(self) -> bool:
-        """Whether the file was deleted or moved away: its folder exists, and removing the last pose keeps the file."""
+        """Whether the file was deleted or moved away.
+
+        Its folder must exist; removing the last pose does not delete it.
+        """
         return self.path.parent.is_dir() and not self.path.exists()
 
     def change(self, name: str, pose: TaughtPose | None, known: Taught | None = None) -> None:
         """Save a pose under a name, or remove the name; return once the change is on the disk.
 
-        Poses written meanwhile by another service of the same robot are kept.
+        Poses that another service of the same robot has written in the meantime are kept.
 
         Parameters
         ----------

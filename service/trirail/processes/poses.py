@@ -1,7 +1,7 @@
 """Named poses in the gateway: those of [poses] in the configuration, and taught ones, which are saved in a file.
 
-A write to the disk may take longer than the gateway may be silent, so a thread of its own writes taught poses. They are
-confirmed, announced and usable in goals once they are on the disk.
+A separate thread writes taught poses, since a write to the disk may take longer than the gateway may be silent. A
+taught pose is confirmed, announced and usable in goals once it is on the disk.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from trirail.wire.text import check_new_pose
 from trirail.wire.vocabulary import MODES, Mode
 
 MAX_TAUGHT_POSES = 1000
-"""Most taught poses."""
+"""Maximum number of taught poses."""
 MAX_CHANGES_UNDER_WAY = 32
-"""Most changes in progress; further ones are refused."""
+"""Maximum number of changes in progress; more are refused."""
 CHECK_PERIOD_S = 2.0
 """Interval between two checks that the file of taught poses exists [s]."""
 MAX_CLOSURE_ERROR_M = 1e-3
-"""Largest error between the sliders of a measured pose and the measured sliders [m]. A larger error means that the
-present sliders do not close the loops, so that the pose is of an earlier cycle."""
+"""Maximum error between the measured sliders and those computed from a measured pose [m]. With a larger error the
+present sliders do not close the loops, so the pose is that of an earlier cycle."""
 
 
 class _Change(NamedTuple):
@@ -184,7 +184,7 @@ class Poses:
         self._to_measure.append(_Change(incoming, user, name, None))
 
     def measure(self, record: np.void) -> None:
-        """Take the measured pose of a record for each pose to teach; the record must be newer than the request."""
+        """Measure each pose to be taught from a record, which must be newer than the request."""
         while self._to_measure:
             wanted = self._to_measure.popleft()
             self._under_way -= 1

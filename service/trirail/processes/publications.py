@@ -42,7 +42,7 @@ _HISTORY_REPLIES = RepliesConfig(
 
 
 class Publications:
-    """Publishers on a robot's keys. For a slow subscriber, state and records are dropped, and events wait."""
+    """Publishers on a robot's keys. A slow subscriber loses states and records; events wait for it."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         def dropping(name: str, encoding: str, priority: zenoh.Priority) -> zenoh.Publisher:
@@ -96,14 +96,14 @@ _NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
 
 
 def wall_offset_ns() -> int:
-    """Return the wall clock minus the monotonic one, now: the wall clock may be set while the service runs."""
+    """Return wall-clock time minus monotonic time, now, since the wall clock may be set while the service runs."""
     return time.time_ns() - time.monotonic_ns()
 
 
 class StateMaker:
     """Builder of states from the newest record and the loop's other messages, with timing statistics.
 
-    `offset_ns` returns the wall clock minus the monotonic one.
+    `offset_ns` returns wall-clock time minus monotonic time [ns].
     """
 
     def __init__(self, config: Config, offset_ns: Callable[[], int] = wall_offset_ns) -> None:
@@ -150,7 +150,7 @@ class StateMaker:
 
     @property
     def lease(self) -> str | None:
-        """Holder of the lease; None for nobody."""
+        """Holder of the lease; None if it is free."""
         return self._status.lease
 
     @property
@@ -159,7 +159,7 @@ class StateMaker:
         return 0 if self._newest is None else int(self._newest["cycle"])
 
     def newest(self, warnings: tuple[str, ...] = ()) -> State:
-        """Return the state by the newest record, with these warnings."""
+        """Return the state according to the newest record, with the given warnings."""
         row = self._newest
         lateness, cycle = self._statistics
         goal, target = self._status.goal, self._status.target

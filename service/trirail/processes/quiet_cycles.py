@@ -38,9 +38,9 @@ class QuietResult(NamedTuple):
     deadline_ns: int
     lateness_ns: int
     missed: int
-    """Ticks skipped before the cycle, not counted yet."""
+    """Number of ticks that were skipped before the cycle and are not counted yet."""
     marked_ns: int
-    """Time at which its newest part ended [ns]."""
+    """Time at which the cycle's newest part ended [ns]."""
     called: bool
     """Whether a neighbour has called, or messages must be sent."""
     behind: int

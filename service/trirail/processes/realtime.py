@@ -68,9 +68,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 
 PLANNER_BELOW = 10
-"""Difference between the priorities of loop and planner."""
+"""Difference between the priorities of the loop and the planner."""
 DRIVES_BELOW = 5
-"""Difference between the priorities of loop and simulated drives: drives must answer while the planner works."""
+"""Difference between the priorities of loop and simulated drives; drives must answer while the planner works."""
 
 
 def _call(name: str, *arguments: int) -> None:
@@ -94,7 +94,7 @@ def _fifo(loop: LoopTable) -> None:
 
 
 def _lock_memory(_: LoopTable) -> None:
-    """Lock all pages in use, now and in future."""
+    """Lock all current and future pages in memory."""
     # mlockall(2) with MCL_ONFAULT: all mapped pages would be five times as much memory as those in use.
     _call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
 

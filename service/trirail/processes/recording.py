@@ -41,10 +41,8 @@ from trirail.wire.packets import (
 from trirail.wire.records import last_cycle
 
 GATHER = 0.14
-"""Pause in which packets accumulate before they are read [s]: waking up for each costs more than processing it.
-
-Killing the recorder loses less than 0.2 s of data: the packets of this pause, and the loop's batch.
-"""
+"""Pause in which packets accumulate before they are read [s]; waking up for each packet costs more than processing it.
+Killing the recorder loses less than 0.2 s of data: the packets of this pause and the loop's batch."""
 
 NOT_FOR_OTHERS = 0o027
 """Umask of recordings: the owner may write them, the group may read them."""
@@ -61,7 +59,7 @@ class Intake:
         self._loop_death = LoopDeath(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
-        sidecars = path is None  # a user who names a single file expects no others beside it
+        sidecars = path is None  # a user who names a single file does not expect others beside it
         self.recorder = recorder = Recorder(config, directory, path=path, sidecars=sidecars, warn=self._warn)
         folder = recorder.path.parent
 

@@ -1,8 +1,8 @@
 """Replies to queries, sent by separate threads, and announcements of refusals at a limited rate.
 
-A client that does not read its replies blocks no other client. A client sends each stop over Zenoh and to the door for
-stops; it is carried out once, and both copies get the same reply. The slower copy may arrive when the robot moves
-again, and must not stop goals that were sent after the first copy was confirmed.
+A client that does not read its replies does not block other clients. A client sends each stop both over Zenoh and to
+the stop port; the service carries it out once, and both copies get the same reply. The slower copy may arrive when the
+robot moves again, and must not stop goals that were sent after the first copy was confirmed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from trirail.wire.text import is_name, quoted
 REMEMBERED_S = 60.0
 """Time for which the reply to a stop is kept for later copies [s]; no client waits longer."""
 COPIES_KEPT = 4096
-"""Most stops remembered; beyond that the oldest are forgotten."""
+"""Maximum number of stops remembered; the oldest are forgotten first."""
 
 _Id = tuple[str, str, bytes]
 
@@ -64,7 +64,7 @@ class Copies:
         return True
 
     def known(self, incoming: Incoming) -> msgspec.Struct | None:
-        """Return the reply to the first copy of a stop; None before it."""
+        """Return the reply to the first copy of a stop; None if it has not been answered yet."""
         stop = self._stops.get(_id(incoming))
         return stop.answer if stop is not None else None
 
@@ -93,22 +93,22 @@ def _id(stop: Incoming) -> _Id:
 
 
 THREADS = 32
-"""Number of clients that can block on their replies without delaying others."""
+"""Number of threads; as many clients can block on their replies without delaying others."""
 CLOSE_WITHIN = 2.0
 """Longest time for sending the last replies [s]."""
 
 
 class Replies:
-    """Sender of replies, in order for each asker; a reply is kept until the transport closes the asker's session."""
+    """Sender of replies, in order for each client; a reply is kept until the transport closes the client's session."""
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
         self.copies = Copies()
         self._changed = threading.Condition()
-        # Not bounded: dropping a query sends a final message to the asker, which may block as long as a reply.
+        # Not bounded: dropping a query sends a final message to the client, which may block as long as a reply.
         self._queues: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
         self._idle: deque[str] = deque()
-        """Askers with waiting replies, none of which is being sent, in the order of their turns."""
+        """Clients with waiting replies of which none is being sent, in the order of their turns."""
         self._closed = False
         self._threads = [threading.Thread(target=self._run, name="replies", daemon=True) for _ in range(THREADS)]
         for thread in self._threads:
@@ -126,8 +126,8 @@ class Replies:
             incoming.at_door(content)
         if incoming.query is None:
             return
-        # One asker per kind and user: a user who does not read one reply does not read the next ones either.
-        # Queries about a role share one asker for all users.
+        # One queue per kind and user: a user who does not read one reply does not read the next ones either.
+        # Queries about a role share one queue for all users.
         asker = f"{incoming.kind}/{incoming.user}"
         with self._changed:
             if asker not in self._queues:
@@ -137,15 +137,15 @@ class Replies:
             self._queues[asker].append((incoming, content))
 
     def send_now(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Send the reply to a message from this thread, blocking for as long as the asker does not read it."""
+        """Send the reply to a message from this thread; block until the client reads it."""
         if incoming.at_door is not None:
             incoming.at_door(content)
         if incoming.query is not None:
-            with contextlib.suppress(zenoh.ZError):  # the asker has disconnected
+            with contextlib.suppress(zenoh.ZError):  # the client has disconnected
                 self._answer(incoming, incoming.query, content)
 
     def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Answer a message, the equal ones merged into it, and the copies of each."""
+        """Answer a message, the equal messages merged into it, and the copies of each."""
         for each in (incoming, *incoming.alike):
             self.send(each, content)
             for copy in self.copies.answered(each, content):
@@ -198,7 +198,7 @@ class Replies:
         except RefusedError:
             encoding = boundary.JSON
         payload = boundary.encode(content, encoding)
-        with query:  # complete the query: the asker would otherwise wait for more replies until its time-out
+        with query:  # complete the query; the client would otherwise wait for more replies until its time-out
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:
@@ -208,7 +208,7 @@ class Replies:
 
 
 REFUSALS_PER_SECOND = 10
-"""Refusals per second of one user that are announced to everyone; further ones only get their error reply."""
+"""Number of one user's refusals per second that are announced to everyone; more get only their error reply."""
 REFUSALS_OF_ALL = 50
 """The same for all users."""
 

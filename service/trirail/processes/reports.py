@@ -38,7 +38,7 @@ ANSWERS_A_CYCLE = 8
 PROGRESS_EVERY = 0.1
 """Interval between two progress reports of drives that are being configured [s]."""
 INPUTS_KEPT = 8
-"""Most control inputs that wait for the next batch of records; the recorder does not need them before it."""
+"""Maximum number of control inputs that wait for the next batch of records; the recorder does not need them earlier."""
 EVENTS_KEPT = 1000
 """Events kept for a restarted gateway, since the previous one may not have published all of them."""
 
@@ -46,7 +46,7 @@ EVENTS_KEPT = 1000
 class Reports:
     """Reports of the loop: records in batches, events, answers, and the status that records do not contain.
 
-    Nothing here waits: packets for a slow gateway are kept, those for a slow recorder are lost.
+    No call waits: packets for a slow gateway are kept, and packets for a slow recorder are lost.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Reports:
         self._inputs = 0
         self._unsent_inputs: list[ControlInput] = []
         self._postponed = 0, 0
-        """Number of waiting events that belong to an earlier cycle than the following ones, and that cycle."""
+        """Number of waiting events that belong to an earlier cycle than the events after them, and that cycle."""
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._made = control.measured.record.view(np.uint8).data
         """Bytes of the cycle's record, filled by the control."""
@@ -98,7 +98,7 @@ class Reports:
         now_ns
             Time at which the control has received it [ns].
         urgent
-            Whether it applies to the present cycle; otherwise it applies to the next.
+            Whether the input applies to the present cycle; otherwise it applies to the next.
         waiting
             As in ControlInput.
 
@@ -125,7 +125,7 @@ class Reports:
 
     @property
     def idle(self) -> bool:
-        """Whether no event and no answer waits to be sent."""
+        """Whether all events and answers have been sent."""
         return not (self._answers or self._sent_events < self._events)
 
     @property
@@ -134,7 +134,7 @@ class Reports:
         return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
     def pass_on(self) -> None:
-        """Send events and answers, if any, and the control's inputs before them.
+        """Send events and answers, if there are any, after the control's inputs.
 
         An event is stamped with the first cycle that shows its effect: the present one or, after its end, the next.
         """
@@ -188,7 +188,7 @@ class Reports:
             self._publish_status()
 
     def _measure_bus_load(self) -> None:
-        """Compute and report the share of the bus in use, once a second."""
+        """Compute and report the fraction of the bus capacity in use, once a second."""
         cycles = self._control.cycles - self._bus_measured_at
         if cycles * self._period >= 1.0:
             bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic

@@ -1,7 +1,7 @@
-"""Requests of clients to the loop, each answered exactly once; alignment reports.
+"""Requests of clients to the loop, each answered exactly once, and alignment reports.
 
-Goals are sent in turn, commands and checks immediately. A command that stops the robot is carried out even if it cannot
-be read.
+The gateway sends goals in turn, and commands and checks immediately. A command that stops the robot is carried out even
+if its content cannot be read.
 """
 
 from __future__ import annotations
@@ -34,19 +34,20 @@ from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
 
 MAX_GOALS_OF_USER = 3
-"""Most goals of one user in the loop: one being planned, the next one, and one more, which replaces the next one if
-both have the same target. Further goals wait in the gateway, where commands overtake them and a stop withdraws them."""
+"""Maximum number of a user's goals in the loop: one being planned, the next one, and one more, which replaces the next
+one if both have the same target. Further goals wait in the gateway, where commands overtake them and a stop withdraws
+them."""
 MAX_GOALS = 16
-"""Most goals of all users in the loop: as many as it reads in four cycles."""
+"""Maximum number of all users' goals in the loop, as many as it reads in four cycles."""
 MAX_COMMANDS_OF_USER = 8
-"""Most commands and checks of one user in the loop; further ones are refused, except commands that stop the robot."""
+"""Maximum number of one user's commands and checks in the loop; more are refused, except stops."""
 MAX_COMMANDS = 64
 """The same for all users."""
 REPLY_TIMEOUT_S = 15.0
-"""Longest time for the loop to carry out a command, after which an error is answered [s]."""
+"""Time-out of a command in the loop, after which an error is returned to the sender [s]."""
 LOOK_BURST, LOOKS_PER_SECOND = 50, 20.0
-"""Alignment looks of one user accepted in a burst, and then per second: three times as many as an alignment without a
-camera sends."""
+"""Number of one user's alignment looks accepted in a burst, and then per second. This is three times the number that an
+alignment without a camera sends."""
 
 
 class _PendingRequest(NamedTuple):
@@ -80,12 +81,12 @@ class Requests:
         self._goals: dict[int, str] = {}
         """User of each goal in the loop, by ticket."""
         self._commands: dict[int, str] = {}
-        """Users of the commands and checks that the loop has, by ticket."""
+        """User of each command and check in the loop, by ticket."""
         self._pending: dict[int, _PendingRequest] = {}
         self._tickets = 0
 
     def __iter__(self) -> Iterator[Incoming]:
-        """Yield the messages not answered yet."""
+        """Yield the messages that have not been answered."""
         yield from (waiting.incoming for waiting in self._pending.values())
         yield from (goal.incoming for goal in self.backlog)
 
@@ -121,7 +122,8 @@ class Requests:
     def command(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> int:
         """Send a command to the loop; return its ticket.
 
-        Raises RefusedError if too many commands are under way, or the user's role forbids taking the lease over.
+        Raises RefusedError if too many commands are in progress, or if the user's role does not allow taking over the
+        lease.
         """
         if not name.stops:
             self._check_command_count(user)
@@ -134,20 +136,20 @@ class Requests:
         return request.ticket
 
     def check(self, incoming: Incoming, user: str, goal: LoopGoal) -> None:
-        """Request the plan of a goal without moving to it. Raises RefusedError if too many requests are under way."""
+        """Request a plan for a goal without moving. Raises RefusedError if too many requests are in progress."""
         self._check_command_count(user)
         self._tickets += 1
         self._send(incoming, CheckRequest(self._tickets, user, goal), REPLY_TIMEOUT_S)
 
     def _send(self, incoming: Incoming, request: CommandRequest | CheckRequest, within: float) -> None:
-        """Send the loop a request, to be answered within a time [s]. Raises RefusedError if its queue is full."""
+        """Send the loop a request with a time-out [s]. Raises RefusedError if the loop's queue is full."""
         if not self._link.send(message(request)):
             raise RefusedError(RefusalCode.BUSY, "too many requests: send it again")
         self._commands[request.ticket] = request.user
         self._pending[request.ticket] = _PendingRequest(incoming, time.monotonic() + within)
 
     def _check_command_count(self, user: str) -> None:
-        """Raise RefusedError if too many commands and checks are under way, of this user or in total."""
+        """Raise RefusedError if too many commands and checks are in progress, either for this user or overall."""
         own, all_ = sum(sender == user for sender in self._commands.values()), len(self._commands)
         if own >= MAX_COMMANDS_OF_USER:
             raise RefusedError(RefusalCode.BUSY, f"{own} commands of {user} are under way already: send fewer")
@@ -166,7 +168,7 @@ class Requests:
             self.send_goals()
 
     def expire(self) -> None:
-        """Answer a time-out error to requests that the loop has not carried out in time."""
+        """Reply with a time-out error to requests that the loop has not carried out in time."""
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._pending.items() if waiting.deadline < now]:
             self.answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))

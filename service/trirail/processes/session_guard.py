@@ -1,4 +1,4 @@
-"""Access control of the gateway's Zenoh session and of its door for stops, from [zenoh] of the configuration."""
+"""Access control of the gateway's Zenoh session and its stop port, from [zenoh] of the configuration."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _DOOR_REMEDY = "a flood of the other ports then keeps new stops out; free that p
 
 
 class Guard:
-    """Opener of the session and the door for stops, which checks users' roles.
+    """Opener of the session and the stop port, which also checks users' roles.
 
     Raises ServiceError if the certificates cannot be used.
     """
@@ -66,7 +66,7 @@ class Guard:
         return opened
 
     def stop_door(self, take: Callable[[StopRequest, Answer], None]) -> StopDoor:
-        """Open the door for stops beside each endpoint; `warnings` lists the endpoints where that failed."""
+        """Open the stop port beside each endpoint; `warnings` lists the endpoints where that failed."""
 
         def ask(shown: str, request: StopRequest, answer: Answer) -> None:
             user, command = command_of(request, self._robot)
@@ -106,15 +106,15 @@ class Guard:
         disconnect(set(filter(None, map(tcp_address, addresses))))
 
     def linked(self, opened: zenoh.Session) -> set[str]:
-        """Return the endpoints of `connect` where the session is linked to the configured router."""
+        """Return the endpoints of `connect` at which the session is linked to the configured router."""
         return zenoh_session.linked(opened, self._connect, self._router)
 
     def why_not_linked(self, endpoint: str) -> str:
-        """Return the reason why there is no link to an endpoint, "" if none is found; may take seconds."""
+        """Return why there is no link to an endpoint, or "" if no reason is found; may take seconds."""
         return connection_problem(endpoint, self._credentials, self._router)
 
     def role(self, user: str) -> Role | None:
-        """Return a user's role: the highest without certificates, None for a user without a role."""
+        """Return a user's role, or None without one; without certificates, every user has the highest role."""
         return Role.MAINTAINER if self._credentials is None else self.users.get(user)
 
     def check(self, user: str, needed: Role, action: str) -> None:
@@ -126,7 +126,7 @@ class Guard:
             raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about insecure endpoints, the door and certificates, one line each, with the remedy."""
+        """Return warnings about insecure endpoints, the stop port and certificates, one line each, with the remedy."""
         insecure = [
             f"insecure: everyone who reaches {endpoint} can move the robot; trirail keys init makes certificates"
             for endpoint in (*self._listen, *self._connect)

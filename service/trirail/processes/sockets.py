@@ -34,7 +34,7 @@ def descriptor_limit() -> int:
 def descriptors_used() -> int:
     """Return the number of descriptors that this process has open."""
     counted = Path("/proc/self/fd").stat().st_size  # Linux 6.2 and later; 0 before
-    return counted or len(os.listdir("/proc/self/fd")) - 1  # without the descriptor of the listing
+    return counted or len(os.listdir("/proc/self/fd")) - 1  # the listing itself uses one
 
 
 def connections(ports: Container[int]) -> list[tuple[str, int]]:

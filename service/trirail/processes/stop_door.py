@@ -1,10 +1,10 @@
-"""Door for stops: a server beside Zenoh's endpoints that accepts only stops, in a thread with an event loop.
+"""Stop port: a server beside Zenoh's endpoints that accepts only stops, in a thread with an event loop.
 
-Each connection has a task of its own. TLS uses the sockets directly: asyncio's streams would give each connection a
+Each connection has its own task. TLS uses the sockets directly, since asyncio's streams would give each connection a
 buffer of 256 KB, which a flood multiplies, and would close its descriptor later than the reserve needs it.
 
-Each source has a share of the connections: an address until the user is known, the user from then on. Beyond the share
-its oldest connection is closed, so that a flood from one source keeps no other out.
+Each source may use a share of the connections. The source is an address until the user is known, and then the user.
+When a source exceeds its share, its oldest connection is closed, so that a flood from one source does not block others.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answe
 from trirail.wire.text import quoted
 
 MAX_CALLERS: Final = 4096
-"""Most connections, or a quarter of the process's descriptors if that is less; the descriptors are reserved."""
+"""Maximum number of connections, at most a quarter of the process's descriptors; their descriptors are reserved."""
 REQUEST_TIMEOUT_S: Final = 10.0
-"""Longest time until a connection has sent its request [s]; a shorter one makes idle floods more expensive."""
+"""Time-out of a connection's request [s]; a shorter one would make idle floods more expensive."""
 ANSWER_TIMEOUT_S: Final = 20.0
-"""Longest wait for the answer, which comes within 15 s [s]."""
+"""Time-out of the answer [s]; it normally arrives within 15 s."""
 ACCEPTED_PER_TURN: Final = 64
-"""Most connections accepted before the existing ones are served."""
+"""Maximum number of connections accepted before the existing ones are served."""
 
 T = TypeVar("T")
 Answer = Callable[[CommandReply | ErrorReply], None]
@@ -68,7 +68,7 @@ class _Caller:
 
 
 class StopDoor:
-    """Server for stops; `start` begins to serve, `close` ends."""
+    """Server of the stop port; `start` begins to serve requests, and `close` ends the server."""
 
     def __init__(self, secured: ssl.SSLContext | None, handle_request: RequestHandler) -> None:
         self._secured = secured
@@ -91,7 +91,7 @@ class StopDoor:
         self._thread.start()
 
     def close(self) -> None:
-        """End; requests without an answer get none here."""
+        """Close the server; requests without an answer get no answer from it."""
         self._loop.call_soon_threadsafe(self._closing.set)
         self._thread.join()
         self._reserve.end()
@@ -124,7 +124,7 @@ class StopDoor:
                 connected, address = listening.accept()
             except BlockingIOError:
                 break
-            except OSError:  # another thread took the descriptor where they are short, or the caller has gone
+            except OSError:  # no descriptor is left, or the caller has disconnected
                 continue
             connected.setblocking(False)
             caller = _Caller(connected, source(connected, address))
@@ -135,7 +135,7 @@ class StopDoor:
         self._reserve.refill(len(self._callers))
 
     def _enter(self, caller: _Caller, stage: _Stage, share: str) -> None:
-        """Count a connection in another share."""
+        """Count a connection in the share of another stage or source."""
         self._discount(caller)
         caller.stage, caller.share = stage, share
         self._count(caller)
@@ -153,7 +153,7 @@ class StopDoor:
             self._shares.pop((caller.stage, caller.share), None)
 
     def _drop(self, caller: _Caller) -> None:
-        """Close a connection, unless that has been done."""
+        """Close a connection, unless it is already closed."""
         if caller not in self._callers:
             return
         del self._callers[caller]
@@ -175,7 +175,7 @@ class StopDoor:
                 answer = await self._answer(caller, user, line)
             self._check_open(caller)
             caller.connection.send(answer_with(answer))  # no line is longer than the socket's buffer
-        except (OSError, ValueError):  # it has gone, says too much or too little, or has no good certificate
+        except (OSError, ValueError):  # disconnected, invalid request, or no valid certificate
             pass
         finally:
             caller.task = None
@@ -183,7 +183,7 @@ class StopDoor:
 
     async def _request(self, caller: _Caller) -> tuple[bytes, str]:
         """Return the line of a connection, and the name in its certificate. Raises OSError or ValueError."""
-        await caller.readable.wait()  # one that says nothing costs no handshake
+        await caller.readable.wait()  # a silent connection does not cost a handshake
         user = ""
         self._enter(caller, _Stage.TALKING, caller.share)
         if self._secured is not None:
@@ -208,7 +208,7 @@ class StopDoor:
         return data
 
     async def _when_readable(self, caller: _Caller, act: Callable[[], T]) -> T:
-        """Return the result of an action, which is tried whenever the connection has become readable."""
+        """Return the result of an action that is retried each time the connection becomes readable."""
         while True:
             self._check_open(caller)
             caller.readable.clear()
@@ -220,13 +220,13 @@ class StopDoor:
     def _check_open(self, caller: _Caller) -> None:
         """Raise ConnectionError if a connection has been closed.
 
-        OpenSSL keeps the number of its descriptor, which may be that of a newer connection by now.
+        OpenSSL keeps the number of the connection's descriptor, which by now may belong to a newer connection.
         """
         if caller not in self._callers:
             raise ConnectionError
 
     async def _answer(self, caller: _Caller, user: str, line: bytes) -> CommandReply | ErrorReply:
-        """Pass a request on; return its answer. Raises ConnectionError if the caller goes, or sends more."""
+        """Forward a request; return its answer. Raises ConnectionError if the caller disconnects or sends more."""
         try:
             request = decoded(line, StopRequest)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -239,7 +239,7 @@ class StopDoor:
                 answered.set_result(content)
 
         def answer(content: CommandReply | ErrorReply) -> None:
-            with contextlib.suppress(RuntimeError):  # the door is closed
+            with contextlib.suppress(RuntimeError):  # the stop port is closed
                 self._loop.call_soon_threadsafe(finish, content)
 
         try:

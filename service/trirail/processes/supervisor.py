@@ -30,7 +30,7 @@ from trirail.wire.messages import Event, Level
 CHILDREN = ("gateway", "recorder", "loop", "planner")
 """Processes in the order of their start: the first two need no compiled code, and start while it is being imported."""
 CHILDREN_WITH_DRIVES = ("gateway", "recorder", "loop", "drives", "planner")
-"""The same with simulated drives; the loop rehearses while the drives start, and then waits for them."""
+"""The same list with simulated drives; the loop rehearses while the drives start, and then waits for them."""
 PORTS = ("gateway", "recorder", "planner")
 """Processes that connect to the loop, in the order of trirail.processes.ports.Ports."""
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
@@ -52,28 +52,28 @@ RESTART_DURING_START = 1.0
 """Pause before restarting a process that has ended before the service was up [s]: long enough to notice that the loop
 has ended."""
 RESTARTS = 5
-"""Restarts of one process within a minute that follow without a pause."""
+"""Number of restarts of one process within a minute that happen without a pause."""
 CHECK_PERIOD_S = 0.1
 """Interval between two checks of the other processes [s]."""
 MAX_SILENCE_S = 0.7
 """Longest time without a heartbeat [s], after which a process is killed as hung; see heartbeats.HangWatch."""
 MAX_RECORDER_SILENCE_S = 5.0
-"""The same for the recorder [s], which may wait for a disk, and on which no motion depends."""
+"""Longest time without a heartbeat of the recorder [s]; it may wait for a disk, and no motion depends on it."""
 RETRY_PAUSE_S = 10.0
 """Pause before any further restart of recorder or planner [s]; a further end of the gateway ends the service."""
 
 
 class Supervisor:
-    """Supervisor of the service, in the foreground.
+    """Supervisor of the service, which runs in the foreground.
 
     Parameters
     ----------
     record
         Recording file; None for a file named by the time.
     report
-        Called with each message about the processes, and its level.
+        Function that is called with each message about the processes and the message's level.
     on_event
-        Called with each event of the service.
+        Function that is called with each event of the service.
 
     """
 
@@ -261,7 +261,7 @@ class Supervisor:
         self._due[name] = now + wait
 
     def _loop_is_ending(self) -> bool:
-        """Return whether the loop has run and has stopped its heartbeat: only its own end is reported then."""
+        """Return whether the loop has run and has stopped its heartbeat; only the loop's own end is then reported."""
         loop = self._children.get("loop")
         return loop is None or (loop.ready_message is not None and not self._heartbeats.heart("loop").count)
 

@@ -32,7 +32,7 @@ class _Incomplete:
 
     @property
     def message(self) -> Incoming:
-        """All parts as one message, with the number of the first; an answer to it goes to all parts."""
+        """All parts as one message, with the number of the first part; its answer goes to all parts."""
         first, *others = sorted((part.incoming for part in self.received.values()), key=lambda each: each.number)
         newest = others[-1] if others else first
         size = first.size + sum(each.size for each in others)
@@ -66,7 +66,7 @@ class TrajectoryParts:
         self._incomplete: dict[tuple[str, str], _Incomplete] = {}
 
     def __iter__(self) -> Iterator[Incoming]:
-        """Yield the messages not answered yet."""
+        """Yield the messages that have not been answered."""
         return (goal.message for goal in self._incomplete.values())
 
     def add(self, incoming: Incoming, user: str, goal: TrajectoryGoal) -> tuple[Incoming, PackedTrajectory] | None:

@@ -1,8 +1,8 @@
 """Monitoring of the gateway's Zenoh links: those of clients, which are limited, and those to routers.
 
-Zenoh limits the number of sessions in total, but not per certificate. The gateway therefore checks the links: if few
-sessions are left, it ends the newest ones of the user with most, users without a role first. Zenoh dials the routers of
-[zenoh] connect by itself; this module reports their links.
+Zenoh limits the number of sessions in total, but not per certificate. The gateway therefore checks the links. If few
+sessions are left, it ends the newest sessions of the user who has the most, starting with users without a role. Zenoh
+itself connects to the routers of [zenoh] connect; this module reports these links.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trirail.wire.text import quoted
 CHECK_PERIOD_S: Final = 1.0
 """Interval between two checks [s]."""
 WARNING_SHARE: Final = 0.8
-"""Share in use above which a warning starts; it ends below nine tenths of that."""
+"""Fraction of a resource above which a warning starts; the warning ends below nine tenths of it."""
 FREE_SHARE: Final = 0.1
 """Share of the sessions kept free for users with few sessions."""
 PROTECTED_SESSIONS: Final = 8
@@ -37,7 +37,7 @@ class ResourceUse(NamedTuple):
     descriptors: int
     descriptors_most: int
     unopened: int = 0
-    """Connections to endpoints with TLS that have opened no session."""
+    """Number of connections to TLS endpoints that have not opened a session."""
 
 
 def surplus(links: Mapping[str, str], users: Container[str], most: int) -> set[str]:
@@ -68,7 +68,7 @@ def surplus(links: Mapping[str, str], users: Container[str], most: int) -> set[s
 
 
 FAILED_A_SECOND: Final = 10.0
-"""Failed handshakes that Zenoh handles per second: after each it accepts no connection for 0.1 s."""
+"""Number of failed handshakes that Zenoh handles per second; after each it accepts no connection for 0.1 s."""
 UNOPENED: Final = 20
 """Number of connections without a session above which a warning starts."""
 
@@ -240,7 +240,7 @@ class RouterLinks:
             router.ask_at = now + DIAGNOSIS_PERIOD_S
         if router.asked is None or not router.asked.done():
             return
-        error = router.asked.exception()  # the peer is unknown, so that no exception of its answer may end the service
+        error = router.asked.exception()  # an exception caused by an unknown peer must not end the service
         why = quoted(f"{error!r}") if error is not None else router.asked.result()
         router.asked = None
         why = why or "it answers, but opens no session: is it a router that takes this robot?"

@@ -1,9 +1,9 @@
 """Permissions on the network: the roles, and Zenoh's access control derived from them.
 
-Zenoh applies one set of rules to each certificate's common name and one to every certificate. It drops a message that
-no rule allows, and the sender is not informed. Each direction has its own rule: the robot's publications may leave but
-not enter, so no other user can forge a state, event or reply; clients' queries may enter but not leave.
-A rule applies if its key expression includes that of the message: permission for `goal/ann` does not permit `goal/*`.
+Zenoh applies one set of rules to each certificate's common name, and another set to every certificate. It drops a
+message that no rule allows, and does not inform the sender. Each direction has its own rule. The robot's publications
+may leave but not enter, so no other user can forge a state, event or reply; clients' queries may enter but not leave. A
+rule applies if its key expression includes that of the message: permission for `goal/ann` does not permit `goal/*`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from trirail.wire.vocabulary import Command, Role
 from trirail.wire.zenoh_session import key
 
 GOAL_ROLE = Role.OPERATOR
-"""Lowest role that may send and check goals, and report the looks of an alignment, which sends goals."""
+"""Lowest role that may send and check goals. It may also report alignment looks, since an alignment sends goals."""
 POSE_ROLE = Role.MAINTAINER
 """Lowest role that may teach and remove poses."""
 

@@ -51,10 +51,12 @@ def issue(
     serves: bool = False,
     now: datetime | None = None,
 ) -> Pair:
-    """Return a new private key and its certificate, signed by the authority `by`.
+    """Return a new private key and its certificate, signed by the given authority.
 
     Parameters
     ----------
+    by
+        Authority that signs the certificate.
     name
         Common name.
     days
@@ -63,6 +65,7 @@ def issue(
         Host names and IP addresses at which clients connect to a robot.
     serves
         Make a certificate for a robot or router; otherwise it is valid for clients only.
+
     """
     key = ec.generate_private_key(ec.SECP256R1())
     return Pair(_certificate(by, name, key.public_key(), days, addresses, serves, now), _key_pem(key))
@@ -84,7 +87,7 @@ def common_name(certificate: x509.Certificate) -> str:
 
 
 def serves(certificate: x509.Certificate) -> bool:
-    """Whether clients accept the certificate from a robot or router; a user's is valid for clients only."""
+    """Return whether clients accept the certificate from a robot or router; a user's is valid for clients only."""
     try:
         purposes = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     except x509.ExtensionNotFound:

@@ -25,11 +25,11 @@ class Credentials(NamedTuple):
     name: str
     """Common name of the certificate: a user's or a robot's; "" if it has none."""
     expires: datetime
-    """Expiry of the certificate or that of its authority, whichever is first."""
+    """Expiry of the certificate or of its authority, whichever is earlier."""
     addresses: tuple[str, ...]
     """Host names and IP addresses at which clients connect to a robot; empty for a user."""
     serves: bool = False
-    """Whether it is a robot's or a router's certificate; a user's is valid for clients only."""
+    """Whether the certificate is a robot's or a router's; a user's is valid for clients only."""
     contents: tuple[bytes, ...] = ()
     """Contents of the three files, as checked."""
     copies: tuple[Path, ...] = ()
@@ -37,7 +37,7 @@ class Credentials(NamedTuple):
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
-        """Paths of the authority's certificate, the own certificate, and its private key."""
+        """Paths of the authority's certificate, this certificate and its private key."""
         authority, certificate, key = self.copies or (self.folder / name for name in (AUTHORITY, CERTIFICATE, KEY))
         return authority, certificate, key
 
@@ -89,7 +89,7 @@ class Credentials(NamedTuple):
 
     @classmethod
     def read_server(cls, folder: Path) -> Self:
-        """Read the folder of a robot or router. Raises ServiceError as `read`, and for a user's."""
+        """Read the folder of a robot or router. Raises ServiceError like `read`, and for a user's folder."""
         credentials = cls.read(folder)
         if not credentials.serves:
             raise ServiceError(
@@ -120,7 +120,7 @@ class Admission(NamedTuple):
 
 
 def check_private(key_file: Path) -> None:
-    """Raise ServiceError if a private key is readable by others than its owner, or than its group if root owns it."""
+    """Raise ServiceError if a private key is readable by anyone but its owner; the group may read a key of root."""
     status = key_file.stat()
     if status.st_mode & (0o037 if status.st_uid == 0 else 0o077):
         raise ServiceError(
@@ -139,7 +139,7 @@ def revoked(folder: Path) -> frozenset[str]:
 
 
 def with_role(users: Mapping[str, Role], folder: Path) -> dict[str, Role]:
-    """Return the roles of the users that are not revoked. Raises ServiceError as `revoked`."""
+    """Return the roles of the users that are not revoked. Raises ServiceError like `revoked`."""
     without = revoked(folder)
     return {user: role for user, role in users.items() if user not in without}
 

@@ -21,7 +21,7 @@ Decoder = msgspec.json.Decoder[Any] | msgspec.msgpack.Decoder[Any]
 
 _MADE: dict[Any, tuple[msgspec.json.Decoder[Any], msgspec.msgpack.Decoder[Any]]] = {}
 _MAKING = threading.Lock()
-"""Guard for two modules that are imported concurrently and whose types share others."""
+"""Lock for modules that are imported concurrently and whose types use the same other types."""
 
 
 def prepare(*kinds: Any) -> None:

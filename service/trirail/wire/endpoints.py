@@ -28,7 +28,7 @@ class ReachableBy(StrEnum):
 
 
 def fault_of(endpoint: str) -> str:
-    """Return what is wrong with an endpoint, and the expected form; "" if it is valid."""
+    """Return the problem of an endpoint and the expected form; "" if the endpoint is valid."""
     protocol, address = _parts(endpoint)
     if "/" not in endpoint or not protocol:
         return f"the protocol is missing: {ENDPOINT_SYNTAX}"
@@ -66,9 +66,9 @@ def is_host(text: str) -> bool:
 
 
 def leads_to(endpoint: str, reached: str) -> bool:
-    """Whether a configured endpoint can be the connected one, whose host is given by IP address.
+    """Return whether a configured endpoint can be the connected one, whose host is an IP address.
 
-    A host name matches every address.
+    A configured host name matches every address.
     """
     (protocol, address), (as_protocol, as_address) = _parts(endpoint), _parts(reached)
     if protocol != as_protocol or protocol not in _WITH_PORT:
@@ -98,7 +98,7 @@ def _covers(every: _Address, other: _Address) -> bool:
 
 
 def reach(endpoint: str) -> ReachableBy:
-    """Return the reach of an endpoint; the network if it is uncertain, such as for a host name."""
+    """Return the reach of an endpoint; the network if the reach is uncertain, as for a host name."""
     protocol = endpoint.partition("/")[0]
     if protocol == "tls":
         return ReachableBy.CERTIFICATE

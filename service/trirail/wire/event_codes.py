@@ -1,4 +1,4 @@
-"""Event codes: what an event says, for programs and for pages in other languages than its English message."""
+"""Event codes: the content of an event for programs, and for pages in languages other than English."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class EventCode(StrEnum):
     OTHER = "other", "a code of a newer service that this client does not know"
 
     def __new__(cls, code: str, meaning: str = "", *params: str) -> Self:
-        """Make a member of its row; with a code alone the enumeration looks it up."""
+        """Create a member from its row; a call with a code alone looks the member up."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.meaning, member.params = meaning, params
@@ -119,17 +119,17 @@ class EventCode(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> EventCode | None:
-        """Return OTHER for a code of a newer service."""
+        """Return OTHER for a code that only a newer service knows."""
         return cls.OTHER if isinstance(value, str) else None
 
 
 Params = dict[str, float | str]
 MAX_PARAM = 200
-"""Longest text of a parameter; an event with a long error must fit into a packet [characters]."""
+"""Maximum length of a parameter's text; an event with a long error must fit into a packet [characters]."""
 
 
 class EventText(NamedTuple):
-    """An English text for people with its code and parameters for programs."""
+    """English text for people, with the code and parameters for programs."""
 
     text: str
     code: EventCode
@@ -140,7 +140,7 @@ class EventText(NamedTuple):
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Fields by which a message carries the code beside the text."""
+        """Fields in which a message carries the code and the parameters."""
         return {"event_code": self.code, "params": self.params}
 
 

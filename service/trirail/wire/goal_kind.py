@@ -1,4 +1,4 @@
-"""Base class of all goal kinds, and the fields that several kinds share."""
+"""Base class of all kinds of goals, and the fields that several kinds share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trirail.wire.sizes import MAX_NAME
 from trirail.wire.text import ID_RULE, is_id, quoted
 
 Identifier = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
-# The bounds are far beyond every robot's range, and far below magnitudes at which doubles lose precision.
+# These bounds exceed every robot's range, and are far below magnitudes at which doubles lose precision.
 Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
 """x, y or a slider's position [m], phi [rad], or their velocities."""
 Acceleration = Annotated[float, Meta(ge=-1e6, le=1e6)]
@@ -28,11 +28,11 @@ OwnTriple = tuple[OwnLimit, OwnLimit, OwnLimit]
 FrameName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 PoseName = Annotated[str, Meta(pattern=rf"^[A-Za-z0-9_-]{{1,{MAX_NAME}}}$")]
 Tool = tuple[Coordinate, Coordinate] | FrameName
-"""A point in the platform's frame, whose origin is its centre [m], or the name of a point in [frames.tool]."""
+"""Point in the platform's frame, relative to the platform's centre [m], or the name of a point in [frames.tool]."""
 
 
 def check_fields(message: Struct) -> None:
-    """Raise ValueError for an unprintable id or a number that is not finite, also if the message was never decoded."""
+    """Raise ValueError for an unprintable id or a number that is not finite, even if the message was never decoded."""
     for name in message.__struct_fields__:
         value = getattr(message, name)
         if name == "id" and isinstance(value, str) and not is_id(value):
@@ -43,7 +43,7 @@ def check_fields(message: Struct) -> None:
 
 
 class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
-    """A goal's own limits for x, y [m] and phi [rad], at or below those of the platform."""
+    """Limits of a single goal for x, y [m] and phi [rad]; they may not exceed the platform's limits."""
 
     velocity: OwnTriple | None = None
     """[m/s, m/s, rad/s]."""
@@ -56,8 +56,8 @@ class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
         check_fields(self)
 
 
-# Fields that several kinds share. Schemas, command line and the table of service/talking.md take the descriptions from
-# here.
+# Fields that several kinds share. The schemas, the command line and the table of service/talking.md use these
+# descriptions.
 OwnId = Annotated[
     Identifier | None,
     Meta(description="your name for the goal, used once; made by the service if absent"),
@@ -87,7 +87,7 @@ AxesFrame = Annotated[FrameName, Meta(description="axes of the move: base, platf
 
 
 def field_description(kind: type[Struct], name: str) -> str:
-    """Return the description of a field of a goal kind. Raises LookupError if its type has none."""
+    """Return the description of a goal kind's field. Raises LookupError if the type of the field has none."""
     for field in structs.fields(kind):
         for meta in getattr(field.type, "__metadata__", ()):
             if field.name == name and isinstance(meta, Meta) and meta.description is not None:
@@ -96,28 +96,28 @@ def field_description(kind: type[Struct], name: str) -> str:
 
 
 class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
-    """Properties of a goal of any kind, with defaults that a kind overrides by a field or a class constant."""
+    """Properties of any goal; a kind overrides their defaults with a field or a class constant."""
 
     follows: ClassVar[bool] = False
-    """Whether the goal waits for a preceding goal with a `blend`, instead of preempting it."""
+    """Whether the goal waits for a preceding goal that has a `blend`, instead of preempting it."""
     renewed: ClassVar[bool] = False
-    """Whether the goal lasts only while goals of its kind, id and user renew it, each within its `timeout`."""
+    """Whether the goal lasts only while goals with the same kind, id and user renew it, each within its `timeout`."""
     frequent: ClassVar[bool] = False
-    """Whether renewals are so frequent that the newest replaces a waiting one, and that a refused renewal ends nothing
-    and is reported only once."""
+    """Whether renewals are frequent. The newest renewal then replaces one that still waits, and a refused renewal does
+    not end the goal and is reported only once."""
     waits_at_end: ClassVar[bool] = False
     """Whether the goal stays active at the end of its path for as long as it is renewed."""
     timed: ClassVar[bool] = False
-    """Whether the goal refers to a `time`: wall-clock time when it arrives, loop time when it is planned [s]."""
+    """Whether the goal refers to a `time` [s]: wall-clock time when the goal arrives, loop time when it is planned."""
     greatest_rate: ClassVar[float] = math.inf
-    """Maximum rate of the motion at any override: 1 for goals with their own timing."""
+    """Maximum rate of the motion at any override; 1 for goals with their own timing."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
     @property
     def id(self) -> str | None:
-        """The client's id of the goal."""
+        """Id that the client gave to the goal."""
         return None
 
     @property
@@ -132,12 +132,12 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def marks(self) -> tuple[Mark, ...]:
-        """Places on its path at which outputs switch."""
+        """Places on the goal's path at which outputs switch."""
         return ()
 
     @property
     def stop_at(self) -> StopAt | None:
-        """Edge of an input at which it ends."""
+        """Edge of an input at which the goal ends."""
         return None
 
     @property
@@ -147,7 +147,7 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def lengthy(self) -> bool:
-        """Whether other users' goals are planned first, because planning this one takes long."""
+        """Whether planning the goal takes so long that other users' goals are planned first."""
         return False
 
     @property
@@ -157,20 +157,20 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def time(self) -> float | None:
-        """Time to which the goal refers [s]; None for its arrival."""
+        """Time to which the goal refers [s]; None for the time of its arrival."""
         return None
 
     @property
     def target(self) -> Triple | None:
-        """Pose of the moving target; None if the goal follows none."""
+        """Pose of the moving target; None if the goal does not follow a target."""
         return None
 
     def at(self, time: float) -> Self:
-        """Return a copy with another time [s], if the kind is timed."""
+        """Return a copy with another time [s]. Raises NotImplementedError if the kind is not timed."""
         raise NotImplementedError(f"{type(self).__name__} has no time to replace by {time} s")
 
     def check_beginning(self) -> None:
-        """Raise RefusedError for a message that can renew such a goal, but not start one."""
+        """Raise RefusedError if the message can renew a goal of this kind but not start one."""
 
 
 def import_all(package: ModuleType) -> None:

@@ -1,4 +1,4 @@
-"""Goals as clients send them, of every kind in trirail.wire.kinds. SI units and radians."""
+"""Goals as clients send them, of all kinds in trirail.wire.kinds, in SI units and radians."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ import_all(kinds)
 KINDS: tuple[type[GoalKind], ...] = tuple(
     sorted(set(GoalKind.__subclasses__()) - {PackedTrajectory}, key=lambda kind: kind.__module__)
 )
-"""All goal kinds: each has a file in trirail.wire.kinds."""
+"""All kinds of goals; each has its own module in trirail.wire.kinds."""
 
 if TYPE_CHECKING:
     Goal = GoalKind
@@ -48,8 +48,8 @@ else:
     Goal = Union[KINDS]  # noqa: UP007 - from a tuple of types
     PathGoal = Union[tuple(kind for kind in KINDS if not kind.renewed)]  # noqa: UP007 - as above
     LoopGoal = Union[(*KINDS, PackedTrajectory)]
-"""A goal of any kind, as clients send it; of a kind whose whole path is known when it arrives; and of any kind, as
-gateway, loop, planner and recordings represent it."""
+"""Unions of goals. `Goal` is any goal that a client can send. `PathGoal` is a goal whose whole path is known when it
+arrives. `LoopGoal` is any goal as the gateway, loop, planner and recordings represent it."""
 
 
 def kind_name(goal: GoalKind) -> str:

@@ -20,11 +20,11 @@ _DESCRIPTOR = array("i").itemsize
 
 
 class LinkClosed(Exception):
-    """The peer has closed the connection."""
+    """Raised when the peer has closed the connection."""
 
 
 class TooLarge(Exception):
-    """A packet exceeds MAX_SHARED."""
+    """Raised when a packet exceeds MAX_SHARED."""
 
 
 class PacketLink:
@@ -112,7 +112,7 @@ def _share(packet: bytes | bytearray | memoryview) -> int | None:
 
 
 def _read_shared(descriptor: bytes) -> bytes:
-    """Return the content of the file of a received descriptor, and close it."""
+    """Read the file whose descriptor was received, and close the file."""
     (file,) = array("i", descriptor)
     try:
         return os.pread(file, os.fstat(file).st_size, 0)  # its exact size: a larger buffer would be cleared first
@@ -140,7 +140,10 @@ def listen(path: Path) -> socket.socket:
 
 
 class Port:
-    """The loop's side: it keeps listening, so that a restarted peer can reconnect, and has at most one peer."""
+    """The loop's side of connections with one kind of peer. It has at most one peer at a time.
+
+    The port keeps listening, so that a restarted peer can reconnect.
+    """
 
     def __init__(self, listening: socket.socket) -> None:
         self._listening = listening
@@ -186,7 +189,7 @@ class Port:
         return self.accept()
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
-        """Send a packet if a peer is connected; one that it cannot take is dropped and counted."""
+        """Send a packet if a peer is connected; drop and count a packet that the peer cannot accept."""
         if self._link is None:
             return False
         try:

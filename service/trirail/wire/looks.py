@@ -32,9 +32,9 @@ LookEnd = Literal[
     "still",
     "moves",
 ]
-"""A trirail.alignment.procedure.AlignmentEnd, another end, or a trirail.errors.AlignmentFault."""
+"""Reason for the end: a trirail.alignment.procedure.AlignmentEnd, a trirail.errors.AlignmentFault, or another one."""
 SUCCESSFUL_ENDS = (None, "reached", "calibrated", "checked")
-"""Ends that are not a failure; None is a look that continues."""
+"""Ends that are not failures; None is the value of a look after which the alignment continues."""
 
 
 class SeenMark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -42,7 +42,7 @@ class SeenMark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tr
 
     name: Identifier
     pixel: tuple[Pixel, Pixel]
-    """u, v in its picture; the mean if several pictures were taken."""
+    """u, v in the mark's picture; the mean if several pictures were taken."""
     to_go: tuple[Coordinate, Coordinate] | None = None
     """Vector from the mark to its target, x, y in the base frame [m]; None in a calibration."""
 
@@ -56,7 +56,7 @@ class LookError(Struct, frozen=True, forbid_unknown_fields=True):
     """Deviation of a part, measured by one look."""
 
     worst: Coordinate
-    """Longest distance that a mark travels in the motion that aligns the part [m]."""
+    """Greatest distance that a mark travels in the motion that aligns the part [m]."""
     shift: tuple[Coordinate, Coordinate]
     """Remaining distance of the centre of the marks, x, y [m]."""
     turn: Coordinate
@@ -77,20 +77,20 @@ class AlignmentLook(Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     """Id of the alignment; the ids of its goals begin with it."""
     purpose: LookPurpose
     number: Count
-    """Number of the look, from 1; if the end came without a look, number of the last one."""
+    """Number of the look, from 1. If the alignment ended without another look, the number of the last look."""
     marks: Annotated[tuple[SeenMark, ...], Meta(max_length=MAX_MARKS)] = ()
     error: LookError | None = None
-    """None in a calibration."""
+    """Deviation of the part; None in a calibration."""
     pose: Coordinates | None = None
     """Measured pose of the platform at the look: x, y [m], phi [rad]."""
     correction: Coordinates | None = None
-    """Motion of the marks' centre that follows: x, y [m], phi [rad]."""
+    """Correction that follows the look, as a motion of the marks' centre: x, y [m], phi [rad]."""
     end: LookEnd | None = None
-    """Reason for which the alignment ends with this look."""
+    """Reason why the alignment ends with this look; None if it continues."""
     words: Annotated[str, Meta(max_length=MAX_TEXT)] = ""
-    """Message of the error, if it ends with one."""
+    """Message of the error, if the alignment ends with one."""
     noise: Pixel | None = None
-    """Standard deviation of a mark's u or v, from the residuals, if it ends as calibrated [pixel]."""
+    """Standard deviation of a mark's u or v, from the residuals, if a calibration ends successfully [pixel]."""
     seconds: Duration = 0.0
     """Time since the first look, on the client's clock [s]."""
 
@@ -99,7 +99,7 @@ class AlignmentLook(Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 def in_words(look: AlignmentLook) -> str:
-    """Return a line for people about a look."""
+    """Return a one-line summary of a look, for people."""
     line = f"{look.purpose} {look.id}, look {look.number}: {_marks(look)}"
     if look.correction is not None:
         x, y, phi = look.correction

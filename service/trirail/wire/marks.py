@@ -1,4 +1,4 @@
-"""Marks of a goal: where on its path an output switches, and the table of where it has switched. SI units, radians."""
+"""Marks of a goal: places on its path at which outputs switch, and the table of switches, in SI units and radians."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Length = Annotated[float, Meta(ge=0.0, le=1e3)]
 Duration = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 OutputName = Annotated[str, Meta(pattern=rf"^[A-Za-z][A-Za-z0-9_-]{{0,{MAX_NAME - 1}}}$")]
 PLACE_FIELDS = ("after_start", "after_start_s", "before_target", "before_target_s", "at_path_fraction", "at", "start")
-"""Fields that say where a mark is: a mark has exactly one of them."""
+"""Fields that give the place of a mark; a mark has exactly one of them."""
 
 
 class Crossing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -41,33 +41,33 @@ class Crossing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tr
 
 
 class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Place on a goal's path at which an output switches, or a stretch of the path on which it does so repeatedly.
+    """Place on a goal's path at which an output switches, or a section of the path on which it switches repeatedly.
 
-    Lengths are those of the path of the goal's tool; seconds are the path's own time, at full speed.
+    Lengths are along the path of the goal's tool. Times are along the path at full speed.
     """
 
     output: OutputName
     """Name of an output of the configuration."""
     value: bool = True
-    """Value to which it switches; of a repetition, the value of its pulses."""
+    """Value to which the output switches; for a repetition, the value during its pulses."""
     after_start: Length | None = None
-    """Length of the path from its start [m]."""
+    """Path length from the start of the path [m]."""
     after_start_s: Duration | None = None
     """Time along the path from its start [s]."""
     before_target: Length | None = None
-    """Length of the path that is left to its end [m]."""
+    """Path length that remains to the end of the path [m]."""
     before_target_s: Duration | None = None
-    """Time along the path that is left to its end [s]."""
+    """Time along the path that remains to its end [s]."""
     at_path_fraction: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
-    """Share of the path's length."""
+    """Fraction of the path's length, 0 to 1."""
     at: Crossing | None = None
-    """Value of one coordinate: the first crossing switches."""
+    """Value of one coordinate; the output switches when the path first crosses it."""
     start: Length | None = None
-    """Length of the path at which a repetition starts [m]."""
+    """Path length at which a repetition starts [m]."""
     end: Length | None = None
-    """Length at which it ends [m]; the end of the path if absent."""
+    """Path length at which a repetition ends [m]; the default is the end of the path."""
     increment: Annotated[float, Meta(ge=1e-7, le=1e3)] | None = None
-    """Length from pulse to pulse [m]; without it, the output keeps `value` from `start` to `end`."""
+    """Path length from pulse to pulse [m]; without it, the output keeps `value` from `start` to `end`."""
     pulse_width: Annotated[float, Meta(ge=1e-4, le=3600.0)] | None = None
     """Duration after which a pulse ends [s], rounded to whole cycles; without it, the value stays."""
 
@@ -91,7 +91,7 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
 
     @property
     def closes(self) -> bool:
-        """Whether the output returns by itself: a pulse, or the end of a stretch."""
+        """Whether the output returns to its previous value, at the end of a pulse or of a section."""
         return self.pulse_width is not None or self.start is not None
 
 
@@ -100,7 +100,7 @@ MarkLike = Mark | Mapping[str, Any]
 
 
 def marks_of(marks: Sequence[MarkLike]) -> tuple[Mark, ...]:
-    """Return marks that may be given by mappings. Raises ValueError for impossible ones."""
+    """Return marks that may be given as mappings. Raises ValueError for invalid ones."""
     return tuple(mark if isinstance(mark, Mark) else converted(dict(mark), Mark) for mark in marks)
 
 
@@ -111,7 +111,7 @@ Marks = Annotated[
 
 
 class StopAt(Struct, frozen=True, forbid_unknown_fields=True):
-    """Edge of an input at which a goal ends: a controlled stop, and the goal is done."""
+    """Edge of an input at which a goal ends: the robot makes a controlled stop, and the goal is done."""
 
     input: OutputName
     """Name of an input of the configuration."""
@@ -124,7 +124,7 @@ StopAtLike = StopAt | Mapping[str, Any]
 
 
 def stop_at_of(edge: StopAtLike | None) -> StopAt | None:
-    """Return an edge that may be given by a mapping. Raises ValueError for an impossible one."""
+    """Return an edge that may be given as a mapping. Raises ValueError for an invalid one."""
     return edge if edge is None or isinstance(edge, StopAt) else converted(dict(edge), StopAt)
 
 
@@ -145,9 +145,9 @@ class PlacedMark(Struct, frozen=True, omit_defaults=True):
     output: str
     value: bool
     pose: Triple
-    """Commanded pose of the platform there: x, y [m], phi [rad]."""
+    """Commanded pose of the platform at that place: x, y [m], phi [rad]."""
     path: float
-    """Length of the tool's path from its start [m]."""
+    """Path length of the tool from the start [m]."""
     time: float
     """Time along the path from its start, at full speed [s]."""
     number: int = 1
@@ -164,17 +164,17 @@ class Switch(Struct, frozen=True, omit_defaults=True):
     output: str
     value: bool
     cycle: int
-    """Cycle whose setpoints, and the switch, the drives take up at the next SYNC."""
+    """Cycle in which the switch is sent with the setpoints; the drives apply both at the next SYNC."""
     t: float
     """Nominal time since the start of the loop [s], as in records."""
     time: float
-    """Wall clock [s since 1970] when the cycle was due; drives switch a period later, at the next SYNC."""
+    """Wall-clock time when the cycle was due [s since 1970]; drives switch one period later, at the next SYNC."""
     commanded: Triple
     """Commanded pose in that cycle: x, y [m], phi [rad]."""
     measured: Triple
     """Pose measured in that cycle: x, y [m], phi [rad]."""
     closed: bool = False
-    """Whether it was switched back because its goal had ended or stopped, not by a mark."""
+    """Whether the output returned because its goal had ended or stopped, and not at a mark."""
 
 
 def switch_rows(switches: tuple[Switch, ...]) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """Requests of the loop to the planner and the planner's answers, which contain all inputs and results of a plan.
 
-Numbers of the motion are packed as they are in memory, so that a plan is the same to the last bit wherever it is
-computed, sent, or read from a recording.
+Numbers of the motion have the same bytes as in memory, so that a plan is bit-identical wherever it is computed, sent,
+or read from a recording.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class PackedRun(Struct, frozen=True, array_like=True):
 
 
 class PlanRequest(Struct, frozen=True):
-    """Loop to planner: a goal and the motion from which it starts."""
+    """Request from the loop to the planner: a goal and the motion from which it starts."""
 
     number: int
-    """Number by which the loop assigns the answer."""
+    """Number with which the loop matches the answer to the request."""
     version: int
     """Version of the present motion."""
     revision: int
-    """Revision of the robot's geometry and limits; a planner with another one must not answer."""
+    """Revision of the robot's geometry and limits; a planner with a different revision must not answer."""
     cycle: int
     """Present cycle of the schedule."""
     lead: int
@@ -63,25 +63,25 @@ class PlanRequest(Struct, frozen=True):
 
 
 class PreemptingMotion(Struct, frozen=True, tag="Planned"):  # as recordings have it
-    """Planner to loop: a motion that preempts the present one."""
+    """Answer from the planner to the loop: a motion that preempts the present one."""
 
     number: int
     version: int
     first: int | None
-    """Cycle in whose commanded state the motion starts; None at rest, when it may start at any time."""
+    """Cycle in whose commanded state the motion starts; None at rest, where the motion may start at any time."""
     run: PackedRun
     reply: GoalReply
-    """Reply to the goal's sender, to which the loop adds the goal's id; duration None at override zero."""
+    """Reply to the goal's sender, without the goal's id, which the loop adds; its duration is None at override zero."""
     stop: PackedPath | None = None
     """Time law of the preceding stop; None if the present motion keeps its law."""
     bound: str | None = None
-    """Limit before which a jog stops, or which a track's target exceeds."""
+    """Limit that stops a jog, or that the target of a track exceeds."""
     switches: bytes = b""
     """Planned switches of outputs, of trirail.motion.marks.SWITCH; their times count from the start of the path."""
 
 
 class PathExtension(Struct, frozen=True, tag="Extended"):  # as recordings have it
-    """Planner to loop: a path that follows the last queued one."""
+    """Answer from the planner to the loop: a path that follows the last queued one."""
 
     number: int
     version: int
@@ -95,7 +95,7 @@ class PathExtension(Struct, frozen=True, tag="Extended"):  # as recordings have 
 
 
 class NotPlanned(Struct, frozen=True, tag=True):
-    """Planner to loop: the refusal of a goal that has no motion."""
+    """Answer from the planner to the loop: the goal is refused because it has no valid motion."""
 
     number: int
     version: int
@@ -114,7 +114,7 @@ PlanAnswer = PreemptingMotion | PathExtension | NotPlanned
 
 
 class Overtaken(BaseException):
-    """Planning was cancelled by a newer request. Not an Exception, because those become answers."""
+    """Raised when a newer request cancels the planning. Not an Exception, because those become answers."""
 
 
 prepare(PlanRequest, PlanAnswer)

@@ -1,7 +1,7 @@
-"""Announcement of a service that is starting, visible to clients on its machine before it listens.
+"""Announcement of a starting service, which clients on its machine can see before it listens.
 
-It is an abstract AF_UNIX name (unix(7)), which is in no file system, is visible to every user, and ends with its
-process.
+The announcement is an abstract AF_UNIX name (unix(7)). Such a name is not in a file system, is visible to every user,
+and disappears with its process.
 """
 
 from __future__ import annotations

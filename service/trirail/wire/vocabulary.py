@@ -24,20 +24,20 @@ class Mode(StrEnum):
 
 
 MODES = tuple(Mode)
-"""Modes in the order in which records number them."""
+"""Modes in the order of their numbers in records."""
 
 
 class FaultCause(StrEnum):
-    """Cause of a fault that no drive reports; DriveFault has the causes of drives."""
+    """Cause of a fault that the service detects; DriveFault has the causes that drives report."""
 
     FOLLOWING_ERROR = "following_error"
     """The following error of a slider exceeds [limits.slider] following_error."""
     LIMIT = "limit"
-    """The last gate has refused a setpoint."""
+    """The last check before the drives refused a setpoint."""
     ENABLE = "enable"
     """The drives were not enabled in time."""
     PLACE = "place"
-    """The slider positions correspond to no pose, or to one that the robot may not hold."""
+    """The slider positions do not correspond to any pose, or correspond to one at which the robot may not be."""
     QUICK_STOP = "quick_stop"
     """A user sent quick_stop."""
     LOOP = "loop"
@@ -58,7 +58,7 @@ class Role(StrEnum):
     MAINTAINER = "maintainer"
 
     def includes(self, other: Role) -> bool:
-        """Whether it has all permissions of another role."""
+        """Return whether this role has all permissions of another role."""
         roles = tuple(Role)
         return roles.index(self) >= roles.index(other)
 
@@ -67,13 +67,13 @@ class CommandContent(Struct, frozen=True, forbid_unknown_fields=True):
     """Content of a command."""
 
     words: ClassVar[str] = "no content"
-    """Expected content, for people."""
+    """Description of the expected content, for people."""
     optional: ClassVar[bool] = True
-    """Whether the content may be absent; then all fields have their defaults."""
+    """Whether the content may be absent; all fields then have their default values."""
 
 
 LOWEST_OVERRIDE = 1.0
-"""Lowest override apart from 0, at which the robot stands [%]."""
+"""Lowest override other than 0 [%]; at 0 the robot does not move."""
 
 
 class Override(CommandContent, frozen=True):
@@ -83,7 +83,7 @@ class Override(CommandContent, frozen=True):
     optional = False
 
     percent: Annotated[float, Meta(ge=0.0, le=200.0)]
-    """Speed override, 0 or 1 to 200 % of full speed; the limits still apply, and at 0 the robot stands."""
+    """Speed override: 0, or 1 to 200 % of full speed. The limits still apply, and at 0 the robot does not move."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -94,12 +94,12 @@ class Override(CommandContent, frozen=True):
 
 
 class Stop(CommandContent, frozen=True):
-    """Optional content of the command stop: the only goal to stop, whether it runs or waits."""
+    """Optional content of the command stop; it restricts the command to one goal, running or queued."""
 
     words = 'nothing, or {"goal": id}'
 
     goal: Identifier | None = None
-    """Id of the goal; without it, the robot and all goals stop."""
+    """Id of the goal to stop; without it, the robot and all goals stop."""
 
 
 SHORTEST_LEASE, LONGEST_LEASE = 0.1, 10.0
@@ -113,12 +113,12 @@ class AcquireLease(CommandContent, frozen=True):
     words = 'nothing, or {"id": id, "timeout": seconds, "force": true}'
 
     id: Identifier | None = None
-    """Id of the lease: new for every lease and the same in its renewals, so that a late renewal cannot revive a lease
-    that has ended. Without it, each message is a new request."""
+    """Id of the lease. It must be new for every lease and the same in all renewals, so that a late renewal cannot
+    revive a lease that has ended. Without it, each message is a new request."""
     timeout: LeaseTimeout = 1.0
-    """Time without a renewal after which the lease ends, with a controlled stop [s]."""
+    """Time without a renewal after which the lease ends and the robot makes a controlled stop [s]."""
     force: bool = False
-    """Take the lease over from its holder; requires the role of [control] `takeover`."""
+    """Whether to take the lease over from its holder; this requires the role in [control] `takeover`."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -130,11 +130,11 @@ class ReleaseLease(CommandContent, frozen=True):
     words = 'nothing, or {"id": id}'
 
     id: Identifier | None = None
-    """Id of the lease, as in its acquire; without it, the user's present lease."""
+    """Id of the lease, as in its acquire; the default is the user's present lease."""
 
 
 class SetOutput(CommandContent, frozen=True):
-    """The content of the command set_output: an output, and its new value."""
+    """Content of the command set_output: an output and its new value."""
 
     words = '{"output": name, "value": true or false}'
     optional = False
@@ -149,7 +149,7 @@ class NoContent(CommandContent, frozen=True):
 
 
 class _CommandRow(NamedTuple):
-    """Row of the table of commands below."""
+    """Row in the table of commands below."""
 
     name: str
     help: str
@@ -160,22 +160,22 @@ class _CommandRow(NamedTuple):
 
 
 class Command(StrEnum):
-    """Commands: name on the wire, help, and properties.
+    """Commands with their names on the wire, help texts and properties.
 
-    The effects are in trirail.control.commands.EFFECTS. Gateway, access rules, schemas, clients and command line are
+    trirail.control.commands.EFFECTS contains the effects. Gateway, access rules, schemas, clients and command line are
     derived from this table.
     """
 
     help: str
-    """Effect, in one line for people."""
+    """Effect of the command in one line, for people."""
     role: Role
-    """Lowest role that may send it."""
+    """Lowest role that may send the command."""
     content: type[CommandContent]
-    """Type of its content."""
+    """Type of the command's content."""
     stops: bool
-    """Whether it stops the robot: it overtakes all waiting messages, and goals sent before it do not start."""
+    """Whether the command stops the robot: it overtakes all waiting messages, and goals sent before it do not start."""
     ignores_lease: bool
-    """Whether every user may send it while another user holds the lease."""
+    """Whether every user may send the command while another user holds the lease."""
 
     ENABLE = _CommandRow("enable", "Enable the drives and hold the position.", Role.OPERATOR)
     DISABLE = _CommandRow("disable", "Stop, then disable the drives.", Role.OPERATOR, stops=True, ignores_lease=True)
@@ -226,7 +226,7 @@ class Command(StrEnum):
         stops: bool = False,
         ignores_lease: bool = False,
     ) -> Self:
-        """Create a member from its row; with a name alone, such as Command("stop"), the enumeration looks it up."""
+        """Create a member from its row; a call with a name alone, such as Command("stop"), looks the member up."""
         member = str.__new__(cls, name)
         member._value_ = name
         member.help, member.role, member.content = help, role, content
@@ -235,5 +235,5 @@ class Command(StrEnum):
 
     @property
     def accepts(self) -> Any:
-        """Type as which its content is decoded."""
+        """Type as which the command's content is decoded."""
         return self.content | None if self.content.optional else self.content

@@ -22,8 +22,8 @@ SEND_TIMEOUT_S = 2.0
 """Time after which a client is disconnected if it does not accept a message that must not be dropped, such as a reply
 or a past event [s]."""
 BATCH_SIZE = 8192
-"""Size of a service's send and receive buffers; a larger message is sent in fragments [bytes]. Zenoh negotiates the
-smaller size of both sides."""
+"""Size of a service's send and receive buffers [bytes]; a larger message is sent in fragments. Zenoh uses the smaller
+size of the two sides."""
 
 _COMMON_SETTINGS = {
     "scouting/multicast/enabled": False,
@@ -144,7 +144,7 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
 
 
 def _connection_advice(locator: str, credentials: Credentials | None) -> str:
-    """Return why no session opens at a locator, and the next step; diagnosed here, because Zenoh does not report it."""
+    """Return why no session opens at a locator, and the next step, because Zenoh does not report the reason."""
     if is_starting(locator):
         return " yet: the service is starting; try again when it reports that it is up"
     refused = "" if credentials is None else ", or rejects these certificates"
@@ -165,7 +165,7 @@ def linked(opened: zenoh.Session, endpoints: Sequence[str], router: str | None) 
 
 
 def close(opened: zenoh.Session) -> None:
-    """Close a session; one that hangs is left open until the process ends."""
+    """Close a session; a session that hangs stays open until the process ends."""
     with contextlib.suppress(zenoh.ZError):
         opened.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 

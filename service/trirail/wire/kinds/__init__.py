@@ -1,1 +1,1 @@
-"""The kinds of goals, a file for each, with its fields, checks and properties. All are read in."""
+"""Kinds of goals; each has a module with its fields, checks and properties, and all modules are imported."""

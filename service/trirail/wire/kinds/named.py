@@ -7,7 +7,7 @@ from trirail.wire.marks import Marks, StopAtEdge
 
 
 class NamedGoal(GoalKind, frozen=True, tag="named"):
-    """Move the platform to a named pose: a pose goal with the pose that has this name when the message arrives."""
+    """Move the platform to the pose that has this name when the message arrives; otherwise like a pose goal."""
 
     name: PoseName
     """Name of a pose in the reply on …/poses."""

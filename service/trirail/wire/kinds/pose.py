@@ -18,7 +18,7 @@ from trirail.wire.marks import Marks, StopAtEdge
 
 
 class PoseGoal(GoalKind, frozen=True, tag="pose"):
-    """Move the platform to a pose, straight in pose space where the start allows."""
+    """Move the platform to a pose, on a straight line in pose space if the start allows this."""
 
     follows = True
 
@@ -40,6 +40,6 @@ class PoseGoal(GoalKind, frozen=True, tag="pose"):
 
 
 def pose_in_place_of(goal: GoalKind, x: float, y: float, phi: float, tool: Tool | None = None) -> PoseGoal:
-    """Return the pose goal that is equivalent to a goal in other terms, with the fields that both have."""
+    """Return the pose goal that is equivalent to a goal of another kind, with the fields that both kinds have."""
     same = {name: getattr(goal, name) for name in ("id", "speed", "valid_for", "limits", "blend", "marks", "stop_at")}
     return PoseGoal(x, y, phi, tool=tool, **same)

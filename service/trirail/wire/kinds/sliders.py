@@ -7,7 +7,7 @@ from trirail.wire.marks import Marks, StopAtEdge
 
 
 class SlidersGoal(GoalKind, frozen=True, tag="sliders"):
-    """Move the sliders to positions, straight in slider space where the start allows."""
+    """Move the sliders to positions, on a straight line in slider space if the start allows this."""
 
     position: Coordinates
     """lambda_10 of the sliders A, B, C [m]."""

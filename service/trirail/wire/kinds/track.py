@@ -11,11 +11,11 @@ from trirail.wire.goal_kind import Clock, Coordinate, Coordinates, GoalKind, Own
 
 
 class TrackGoal(GoalKind, frozen=True, tag="track"):
-    """Follow a moving target, renewed 10 to 200 times a second, until `timeout` passes without a renewal of its id.
+    """Follow a moving target that the client renews 10 to 200 times a second.
 
-    Between two messages the target is extrapolated with its velocity. The platform follows a target that is too fast at
-    its limits, and waits at the border of the workspace for one that is out of reach. Without a renewal in time, the
-    robot brakes on its path.
+    The goal ends when `timeout` passes without a renewal of its id; the robot then brakes on its path. Between two
+    messages the service extrapolates the target with its velocity. The platform follows a target that is too fast at
+    its own limits, and waits at the border of the workspace for a target that is out of reach.
     """
 
     renewed = frequent = waits_at_end = timed = True
@@ -30,11 +30,12 @@ class TrackGoal(GoalKind, frozen=True, tag="track"):
     velocity: Coordinates = (0.0, 0.0, 0.0)
     """Velocity of x, y and phi at `time` [m/s, m/s, rad/s]."""
     time: Clock | None = None
-    """Time of the target's pose, by the wall clock of the service's machine [s since 1970]; at most half a second in
-    the past or future; the time of arrival if absent. The clocks of two machines must agree to about a millisecond."""
+    """Time to which the target's pose applies, on the wall clock of the service's machine [s since 1970]. It may be at
+    most half a second in the past or future, and defaults to the time of arrival. The clocks of two machines must agree
+    to about a millisecond."""
     id: OwnId = None
     timeout: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.25
-    """Real time, at every override, after which a track that is not renewed brakes [s]."""
+    """Real time without a renewal after which the track brakes, at every override [s]."""
     valid_for: ValidFor = None
 
     @property

@@ -37,7 +37,7 @@ class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     """Pose of the platform at a time, with optional velocity and acceleration."""
 
     t: Time
-    """Time relative to that of the first point, which is arbitrary, such as zero or seconds since 1970 [s]."""
+    """Time relative to the first point's `t`, which is arbitrary, such as zero or seconds since 1970 [s]."""
     x: Coordinate
     """x of the platform's centre in the base frame [m]."""
     y: Coordinate
@@ -45,21 +45,22 @@ class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     phi: Coordinate
     """Angle of the platform in the base frame, counterclockwise [rad]."""
     velocity: Coordinates | None = None
-    """Velocity of x, y and phi [m/s, m/s, rad/s]; by default the mean between the neighbours, and zero at both ends."""
+    """Velocity of x, y and phi [m/s, m/s, rad/s]. The default is the mean velocity between the neighbouring points, and
+    zero at both ends."""
     acceleration: tuple[Acceleration, Acceleration, Acceleration] | None = None
-    """Acceleration of x, y and phi [m/s², m/s², rad/s²]; the default is derived as for the velocity."""
+    """Acceleration of x, y and phi [m/s², m/s², rad/s²]; its default is computed like that of the velocity."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
 class TrajectoryPart(Struct, frozen=True, forbid_unknown_fields=True):
-    """Number of one message of a trajectory that is sent in parts."""
+    """Number of a message in a trajectory that is sent in parts."""
 
     number: Annotated[int, Meta(ge=1, le=MAX_POINTS // 2)]
-    """Counted from 1."""
+    """Number of this part, from 1."""
     of: Annotated[int, Meta(ge=1, le=MAX_POINTS // 2)]
-    """Number of parts."""
+    """Total number of parts."""
 
     def __post_init__(self) -> None:
         if self.number > self.of:
@@ -67,19 +68,19 @@ class TrajectoryPart(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TrajectoryGoal(GoalKind, frozen=True, tag="trajectory"):
-    """Follow timed points, joined by quintic polynomials, from the robot's pose."""
+    """Follow timed points from the robot's pose; quintic polynomials join the points."""
 
     points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=MAX_PART)]
-    """Points in order of time; the first is the robot's pose, the last is at rest."""
+    """Points in order of time; the first is the robot's pose, and the robot is at rest at the last."""
     id: OwnId = None
     stretch: Stretch = False
     settle: bool = True
-    """Whether the goal is done when the robot is measured to be in position, as for other goals; otherwise at the end
-    of its path."""
+    """Whether the goal is done only when the robot is measured to be in position, as other goals are. Otherwise it is
+    done at the end of its path."""
     valid_for: ValidFor = None
     part: TrajectoryPart | None = None
-    """Number of this message if the points are sent in parts, each with the same `id` and options. Each part receives
-    the reply to the whole goal."""
+    """Number of this message if the points are sent in parts, each with the same `id` and options. The reply to each
+    part is the reply to the whole goal."""
     marks: Marks = ()
     stop_at: StopAtEdge = None
 
@@ -91,26 +92,26 @@ class TrajectoryGoal(GoalKind, frozen=True, tag="trajectory"):
 
     @property
     def lengthy(self) -> bool:
-        """Whether it has more points than fit into one message."""
+        """Whether the goal has more points than fit into one message."""
         return len(self.points) > MAX_PART
 
 
 def check_times(times: Sequence[float]) -> None:
-    """Raise ValueError if the times of points [s] do not increase, or if the duration is too long."""
+    """Raise ValueError if the times of the points [s] do not increase, or if the trajectory is too long."""
     duration = times[-1] - times[0] if times else 0.0
     if duration > MAX_DURATION_S:
         raise ValueError(
             f"points: they last {duration:g} s, a trajectory {MAX_DURATION_S:g} s at most; are times in seconds?"
         )
     for before, after in itertools.pairwise(times):
-        if not after - before > 0.999 * SHORTEST_PIECE:  # not a matter of the last digit
+        if not after - before > 0.999 * SHORTEST_PIECE:  # tolerate rounding of the last digit
             raise ValueError(
                 f"points: t = {after} follows t = {before}: times must rise, by {SHORTEST_PIECE:g} s at least"
             )
 
 
 def parts(goal: TrajectoryGoal) -> list[TrajectoryGoal]:
-    """Return a trajectory as a list of messages: itself if it fits into one, otherwise parts of about equal size."""
+    """Split a trajectory into messages of similar size; return the goal alone if it fits into one message."""
     points = goal.points
     number = -(-len(points) // MAX_PART)
     if number < 2:

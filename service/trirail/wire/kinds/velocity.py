@@ -1,4 +1,4 @@
-"""Jogs: motion at a velocity for as long as it is renewed."""
+"""Jogs: motion at a velocity for as long as the client renews it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trirail.wire.goal_kind import Coordinate, GoalKind, OwnId, ToolPoint, Valid
 
 
 class VelocityGoal(GoalKind, frozen=True, tag="velocity"):
-    """Jog: move at a velocity [m/s, rad/s] until `timeout` passes without a renewal of the same id."""
+    """Jog at a velocity [m/s, rad/s] until `timeout` passes without a renewal with the same id."""
 
     renewed = True
 
@@ -23,7 +23,7 @@ class VelocityGoal(GoalKind, frozen=True, tag="velocity"):
     """Angular velocity of the platform about that point, counterclockwise [rad/s]."""
     id: OwnId = None
     timeout: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.1
-    """Time after which the robot brakes unless the jog is renewed; independent of the override [s]."""
+    """Time without a renewal after which the robot brakes, at every override [s]."""
     valid_for: ValidFor = None
     tool: ToolPoint = None
 
