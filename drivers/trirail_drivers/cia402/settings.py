@@ -148,4 +148,4 @@ async def configure_homing(drive: Differences, homing: Homing, units: Units) -> 
         await drive.ensure(0x609A, 0, units.acceleration(name, "homing.acceleration", homing.acceleration))
     else:
         drive.lack((0x609A, 0), "it has no such object")
-    await drive.ensure(0x607C, 0, 0)  # makers differ in its sign; the drive's `offset` in [drives] is used instead
+    await drive.ensure(0x607C, 0, 0)  # makers use different signs; the drive's `offset` in [drives] is used instead

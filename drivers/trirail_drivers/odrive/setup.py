@@ -104,7 +104,8 @@ def configure(
 ) -> tuple[tuple[OdriveSetup, OdriveStart] | None, ...]:
     """Set up three drives concurrently. With `awaits`, the result of a drive that does not answer is None.
 
-    Raises one DriveError for all drives, or DriveTimeout if one of the causes is a drive that does not answer.
+    Raises DriveError with the errors of all drives. A single error is raised as it is, such as DriveTimeout for a
+    drive that does not answer.
     """
 
     def progress() -> str:

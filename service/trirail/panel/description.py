@@ -18,7 +18,7 @@ from trirail.wire.vocabulary import Command, Role
 from trirail.workspace.part_positions import RobotParts
 
 STAGE = 0.05
-"""Maximum travel along x for which lengths are shown in micrometres, as for a stage [m]."""
+"""Maximum travel of the platform along x for which lengths are shown in micrometres, as for a stage [m]."""
 MICROMETRES: dict[str, Any] = {
     "unit": "µm",
     "scale": 1e6,

@@ -32,7 +32,7 @@ Commands that stop the robot have a separate limit of the same size.
 class MessageSender(Protocol):
     """Function that sends messages to the page.
 
-    `to` is a word that the page translates, `name` the name of its object.
+    `to` is a word that the page translates, `name` the name of its object, if any.
     """
 
     def __call__(self, tell: str, /, **content: Any) -> None:
