@@ -1,14 +1,14 @@
-"""Root of all trirail errors, and the errors of drives."""
+"""Root of all trirail errors, and the errors of the drives."""
 
 from __future__ import annotations
 
 MAX_MESSAGE_LENGTH = 500
-"""Largest length of a message [characters]."""
+"""Maximum length of a message [characters]."""
 _ELLIPSIS = " … "
 
 
 def shortened(text: str, longest: int = MAX_MESSAGE_LENGTH) -> str:
-    """Shorten a long text in the middle: its beginning names the problem, its end the remedy."""
+    """Shorten a long text in the middle, since its beginning names the problem and its end the remedy."""
     if len(text) <= longest:
         return text
     end = longest // 3
@@ -16,9 +16,9 @@ def shortened(text: str, longest: int = MAX_MESSAGE_LENGTH) -> str:
 
 
 class TrirailError(Exception):
-    """Refusal or failure of trirail; the message is one line with object, problem and remedy.
+    """Refusal or failure in trirail. The message is one line that names the object, the problem and the remedy.
 
-    Its length is bounded, since it may repeat the content of a file or a message.
+    The length of the message is bounded, since it may repeat the content of a file or of another message.
     """
 
     def __init__(self, message: str) -> None:
@@ -50,11 +50,11 @@ class DriveTimeout(DriveError):
 
 
 class DriveAbsentError(DriveTimeout):
-    """A drive has answered nothing at all."""
+    """A drive has not answered any request."""
 
 
 class ConfigurationRefused(DriveError):
-    """A drive did not keep a written value: another one was read back."""
+    """A drive did not keep a written value: a different value was read back."""
 
     def __init__(
         self, drive: str, name: str, index: int, subindex: int, wanted: object, read_back: object, seconds: float

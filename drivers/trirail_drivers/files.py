@@ -1,4 +1,4 @@
-"""Reading of regular files without blocking, and writing of files that survive a crash whole."""
+"""Reading of regular files without blocking, and writing of files so that a crash leaves them complete."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import BinaryIO
 from trirail_drivers.errors import FileError
 
 LARGEST_TEXT = 16_000_000
-"""Largest text file that is read [bytes]: some hundred thousand points of a trajectory."""
+"""Maximum size of a text file that is read [bytes]; it holds some hundred thousand points of a trajectory."""
 
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
@@ -27,9 +27,12 @@ _KINDS = {
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading. Raises FileError if it is missing, or not regular and might never end."""
+    """Open a regular file for reading.
+
+    Raises FileError if the file is missing, or is not regular and might never end.
+    """
     try:
-        # Checked before: opening a device may have effects, and opening a FIFO without O_NONBLOCK waits for a writer.
+        # Checked first: opening a device may have effects, and opening a FIFO without O_NONBLOCK waits for a writer.
         check(path)
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     except OSError as error:
@@ -45,7 +48,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def text(path: Path) -> str:
-    """Return the content of a text file in UTF-8. Raises FileError."""
+    """Return the content of a UTF-8 text file. Raises FileError."""
     with open_regular(path) as file:
         try:
             content = file.read(LARGEST_TEXT + 1)
@@ -60,10 +63,10 @@ def text(path: Path) -> str:
 
 
 def replace(path: Path, content: bytes, mode: int = 0o644) -> None:
-    """Replace a file such that a crash or a power cut leaves either the old or the new one, whole.
+    """Replace a file so that a crash or a power cut leaves either the old or the new file, complete.
 
-    The content is written to a temporary file beside it, which only its owner can read, and synced before the rename;
-    the rename is synced before this returns. Raises OSError.
+    The content is written to a temporary file in the same folder, which only its owner can read, and is synced to the
+    disk before the rename; the rename is synced before this function returns. Raises OSError.
     """
     descriptor, beside = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)  # 0600
     try:
@@ -88,14 +91,15 @@ def make_folder(folder: Path) -> None:
 
 
 PREFIX = "trirail-run-"
-"""Prefix of a temporary folder's name; folders with other names are never removed."""
+"""Prefix of the names of temporary folders; folders with other names are never removed."""
 
 
 @contextmanager
 def temporary_folder(parent: str | None = None) -> Iterator[Path]:
-    """Create a folder and remove it afterwards; remove those that killed processes of this user have left.
+    """Create a folder and remove it afterwards; also remove folders that killed processes of this user have left
+    behind.
 
-    A folder is in use while a process holds its lock, which ends with the process. Raises OSError.
+    A folder is in use while a process holds its lock; the lock ends with the process. Raises OSError.
     """
     base = Path(parent or tempfile.gettempdir())
     for left in base.glob(f"{PREFIX}*"):
@@ -109,7 +113,9 @@ def temporary_folder(parent: str | None = None) -> Iterator[Path]:
 
 
 def _locked_folder(base: Path) -> tuple[Path, int]:
-    """Return a new folder and the descriptor of its lock; try again if another process removes it before the lock."""
+    """Return a new folder and the descriptor of its lock; retry if another process removes the folder before it is
+    locked.
+    """
     while True:
         folder = tempfile.mkdtemp(prefix=PREFIX, dir=base)
         with suppress(FileNotFoundError, BlockingIOError):
@@ -120,7 +126,7 @@ def _locked_folder(base: Path) -> tuple[Path, int]:
 
 
 def _remove_unused(folder: Path) -> None:
-    """Remove a folder of this user that is not locked."""
+    """Remove a folder of this user unless it is locked."""
     with suppress(OSError):
         if folder.lstat().st_uid != os.getuid():
             return
@@ -140,12 +146,12 @@ def _lock(folder: Path | str) -> int:
 
 
 def check(path: Path) -> None:
-    """Raise FileError for a path that is no regular file, OSError if it does not exist."""
+    """Raise FileError if a path is not a regular file, and OSError if it does not exist."""
     _check(path, os.stat(path))
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync the names in a folder to the disk: fsync of a file covers its content, not its name."""
+    """Sync the file names in a folder to the disk, since fsync of a file covers its content but not its name."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

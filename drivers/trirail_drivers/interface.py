@@ -9,16 +9,18 @@ from typing import NamedTuple, Protocol
 from msgspec import Struct
 
 NAMES = ("A", "B", "C")
-"""Names of the drives, which are those of their sliders."""
+"""Names of the drives, which are also the names of their sliders."""
 
 Triple = tuple[float, float, float]
 
 Clock = Callable[[], float]
-"""Function that returns the time [s]: monotonic, or simulated."""
+"""Function that returns the monotonic or simulated time [s]."""
 
 
 class PowerState(IntEnum):
-    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton), used for every protocol."""
+    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton); the drivers of all protocols use
+    them.
+    """
 
     NOT_READY_TO_SWITCH_ON = 0
     SWITCH_ON_DISABLED = 1
@@ -47,40 +49,40 @@ class DriveFault(NamedTuple):
 
 
 class MissingProtection(Struct, frozen=True):
-    """A protection that a drive lacks, as its configuration accepts."""
+    """Protection that a drive lacks and that its configuration allows it to lack."""
 
     drive: str
     """Name of the drive."""
     object: str
-    """Name in `accept_without`: the object's index, as 1006, or an ODrive's setting."""
+    """Name in `accept_without`: the index of the object, such as 1006, or the name of an ODrive setting."""
     means: str
-    """One line for people: its purpose, and the consequence of lacking it."""
+    """One line for people: the purpose of the protection, and the consequence of lacking it."""
 
 
 class Counts(NamedTuple):
     """Numbers of late and lost positions and setpoints of one drive since the start; none is a fault by itself."""
 
     feedback_late: int = 0
-    """Positions that came a cycle later than the previous one did."""
+    """Number of positions that arrived one cycle later than the position before."""
     feedback_lost: int = 0
-    """SYNCs that were never answered, as far as later answers show."""
+    """Number of SYNCs that the drive never answered, as far as later answers show."""
     setpoints_late: int = 0
-    """Setpoints written after the next SYNC was due."""
+    """Number of setpoints written after the next SYNC was due."""
     setpoints_lost: int = 0
-    """Setpoints that the bus refused."""
+    """Number of setpoints that the bus refused."""
 
 
 class Unready(NamedTuple):
-    """Reason for which a drive cannot be reset yet, and the progress of its set-up."""
+    """Reason why a drive cannot be reset yet, and the progress of its set-up."""
 
     reason: str
-    """One line for people: it does not answer, restarted, or is refused."""
+    """One line for people: the drive does not answer, has restarted, or is refused."""
     objects: int = 0
-    """Number of its objects read or written until now; 0 outside a set-up."""
+    """Number of objects of the drive read or written so far; 0 outside a set-up."""
     expected: int = 0
-    """Number of them in its last set-up; 0 if it had none."""
+    """Number of objects read or written in the drive's last set-up; 0 if there was none."""
     counted: str = "objects"
-    """Name of the things counted, for people."""
+    """Name of the counted items, for people."""
 
     def __str__(self) -> str:
         of = f" of {self.expected}" if self.expected >= self.objects else ""
@@ -88,7 +90,7 @@ class Unready(NamedTuple):
 
 
 UnreadyDrives = tuple[Unready | None, Unready | None, Unready | None]
-"""Reason for which each drive cannot be reset yet; None if it is configured."""
+"""For each drive, the reason why it cannot be reset yet; None if it is configured."""
 
 
 class Feedback(NamedTuple):
@@ -98,35 +100,40 @@ class Feedback(NamedTuple):
     """Measured slider positions [m]."""
     state: tuple[PowerState, PowerState, PowerState]
     fault: DriveFault | None
-    """First fault since the last reset, or the fault of a drive that did not stop after it; else None."""
+    """First fault since the last reset, or the fault of a drive that did not stop after it; None if there is no fault.
+    """
     counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
     warnings: tuple[str, ...] = ()
-    """New warnings for people, a line each; each appears in one feedback only."""
+    """New warnings for people, one line each; each warning appears in one feedback only."""
     age: tuple[int, int, int] = (0, 0, 0)
-    """Number of SYNCs between the one at which each position was sampled and the newest: 0 if the drive has answered
-    it already, 1 if its answer is still on its way, more if answers were lost."""
+    """For each position, the number of SYNCs since the SYNC at which it was sampled.
+
+    0 if the drive has already answered the newest SYNC, 1 if that answer is still on its way, more if answers were
+    lost.
+    """
     homing: bool = False
     """Whether a drive is being homed."""
     follows: tuple[bool, bool, bool] = (True, True, True)
-    """Whether each drive follows setpoints; a drive that is being homed moves by itself."""
+    """Whether each drive follows setpoints. A drive that is being homed moves by itself and does not."""
     homed: tuple[bool, bool, bool] = (True, True, True)
-    """Whether each position is counted from a known place: always with absolute encoders, otherwise after homing."""
+    """Whether each position is relative to a known place: always with absolute encoders, otherwise after homing."""
     unready: UnreadyDrives = (None, None, None)
-    """Reason for which each drive cannot be reset yet; None if it is configured. A drive without a position since the
-    start is reported at its zero, and as not homed."""
+    """For each drive, the reason why it cannot be reset yet; None if it is configured. A drive that has sent no
+    position since the start is reported at its zero, and as not homed.
+    """
     inputs: tuple[int, int, int] = (0, 0, 0)
-    """Newest digital inputs of each drive, within its mask (trirail_drivers.config.DigitalIo)."""
+    """Newest digital inputs of each drive, limited to its mask (trirail_drivers.config.DigitalIo)."""
 
 
 class DriveGroup(Protocol):
     """Three drives that follow a position setpoint every cycle.
 
-    `configure` and `close` may block and raise DriveError. All other methods are for the cycle and never block or
+    `configure` and `close` may block and raise DriveError. All other methods are called in the cycle and never block or
     raise; an error becomes a fault in the next feedback.
     """
 
     bus_load: float
-    """Worst-case share of the bus that the cyclic traffic takes, with bit stuffing; 1.0 is full."""
+    """Worst-case fraction of the bus capacity that the cyclic traffic uses, with bit stuffing; 1.0 is a full bus."""
 
     @property
     def missing_protections(self) -> tuple[MissingProtection, ...]:
@@ -134,75 +141,84 @@ class DriveGroup(Protocol):
 
     @property
     def path_outputs(self) -> tuple[bool, bool, bool]:
-        """Whether each drive adopts its outputs with a setpoint; otherwise they may not switch on a path."""
+        """Whether each drive applies its outputs together with a setpoint; otherwise its outputs cannot be switched on
+        a path.
+        """
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames sent and received since the start, each with worst-case stuffing, without those that the
-        kernel filters out."""
+        """Number of bits of all frames sent and received since the start, each with worst-case stuffing.
+
+        Frames that the kernel filters out are not counted.
+        """
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
-        """First fault that each drive itself has reported since the last reset, or None."""
+        """For each drive, the first fault that it has reported itself since the last reset, or None."""
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
-        """Set the drives up for a cycle of `period` seconds, read back what can be read, start them without power.
+        """Set up the drives for a cycle of `period` seconds, verify the settings, and start the drives without power.
+
+        Settings that a drive can report are read back.
 
         Parameters
         ----------
         period
             Cycle period [s].
         fastest
-            Velocity limit of the sliders [m/s]; if given, drives that cannot take it are refused.
+            Velocity limit of the sliders [m/s]. If it is given, drives that cannot handle it are refused.
         awaits
-            Whether a drive that does not answer is a fault instead of an error: the following cycles configure it
+            If True, a drive that does not answer is a fault instead of an error. The following cycles configure it
             when it appears, like a drive that restarts.
         """
 
     def sync(self) -> None:
-        """Begin a cycle: the drives adopt the setpoints written in the last one and sample their positions."""
+        """Begin a cycle: the drives apply the setpoints of the previous cycle and sample their positions."""
 
     def read(self) -> Feedback:
-        """Handle every frame that has arrived; return the feedback."""
+        """Handle every frame that has arrived, and return the feedback."""
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC.
+        """Send setpoints [m] and velocity feed-forward [m/s], which the drives apply at the next SYNC.
 
-        Changed outputs are sent behind them, also if the setpoints are not, and adopted at the same SYNC.
+        Changed outputs are sent after the setpoints, even if no setpoint is sent, and are applied at the same SYNC.
         """
 
     def set_outputs(self, words: Sequence[int]) -> None:
-        """Set the wanted outputs of the drives A, B, C, as bits of 60FEh: the next `write` sends those that differ.
+        """Set the wanted outputs of the drives A, B, C as bits of 60FEh; the next `write` sends those that changed.
 
-        Bits that are not in a drive's mask (trirail_drivers.config.DigitalIo) are ignored.
+        Bits outside a drive's mask (trirail_drivers.config.DigitalIo) are ignored.
         """
 
     def enable(self, alone: str | None = None) -> None:
-        """Begin to power up all drives, or only the drive `alone`, the others staying without power.
+        """Begin to power up all drives, or only the drive `alone` while the others stay without power.
 
-        The following cycles carry it out, as the states in the feedback show. Drives with power, or getting it, must
-        be disabled first.
+        The following cycles complete the power-up, and the states in the feedback show its progress. Drives that have
+        power, or are being powered up, must be disabled first.
         """
 
     def home(self) -> None:
-        """Begin to home the drives whose positions are not absolute; the following cycles carry it out.
+        """Begin to home the drives whose positions are not absolute; the following cycles complete the homing.
 
-        Only for powered drives at standstill; a drive that was enabled alone is homed alone. While a drive does not
-        follow, its setpoints are ignored; in the cycle in which it follows again, its setpoint must be the position
-        of the previous cycle's feedback.
+        All drives to be homed must have power and be at standstill. A drive that was enabled alone is homed alone.
+        While a drive does not follow setpoints, its setpoints are ignored. In the cycle in which it follows again, its
+        setpoint must be the position in the previous cycle's feedback.
         """
 
     def stop_homing(self) -> None:
-        """Halt the drive that is being homed; then every drive follows setpoints again, at its present position."""
+        """Halt the drive that is being homed.
+
+        Every drive then follows setpoints again, starting at its present position.
+        """
 
     def disable(self) -> None:
-        """Take the power off, at standstill."""
+        """Remove power from the drives, which must be at standstill."""
 
     def quick_stop(self) -> None:
         """Begin the quick-stop ramp of every drive in this cycle."""
 
     def reset(self) -> None:
-        """Clear the latched fault and the drives' own faults, without powering up."""
+        """Clear the latched fault and the faults of the drives, without powering up."""
 
     def close(self) -> None:
         """Leave the drives without power and not operational, and close the bus."""

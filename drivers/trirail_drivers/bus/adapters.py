@@ -1,4 +1,4 @@
-"""Requirements of python-can's interfaces: further packages, or the library of the adapter's maker."""
+"""Additional requirements of python-can's interfaces: Python packages, or the adapter manufacturer's library."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _PACKAGES: Final = {
     "slcan": (("serial",), "serial"),
     "udp_multicast": (("msgpack",), "multicast"),
 }
-"""Modules that an interface imports, and python-can's extra that installs them."""
+"""Modules that an interface imports, and the python-can extra that installs them."""
 _LIBRARIES: Final = {
     "kvaser": ("canlib", "Kvaser's CANlib"),
     "pcan": ("pcanbasic", "PEAK's PCAN-Basic"),
 }
-"""Library of the adapter's maker. Linux has its own drivers for the adapters of both makers."""
+"""Library of the adapter's manufacturer. Linux has its own drivers for the adapters of both manufacturers."""
 
 
 def missing_support(interface: str) -> str:

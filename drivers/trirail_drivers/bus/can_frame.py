@@ -8,7 +8,7 @@ from typing import Final
 CAN_FRAME: Final = Struct("=IB3x8s")
 """`struct can_frame`: identifier with flags, length, data."""
 CAPTURED: Final = Struct(f"<d{CAN_FRAME.size}s")
-"""A captured frame: seconds since 1970, `struct can_frame`."""
+"""Captured frame: seconds since 1970, and `struct can_frame`."""
 HEADER: Final = Struct("=IB")
 """Beginning of `struct can_frame`: identifier with flags, length."""
 DATA_AT: Final = 8
@@ -16,6 +16,6 @@ DATA_AT: Final = 8
 EXTENDED: Final = 1 << 31
 REMOTE: Final = 1 << 30
 ERROR: Final = 1 << 29
-"""Flags beside the identifier: 29-bit identifier, remote frame, error frame of the controller."""
+"""Flags next to the identifier: 29-bit identifier, remote frame, error frame of the controller."""
 STANDARD_BITS: Final = 0x7FF
 EXTENDED_BITS: Final = 0x1FFF_FFFF

@@ -1,7 +1,7 @@
-"""Errors of a CAN bus in words: error frames, and frames that cannot be sent.
+"""Descriptions of CAN bus errors: error frames, and frames that cannot be sent.
 
-Error frames are those of SocketCAN (linux/can/error.h): the identifier holds their classes, eight bytes of data the
-details. Other interfaces have their own codings.
+Error frames are decoded as in SocketCAN (linux/can/error.h): the identifier contains the error classes, and the eight
+data bytes contain the details. Other interfaces use their own codings.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ CONTROLLER: Final = 0x004
 BUS_OFF: Final = 0x040
 RESTARTED: Final = 0x100
 PASSIVE: Final = 0x30
-"""Details of class CONTROLLER, data[1]: error-passive in receiving or sending."""
+"""Details of class CONTROLLER, data[1]: error-passive while receiving or sending."""
 ACTIVE: Final = 0x40
 """Details of class CONTROLLER, data[1]: error-active again."""
 
 _LOST_ARBITRATION, _PROTOCOL, _TRANSCEIVER = 0x002, 0x008, 0x010
 _LENGTH = 8
-"""Every error frame of SocketCAN has eight bytes (CAN_ERR_DLC)."""
+"""Number of data bytes in every SocketCAN error frame (CAN_ERR_DLC)."""
 
 _CLASSES = {
     0x001: "a frame was not sent in time",
@@ -90,7 +90,7 @@ class Severity(IntEnum):
     """Severity of an error frame."""
 
     ROUTINE = 0
-    """Normal on a working bus: arbitration lost, errors over."""
+    """Normal on a working bus: lost arbitration, or the end of an error condition."""
     WARNING = 1
     """The bus still carries frames, with errors."""
     FAULT = 2
@@ -105,7 +105,7 @@ class ErrorReport(NamedTuple):
 
 
 def decode_error_frame(kind: int, data: bytes | bytearray) -> ErrorReport:
-    """Decode an error frame's identifier and data; one in another coding than SocketCAN's is a warning."""
+    """Decode an error frame's identifier and data; a frame that is not in SocketCAN's coding becomes a warning."""
     if len(data) != _LENGTH:
         return ErrorReport(Severity.WARNING, f"error frame {kind:X} in the interface's own coding")
     parts = [words for bit, words in _CLASSES.items() if kind & bit]
@@ -126,14 +126,14 @@ def decode_error_frame(kind: int, data: bytes | bytearray) -> ErrorReport:
 
 
 def queue_is_full(error: Exception) -> bool:
-    """Whether a frame was not sent because the transmit queue is full, which may have passed in the next cycle."""
-    # ENOBUFS: the interface's queue is full; EAGAIN, and python-can without a number: the socket's.
+    """Whether a frame was not sent because the transmit queue is full; the next cycle may succeed again."""
+    # ENOBUFS: the interface's queue is full. EAGAIN, and python-can without a number: the socket's queue is full.
     number = error_number(error)
     return number in (errno.ENOBUFS, errno.EAGAIN) or (isinstance(error, can.CanOperationError) and number is None)
 
 
 def explain(error: Exception, *, sending: bool = True) -> str:
-    """Return the reason for which a frame could not be sent or received, with the remedy."""
+    """Return the reason why a frame could not be sent or received, with the remedy."""
     reason = " ".join(str(error).split())
     if sending and queue_is_full(error):
         return (
@@ -151,7 +151,7 @@ def explain(error: Exception, *, sending: bool = True) -> str:
 
 
 def error_number(error: BaseException | None) -> int | None:
-    """Return the system's error number, from the error or from its causes."""
+    """Return the system's error number, taken from the error or from one of its causes."""
     while error is not None:
         number = error.error_code if isinstance(error, can.CanError) else getattr(error, "errno", None)
         if number is not None:

@@ -1,4 +1,4 @@
-"""Capture of every frame on a bus: buffered here in the cycle, written to a file by the recorder."""
+"""Capture of every frame on a bus. The cycle buffers the frames here; the recorder writes them to a file."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from trirail_drivers.bus.can_frame import CAPTURED
 from trirail_drivers.bus.frames import packed
 
 CHUNK_FRAMES = 1024
-"""Largest number of frames in a chunk."""
+"""Maximum number of frames in a chunk."""
 MAX_FRAMES = 100_000
-"""Largest number of buffered frames; more are dropped."""
+"""Maximum number of buffered frames; further frames are dropped."""
 
 
 class Capture:
-    """Buffer of the frames captured since it was last drained."""
+    """Buffer of the frames captured since the buffer was last drained."""
 
     def __init__(self) -> None:
         self._frames = bytearray()
@@ -28,20 +28,20 @@ class Capture:
             self._frames += CAPTURED.pack(t, frame)
 
     def drain(self) -> Iterator[bytes]:
-        """Empty the buffer; yield its frames in chunks of at most CHUNK_FRAMES."""
+        """Empty the buffer, and yield its frames in chunks of at most CHUNK_FRAMES."""
         frames, self._frames = self._frames, bytearray()
         for start in range(0, len(frames), CHUNK_FRAMES * CAPTURED.size):
             yield bytes(frames[start : start + CHUNK_FRAMES * CAPTURED.size])
 
 
 class CapturedBus(can.BusABC):
-    """A bus whose frames are captured."""
+    """Bus that captures every frame."""
 
     def __init__(self, bus: can.BusABC, capture: Capture) -> None:
         self.inner = bus
-        """The bus underneath."""
+        """The underlying bus."""
         self.capture = capture
-        """Buffer of its frames."""
+        """Buffer of the captured frames."""
         self.channel_info = f"{bus.channel_info}, captured"
         super().__init__(channel=self.channel_info)
 
@@ -58,10 +58,10 @@ class CapturedBus(can.BusABC):
         return frame
 
     def fileno(self) -> int:
-        """Return the descriptor of the bus underneath."""
+        """Return the file descriptor of the underlying bus."""
         return self.inner.fileno()
 
     def shutdown(self) -> None:
-        """Close the bus underneath."""
+        """Close the underlying bus."""
         super().shutdown()
         self.inner.shutdown()

@@ -1,7 +1,8 @@
-"""Access of compiled cycles to a bus: on its socket, or by two Python functions if it has none.
+"""Access of compiled cycles to a bus: through its socket, or through two Python functions if it has no socket.
 
 These functions are called like libc's recvmmsg and sendmmsg, and move the same frames in the same order, one by one.
-An exception cannot pass compiled code, so they keep it, and the next `send` or `receive` raises it.
+Since an exception cannot pass through compiled code, the functions store it, and the next `send` or `receive` raises
+it.
 """
 
 from __future__ import annotations
@@ -17,40 +18,41 @@ from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 
 _CALL = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-"""Function of the address of consecutive `struct can_frame`, and their number."""
+"""Function that takes the address of consecutive `struct can_frame` and their number."""
 
 
 class LentFrames(FrameIO, Protocol):
-    """Frames to and from a bus that compiled code may move for a while."""
+    """Access to the frames of a bus that can be lent to compiled code for some time."""
 
     @property
     def access(self) -> BusAccess:
-        """Access for compiled code."""
+        """Bus access for compiled code."""
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take back `number` frames: `receive` returns those after the first `handled`, then raises `error` (errno.h).
+        """Take back `number` frames from compiled code, of which it has handled the first `handled`.
 
-        `error` is 0 if receiving has not failed.
+        `receive` returns the remaining frames, and then raises `error` (errno.h), which is 0 if receiving has not
+        failed.
         """
 
 
 def lendable_frames(frames: FrameIO) -> LentFrames:
-    """Return frames that compiled code can move: on their socket, unless every frame must be captured."""
+    """Return frame access that can be lent to compiled code; it uses the socket unless every frame must be captured."""
     return frames if isinstance(frames, SocketFrames) and not frames.captured else FrameCalls(frames)
 
 
 class FrameCalls:
-    """Frames to and from any bus, moved by Python for compiled code."""
+    """Frame access to any bus for compiled code; Python moves the frames."""
 
     def __init__(self, frames: FrameIO) -> None:
         self._frames = frames
         self._last_received: list[Received] = []
-        """Frames of the last receiving call."""
+        """Frames from the last receiving call."""
         self._returned: deque[Received] = deque()
         self._failure: BaseException | None = None
-        """Exception of receiving, to be raised after the returned frames."""
+        """Exception raised while receiving, to be raised again after the returned frames."""
         self._refusal: BaseException | None = None
-        """Exception of sending, to be raised by the next `send`."""
+        """Exception raised while sending, to be raised again by the next `send`."""
         self._calls = _CALL(self._receive_all), _CALL(self._send_all)
         receive, send = (ctypes.cast(call, ctypes.c_void_p).value or 0 for call in self._calls)
         self.access = BusAccess(-1, receive, send)
@@ -63,7 +65,7 @@ class FrameCalls:
         self._frames.send(frame)
 
     def receive(self, timeout: float = 0.0) -> Received | None:
-        """Return the next frame that has arrived or arrives within `timeout` [s], or None."""
+        """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
         if self._returned:
             return self._returned.popleft()
         if self._failure is not None:
@@ -72,11 +74,11 @@ class FrameCalls:
         return self._frames.receive(timeout)
 
     def set_identifiers(self, identifiers: Collection[int]) -> None:
-        """Restrict the received identifiers, see FrameIO."""
+        """Restrict the received identifiers; see FrameIO."""
         self._frames.set_identifiers(identifiers)
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
-        """Take frames back: `receive` returns those of the last call after the first `handled`."""
+        """Take frames back: `receive` returns those frames of the last call that follow the first `handled`."""
         self._returned.extend(self._last_received[handled:number])
 
     def _receive_all(self, address: int, most: int) -> int:
@@ -89,7 +91,7 @@ class FrameCalls:
                 address += CAN_FRAME.size
         except BaseException as error:  # noqa: BLE001 - no exception passes compiled code; the next receive raises it
             self._failure = error
-            return ~len(frames)  # negative even for 0 frames
+            return ~len(frames)  # negative even if 0 frames were received
         return len(frames)
 
     def _send_all(self, address: int, number: int) -> int:

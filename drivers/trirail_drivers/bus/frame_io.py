@@ -1,7 +1,8 @@
-"""Frames to and from a bus in the cycle, without waiting: on its socket if it has one, else by python-can.
+"""Exchange of frames with a bus in the cycle, without waiting: on its socket if it has one, otherwise through
+python-can.
 
 python-can opens and configures every bus. If the bus is a socket of `struct can_frame` (SocketCAN, or the bus between
-processes), packed frames cost a fifth of python-can's messages.
+processes), packed frames take a fifth of the time that python-can's messages take.
 """
 
 from __future__ import annotations
@@ -28,16 +29,19 @@ from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 from trirail_drivers.bus.unixbus import UnixBus
 
 MAX_EMPTY_READS = 64
-"""Most reads in a row without a frame: more than the acknowledgements of a cycle, which slcan returns as None."""
+"""Maximum number of consecutive reads without a frame.
+
+It exceeds the number of acknowledgements in a cycle, each of which slcan returns as None.
+"""
 
 TIMESPEC: Final = Struct("@ll")
-"""Linux' `struct timespec`: seconds, nanoseconds; and `struct timeval`: seconds, microseconds."""
+"""`struct timespec` of Linux (seconds, nanoseconds) and `struct timeval` (seconds, microseconds)."""
 TIMESPEC_SPACE: Final = socket.CMSG_SPACE(TIMESPEC.size)
 SO_TIMESTAMPNS: Final = 35
-"""Socket option of asm-generic/socket.h, which Python does not name: the arrival time with each packet."""
+"""Socket option of asm-generic/socket.h that adds the arrival time to each packet; Python has no name for it."""
 
 Received = tuple[int, bytearray]
-"""Identifier with the flags of `struct can_frame`, and data; a remote frame has none."""
+"""Identifier with the flags of `struct can_frame`, and data, which is empty for a remote frame."""
 
 
 class FrameIO(Protocol):
@@ -47,25 +51,25 @@ class FrameIO(Protocol):
         """Send a frame without waiting, or raise."""
 
     def receive(self, timeout: float = 0.0) -> Received | None:
-        """Return the next frame that has arrived or arrives within `timeout` [s], or None."""
+        """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
 
     def set_identifiers(self, identifiers: Collection[int]) -> None:
-        """Restrict receiving to error frames and data frames of these 11-bit identifiers, where that is possible."""
+        """Restrict receiving to error frames and to data frames with these 11-bit identifiers, if the bus can do so."""
 
 
 def frame_io(bus: can.BusABC) -> FrameIO:
-    """Return the cheapest access to a bus."""
+    """Return the fastest access to a bus."""
     inner, capture = (bus.inner, bus.capture) if isinstance(bus, CapturedBus) else (bus, None)
     if isinstance(inner, UnixBus) and inner.carrier is not None:
         return SocketFrames(inner.carrier, capture)
     if isinstance(inner, SocketcanBus) and inner.channel and inner.protocol is can.CanProtocol.CAN_20:
-        # A capture needs every frame; otherwise the kernel filters out frames without a listener.
+        # A capture needs every frame; without one, the kernel filters out frames that have no listener.
         return SocketFrames(inner.socket, capture, interface=inner, filtered=not capture)
     return PythonCanFrames(bus, receives_own_frames=isinstance(inner, UdpMulticastBus))
 
 
 class SocketFrames:
-    """Frames on a socket that carries `struct can_frame`, one a packet."""
+    """Frames on a socket that carries one `struct can_frame` per packet."""
 
     def __init__(
         self,
@@ -75,7 +79,10 @@ class SocketFrames:
         *,
         filtered: bool = False,
     ) -> None:
-        """`interface`: the bus of a SocketCAN socket; `filtered`: the kernel drops frames without a listener."""
+        """`interface` is the bus of a SocketCAN socket.
+
+        If `filtered`, the kernel drops frames that have no listener.
+        """
         self._socket = carrier
         self._capture = capture
         self._interface = interface
@@ -95,7 +102,7 @@ class SocketFrames:
             self._capture.note(frame.packed, time.time())
 
     def receive(self, timeout: float = 0.0) -> Received | None:
-        """Return the next frame that has arrived or arrives within `timeout` [s], or None."""
+        """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
         if self._returned:
             return self._returned.popleft()
         if timeout > 0.0:
@@ -111,15 +118,15 @@ class SocketFrames:
                 size = self._receive_timed(self._capture)
         except BlockingIOError:
             return None
-        except ConnectionError:  # the other end has died with unread frames
+        except ConnectionError:  # the other end died before it had read all frames
             size = 0
-        if size != CAN_FRAME.size:  # 0: end of file on a SOCK_SEQPACKET socket
+        if size != CAN_FRAME.size:  # 0 means end of file on a SOCK_SEQPACKET socket
             raise can.CanOperationError("the listening end is gone")
         identifier, length = HEADER.unpack_from(packet)
         return identifier, packet[DATA_AT : DATA_AT + (0 if identifier & REMOTE else length)]
 
     def set_identifiers(self, identifiers: Collection[int]) -> None:
-        """Let the kernel drop all other frames; error frames have a separate filter, which stays open."""
+        """Let the kernel drop all other frames. Error frames have a separate filter, which lets them pass."""
         if self._filtered and self._interface is not None:
             filters: list[CanFilter] = [
                 {"can_id": identifier, "can_mask": STANDARD_BITS, "extended": False} for identifier in identifiers
@@ -137,12 +144,12 @@ class SocketFrames:
         return BusAccess(self._socket.fileno())
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take frames back: `receive` returns those after the first `handled`, then raises `error` (errno.h)."""
+        """Take frames back: `receive` returns those after the first `handled`, and then raises `error` (errno.h)."""
         self._returned.extend(arrived.unpacked(handled, number))
         self._error = error
 
     def _receive_timed(self, capture: Capture) -> int:
-        """Receive into the packet, and capture it with the kernel's arrival time; return its size."""
+        """Receive a frame into the packet buffer, and capture it with the kernel's arrival time; return its size."""
         size, ancillary, _, _ = self._socket.recvmsg_into([self._packet], TIMESPEC_SPACE, socket.MSG_DONTWAIT)
         arrived = time.time()
         for level, kind, data in ancillary:
@@ -155,24 +162,24 @@ class SocketFrames:
 
 
 class PythonCanFrames:
-    """Frames by python-can's own send and receive, for any interface.
+    """Frames sent and received with python-can's own functions, for any interface.
 
-    None from python-can does not mean that nothing is left: its slcan returns None for each acknowledgement. So the
-    bus is read until its descriptor is empty or, without a descriptor, once more for each frame sent, which may have
-    been acknowledged.
+    None from python-can does not mean that no frame is left, since its slcan returns None for each acknowledgement.
+    Therefore the bus is read until its file descriptor has no more data. Without a descriptor, it is read once more for
+    each sent frame that may have been acknowledged.
 
-    Frames that this end has sent are dropped: gs_usb marks them, a multicast group returns them unmarked.
+    Frames that this end has sent are dropped: gs_usb marks them, while a multicast group returns them unmarked.
     """
 
     def __init__(self, bus: can.BusABC, *, receives_own_frames: bool = False) -> None:
-        """`receives_own_frames`: the bus returns sent frames, unmarked and in order."""
+        """If `receives_own_frames`, the bus returns sent frames in order and without a mark."""
         self._bus = bus
         self._own: deque[tuple[int, bytes]] | None = deque(maxlen=MAX_EMPTY_READS) if receives_own_frames else None
         # SocketCAN marks every frame from this machine, including those of other programs.
         self._marks_own = not isinstance(bus, SocketcanBus)
         self._poll: select.poll | None = None
         self._unanswered = 0
-        """Frames sent whose acknowledgement the interface may still return as None."""
+        """Number of sent frames whose acknowledgement the interface may still return as None."""
         with contextlib.suppress(NotImplementedError, can.CanOperationError):
             descriptor = bus.fileno()
             self._poll = select.poll()
@@ -187,7 +194,7 @@ class PythonCanFrames:
             self._own.append((can_id(message), bytes(message.data)))
 
     def receive(self, timeout: float = 0.0) -> Received | None:
-        """Return the next frame that has arrived or arrives within `timeout` [s], or None."""
+        """Return the next frame that has arrived or arrives within `timeout` [s]; otherwise None."""
         for _ in range(MAX_EMPTY_READS + 1):
             message = self._bus.recv(timeout)
             if message is None:
@@ -199,7 +206,10 @@ class PythonCanFrames:
         return None
 
     def _is_own(self, message: can.Message) -> bool:
-        """Whether this end has sent the frame; earlier own frames that have not come back are lost."""
+        """Whether this end has sent the frame.
+
+        Frames that it sent earlier and that have not come back count as lost.
+        """
         if self._own is None:
             return self._marks_own and not message.is_rx
         sent = can_id(message), bytes(message.data)

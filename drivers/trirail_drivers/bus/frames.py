@@ -1,4 +1,4 @@
-"""Classical CAN frames of any protocol, in Linux' layout: struct can_frame of linux/can.h."""
+"""Classical CAN frames of any protocol, in the Linux layout: struct can_frame of linux/can.h."""
 
 from __future__ import annotations
 
@@ -24,29 +24,32 @@ from trirail_drivers.errors import BusError
 def frame_bits(n: int) -> int:
     """Return the worst-case length [bits] of a classical frame with `n` data bytes and an 11-bit identifier.
 
-    8n + 44 bits and 3 of interframe space; 34 + 8n of these are subject to bit stuffing, which at worst adds one
-    bit after the first five and then one after every four (ISO 11898-1).
+    The frame has 8n + 44 bits, followed by 3 bits of interframe space. 34 + 8n of the bits are subject to bit stuffing,
+    which in the worst case adds one bit after the first five and then one after every four (ISO 11898-1).
     """
     return 8 * n + 47 + (34 + 8 * n - 1) // 4
 
 
 def bits_of(frames: int, data: int) -> float:
-    """Return an upper bound [bits] for `frames` frames with `data` bytes in total; at most 1 bit per frame too high."""
+    """Return an upper bound [bits] for `frames` frames with `data` bytes in total.
+
+    It exceeds the exact value by at most 1 bit per frame.
+    """
     return 8 * data + 47 * frames + (33 * frames + 8 * data) / 4
 
 
 BITS: Final = tuple(frame_bits(n) for n in range(9))
-"""`frame_bits` of each length."""
+"""`frame_bits` for each data length."""
 
 
 class Frame:
-    """A frame to send, with an 11-bit identifier; a frame of every cycle is kept and gets new data."""
+    """Frame to send, with an 11-bit identifier. A frame that is sent every cycle is kept and filled with new data."""
 
     __slots__ = ("bits", "packed")
 
     def __init__(self, identifier: int, data: bytes = b"", *, remote: bool = False) -> None:
         self.bits = BITS[len(data)]
-        """Worst-case length on the bus."""
+        """Worst-case length on the bus [bits]."""
         self.packed = bytearray(CAN_FRAME.pack(identifier | REMOTE * remote, len(data), data))
         """`struct can_frame`."""
 
@@ -58,7 +61,7 @@ class Frame:
         return frame
 
     def fill(self, layout: Struct, *values: int) -> None:
-        """Replace the data, keeping its length; struct.error if the layout cannot hold a value."""
+        """Replace the data and keep its length. Raises struct.error if the layout cannot hold a value."""
         layout.pack_into(self.packed, DATA_AT, *values)
 
     def message(self) -> can.Message:
@@ -92,7 +95,7 @@ def unpacked(packed: bytes, timestamp: float = 0.0) -> can.Message:
 
 
 class FrameSender(Protocol):
-    """Sender of set-up's frames: a bus, or the cycle's access to it."""
+    """Sender of set-up frames: a bus, or the cycle's access to a bus."""
 
     @property
     def channel_info(self) -> str:
@@ -103,9 +106,9 @@ class FrameSender(Protocol):
 
 
 def send_in_setup(bus: FrameSender, frame: Frame) -> None:
-    """Send a frame before the cycle runs; BusError if the bus refuses it.
+    """Send a frame before the cycle runs. Raises BusError if the bus refuses it.
 
-    A full queue is ignored: no node acknowledges while all drives are off, and the missing answer reports that.
+    A full queue is ignored: while all drives are off, no node acknowledges frames, and the missing answer reports that.
     """
     try:
         bus.send(frame.message())

@@ -9,21 +9,21 @@ from typing import Final
 from trirail_drivers.errors import BusError
 
 HIGH_LOAD: Final = 0.8
-"""Worst-case share of the bus above which people are warned, since acyclic frames have to wait."""
+"""Worst-case fraction of the bus capacity above which a warning is emitted, since acyclic frames then have to wait."""
 
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Frames of three drives and the service; bits include worst-case stuffing."""
+    """Frames of three drives and the service. Numbers of bits include worst-case stuffing."""
 
     cycle_bits: int
-    """Bits of one cycle's frames."""
+    """Number of bits of the frames in one cycle."""
     background: Callable[[float], float]
-    """Bits per second that do not depend on the cycle, as a function of the heartbeat period [s]."""
+    """Function that returns the bits per second independent of the cycle, given the heartbeat period [s]."""
     most_sent: int
-    """Largest number of frames that the service sends in one cycle."""
+    """Maximum number of frames that the service sends in one cycle."""
     output_bits: int = 0
-    """Bits of a frame of digital outputs."""
+    """Number of bits of a frame with digital outputs."""
 
     def with_outputs(self, drives: int) -> Traffic:
         """Return the traffic if this number of drives has digital outputs, which may change in every cycle."""
@@ -31,15 +31,18 @@ class Traffic:
         return replace(self, cycle_bits=self.cycle_bits + bits, most_sent=self.most_sent + drives)
 
     def bus_load(self, rate_hz: float, bitrate: int, heartbeat: float) -> float:
-        """Return the worst-case share of the bus that all frames take; 1.0 is full."""
+        """Return the worst-case fraction of the bus capacity that all frames use; 1.0 is a full bus."""
         return (rate_hz * self.cycle_bits + self.background(heartbeat)) / bitrate
 
     def highest_rate(self, bitrate: int, heartbeat: float) -> float:
-        """Return the cycle rate [Hz] that fills the bus; 0 if the other frames fill it alone."""
+        """Return the cycle rate [Hz] at which the bus is full; 0 if the other frames alone fill it."""
         return max(0.0, (bitrate - self.background(heartbeat)) / self.cycle_bits)
 
     def check_bus_load(self, rate_hz: float, bitrate: int, heartbeat: float) -> float:
-        """Return the bus load of a cycle; BusError, with the highest possible rate, if it exceeds 1.0."""
+        """Return the bus load of a cycle.
+
+        Raises BusError, which states the highest possible rate, if the load exceeds 1.0.
+        """
         load = self.bus_load(rate_hz, bitrate, heartbeat)
         if load > 1.0:
             raise BusError(
@@ -50,7 +53,7 @@ class Traffic:
 
 
 def warning(rate_hz: float, load: float) -> str:
-    """Return a warning for a bus load above HIGH_LOAD, else ""."""
+    """Return a warning if the bus load exceeds HIGH_LOAD, otherwise ""."""
     return (
         f"CAN bus: {rate_hz:g} Hz takes {load:.0%} of it at worst; keep below {HIGH_LOAD:.0%}"
         if load > HIGH_LOAD

@@ -1,4 +1,4 @@
-"""Arrays of frames that compiled code sends and receives in one call, and its access to the bus."""
+"""Arrays of frames that compiled code sends and receives in one call, and the access of compiled code to the bus."""
 
 from __future__ import annotations
 
@@ -12,27 +12,31 @@ from trirail_drivers.bus.frames import Frame
 
 
 class BusAccess(NamedTuple):
-    """Access of compiled code to a bus: a socket or, if it has none, two functions."""
+    """Access of compiled code to a bus: a socket, or two functions if the bus has no socket."""
 
     descriptor: int
-    """Socket of `struct can_frame`, one per packet; below 0 if there is none and the functions must be called."""
+    """Socket that carries one `struct can_frame` per packet; negative if there is none and the functions must be
+    called.
+    """
     receive: int = 0
-    """Address of a function that fills up to n frames; returns their number, or `~number` if it then failed."""
+    """Address of a function that receives up to n frames; it returns their number, or `~number` if it failed after
+    them.
+    """
     send: int = 0
-    """Address of a function that sends n frames; returns the number sent before the first failure."""
+    """Address of a function that sends n frames; it returns the number of frames sent before the first failure."""
 
 
 class PackedFrames:
-    """Frames for libc's sendmmsg and recvmmsg: `struct mmsghdr` of sys/socket.h, one `iovec` each."""
+    """Frames for libc's sendmmsg and recvmmsg: `struct mmsghdr` of sys/socket.h, each with one `iovec`."""
 
     def __init__(self, number: int) -> None:
         self.frames = np.zeros((number, CAN_FRAME.size), np.uint8)
         """`struct can_frame`, (number, size) of uint8."""
         self._vectors = np.zeros((number, 2), np.uint64)
         self.headers = np.zeros((number, 8), np.uint64)
-        """`struct mmsghdr`; its last number is the received length [bytes]."""
-        # On 64-bit Linux a header is msg_name, msg_namelen, msg_iov, msg_iovlen, msg_control, msg_controllen,
-        # msg_flags, msg_len, eight bytes each with padding.
+        """`struct mmsghdr` of each frame; its last number is the received length [bytes]."""
+        # On 64-bit Linux, a header consists of msg_name, msg_namelen, msg_iov, msg_iovlen, msg_control, msg_controllen,
+        # msg_flags and msg_len; each takes eight bytes including padding.
         for frame, vector, header in zip(self.frames, self._vectors, self.headers, strict=True):
             vector[:] = frame.ctypes.data, CAN_FRAME.size
             header[2:4] = vector.ctypes.data, 1
@@ -49,7 +53,7 @@ class PackedFrames:
             row[:] = np.frombuffer(frame.packed, np.uint8)
 
     def unpacked(self, first: int, end: int) -> list[tuple[int, bytearray]]:
-        """Return a range of the frames, as identifier with flags and data."""
+        """Return a range of the frames; each is an identifier with flags, and data."""
         unpacked = []
         for row in self.frames[first:end]:
             packed = row.tobytes()

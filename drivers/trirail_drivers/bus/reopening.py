@@ -1,4 +1,4 @@
-"""Reopening of a lost bus in a thread: an adapter may take seconds, and the cycle never waits."""
+"""Reopening of a lost bus in a thread, since an adapter may take seconds to open and the cycle never waits."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ RETRY_AFTER: Final = 0.5
 
 
 class AbsentBus(can.BusABC):
-    """Placeholder of a bus that is not open: nothing arrives, and nothing can be sent."""
+    """Placeholder for a bus that is not open: no frame arrives, and no frame can be sent."""
 
     def __init__(self, name: str, reason: str = "") -> None:
         self.channel_info = name
         self.reason = reason
-        """Reason for which the bus is not open."""
+        """Reason why the bus is not open."""
         super().__init__(channel=name)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Refuse a frame."""
+        """Refuse to send a frame."""
         raise can.CanOperationError(f"{self.channel_info} is not open")
 
     def recv(self, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Return that no frame has arrived."""
+        """Return None, since no frame can arrive."""
         return
 
 
 def start_thread(work: Callable[[], None]) -> None:
-    """Run work in a thread that delays neither the loop nor the end of the process."""
+    """Run `work` in a thread that delays neither the loop nor the end of the process."""
 
     def run() -> None:
-        with contextlib.suppress(OSError):  # it would inherit the loop's real-time priority and processor
+        with contextlib.suppress(OSError):  # the thread would inherit the loop's real-time priority and processor
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         work()
 
@@ -46,7 +46,7 @@ def start_thread(work: Callable[[], None]) -> None:
 
 
 class Reopening:
-    """Attempts to open a bus, one at a time. Only the opening itself runs in the thread."""
+    """Attempts to open a bus, one at a time. Only the opening itself runs in a thread."""
 
     def __init__(
         self,
@@ -54,9 +54,9 @@ class Reopening:
         open_bus: Callable[[], can.BusABC],
         start: Callable[[Callable[[], None]], None] = start_thread,
     ) -> None:
-        """`open_bus` may block and raise; `start` begins work in another thread and does not wait for it."""
+        """`open_bus` may block and raise. `start` starts work in another thread and does not wait for it."""
         self.name = name
-        """Name of the bus for people, as can0."""
+        """Name of the bus for people, such as can0."""
         self._open = open_bus
         self._start = start
         self._retired: can.BusABC | None = None
@@ -66,11 +66,14 @@ class Reopening:
         self._closed = False
 
     def retire(self, bus: can.BusABC) -> None:
-        """Close a bus before the next attempt: most adapters can be opened only once."""
+        """Close a bus before the next attempt, since most adapters can be opened only once."""
         self._retired = bus
 
     def attempt(self, now: float) -> can.BusABC | str | None:
-        """Return an opened bus or the reason of a failed attempt, once each, else None; start an attempt when due."""
+        """Return the opened bus or the reason why an attempt failed, once each; otherwise None.
+
+        Start an attempt when due.
+        """
         if self._under_way:
             outcome = self._outcome
             if outcome is not None:
@@ -81,23 +84,23 @@ class Reopening:
             retired, self._retired = self._retired, None
             try:
                 self._start(partial(self._attempt, retired))
-            except RuntimeError as error:  # the system's limit of threads
+            except RuntimeError as error:  # the system's limit on threads is reached
                 self._outcome = str(error)
         return None
 
     def close(self) -> None:
-        """Close a bus that was opened but not returned, now or when it opens."""
+        """Close a bus that was opened but never returned; if it is still being opened, close it afterwards."""
         self._closed = True
         for bus in (self._retired, self._outcome):
             if isinstance(bus, can.BusABC):
                 _shut_down(bus)
 
     def _attempt(self, retired: can.BusABC | None) -> None:
-        if retired is not None:  # in the thread too, since closing an adapter may block
+        if retired is not None:  # also in a thread, since closing an adapter may block
             _shut_down(retired)
         try:
             outcome: can.BusABC | str = self._open()
-        except Exception as error:  # noqa: BLE001 - makers' libraries raise anything
+        except Exception as error:  # noqa: BLE001 - vendor libraries raise any exception
             outcome = " ".join(str(error).split()) or type(error).__name__
         self._outcome = outcome
         if self._closed and isinstance(outcome, can.BusABC):
@@ -105,5 +108,5 @@ class Reopening:
 
 
 def _shut_down(bus: can.BusABC) -> None:
-    with contextlib.suppress(Exception):  # its adapter may be gone
+    with contextlib.suppress(Exception):  # the adapter may have been removed
         bus.shutdown()

@@ -1,4 +1,4 @@
-"""A CAN bus between processes of one machine, for kernels without SocketCAN."""
+"""CAN bus between processes of one machine, for kernels without SocketCAN."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ SEND_BUFFER_BYTES = 1 << 22
 class UnixBus(can.BusABC):
     """One end of a bus over an AF_UNIX SOCK_SEQPACKET socket at the path `channel`.
 
-    One end listens: whenever it receives, it relays each frame to all its peers but the sender. Any number of others
-    connect. A peer that does not read loses frames, like a full CAN controller. Each packet is a `struct can_frame`.
+    One end listens and any number of others connect. Whenever the listening end receives, it relays each frame to all
+    peers except the sender. A peer that does not read loses frames, like a full CAN controller. Each packet is a
+    `struct can_frame`.
     """
 
     def __init__(self, channel: str, listen: bool = False, **kwargs: object) -> None:
@@ -46,7 +47,7 @@ class UnixBus(can.BusABC):
         super().__init__(channel, **kwargs)  # type: ignore[arg-type]
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Send to the peers; raises can.CanOperationError if the listening end is gone or too slow."""
+        """Send a frame to the peers. Raises can.CanOperationError if the listening end is gone or too slow."""
         if msg.is_fd:
             raise can.CanOperationError(f"{self.channel_info}: classical CAN frames only, not CAN FD")
         packet = packed(msg)
@@ -60,15 +61,15 @@ class UnixBus(can.BusABC):
 
     @property
     def carrier(self) -> socket.socket | None:
-        """Socket of a connected end; None for the listening end, and after the connection was lost."""
+        """Socket of a connected end; None for the listening end and after the connection has been lost."""
         return next(iter(self._peers.values()), None) if self._listener is None else None
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable when a frame or a new peer may be there."""
+        """Return a file descriptor that is readable when a frame or a new peer may have arrived."""
         return self._epoll.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus; the listening end closes it for all."""
+        """Leave the bus. If the listening end leaves, the bus is closed for all peers."""
         if self._is_shutdown:
             return
         super().shutdown()
@@ -94,7 +95,7 @@ class UnixBus(can.BusABC):
             _connect(self._path).close()
             raise BusError(f"{self.channel_info}: another process listens there; stop it or use another path")
         if self._path.is_socket():
-            self._path.unlink()  # left by a process that died
+            self._path.unlink()  # left behind by a process that died
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
             listener.bind(str(self._path))
@@ -110,7 +111,7 @@ class UnixBus(can.BusABC):
         self._epoll.register(peer, select.EPOLLIN)
 
     def _read_frame(self, peer: socket.socket) -> None:
-        """Read one frame of a peer, or its end of file."""
+        """Read one frame or the end of file from a peer."""
         try:
             packet = peer.recv(CAN_FRAME.size)
         except ConnectionError:
@@ -135,7 +136,7 @@ class UnixBus(can.BusABC):
 
 
 def widen_send_buffer(peer: socket.socket) -> None:
-    """Enlarge the send buffer, within the system's limit, for a peer that is not scheduled for a while."""
+    """Enlarge the send buffer, within the system's limit, so that a peer may go unscheduled for some time."""
     peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
 
 

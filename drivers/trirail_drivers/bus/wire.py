@@ -1,4 +1,4 @@
-"""Access of the cycle to the CAN bus: it never waits or raises, latches the first fault, and reopens a lost bus."""
+"""Access of the cycle to the CAN bus. It never waits or raises, latches the first fault, and reopens a lost bus."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from trirail_drivers.errors import shortened
 from trirail_drivers.interface import Clock, DriveFault
 
 MAX_FRAMES = 1000
-"""Largest number of frames handled by one `receive`, so that a babbling node cannot block it."""
+"""Maximum number of frames that one `receive` handles, so that a babbling node cannot block it."""
 UNSENT_CYCLES = 3
-"""Number of consecutive cycles with a full transmit queue that are a fault."""
+"""Number of consecutive cycles with a full transmit queue that constitute a fault."""
 
 TRIAL_CYCLES = 3
-"""Number of consecutive cycles in which a reopened bus must take every frame before it counts as back."""
+"""Number of consecutive cycles in which a reopened bus must accept every frame before it counts as working again."""
 
 Handler = Callable[[bytearray, float], None]
-"""Function of a frame's data and the time [s]; raises struct.error for a wrong length."""
+"""Function that handles a frame's data at a time [s]. It raises struct.error for a wrong length."""
 
 
 class Listener(Protocol):
-    """Receiver of frames: one drive."""
+    """Receiver of frames, which represents one drive."""
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
         """Latch a fault of the drive."""
@@ -45,15 +45,15 @@ class Wire:
     """
 
     def __init__(self, bus: can.BusABC, stop: Callable[[], None], reopening: Reopening | None = None) -> None:
-        """`reopening` reopens a lost bus; without it, the bus stays lost."""
+        """`reopening` reopens a lost bus; without it, a lost bus stays lost."""
         self.bus = bus
-        """Bus for use outside the cycle: set-up and closing."""
+        """Bus for use outside the cycle, during set-up and closing."""
         self.down = ""
-        """Reason for which the bus is lost, a line for people; "" while it is usable."""
+        """Reason why the bus is lost, one line for people; "" while the bus is usable."""
         self._name = reopening.name if reopening is not None else str(bus.channel_info)
         self._reopening = reopening
         self.traffic = 0
-        """Bits of all frames sent and received, each with worst-case stuffing."""
+        """Number of bits of all frames sent and received, each with worst-case stuffing."""
         self._frames = lendable_frames(frame_io(bus))
         self.fault: DriveFault | None = None
         self._stop = stop
@@ -65,20 +65,23 @@ class Wire:
         self._sent = False
         """Whether a frame was sent in this cycle."""
         self._dead = False
-        """Whether the lost bus cannot send either."""
+        """Whether the lost bus cannot even send."""
         self._trial: int | None = None
-        """Number of cycles in which a reopened bus took every frame; None if no bus is on trial."""
+        """Number of cycles in which a reopened bus has accepted every frame; None if no bus is on trial."""
         self._awaits_frame = False
-        """Whether only a received frame shows that the bus is back."""
+        """Whether the bus counts as working again only once a frame has been received."""
 
     def listen(self, can_id: int, listener: Listener, handler: Handler) -> None:
-        """Set the handler of the data frames of an 11-bit identifier."""
+        """Set the handler for data frames with an 11-bit identifier."""
         self._handlers[can_id] = listener, handler
         self._frames.set_identifiers(self._handlers)
 
     def begin(self, now: float, *, stopping: bool = False) -> None:
-        """Begin a cycle, while drives may be `stopping`; continue the reopening of a lost bus."""
-        # Only cycles with a sent frame count: an idle bus proves nothing.
+        """Begin a cycle, and continue the reopening of a lost bus.
+
+        `stopping` means that drives may still be stopping.
+        """
+        # Only cycles in which a frame was sent count: an idle bus proves nothing.
         if self._trial is not None and self._sent:
             self._trial = 0 if self._unsent else self._trial + 1
         self._unsent_cycles = self._unsent_cycles + 1 if self._unsent else 0
@@ -87,13 +90,13 @@ class Wire:
             self._continue_reopening(self._reopening, now, stopping=stopping)
 
     def _continue_reopening(self, reopening: Reopening, now: float, *, stopping: bool) -> None:
-        """Do the next step of reopening: abandon the lost bus, open it in the background, try it out."""
+        """Take the next step of reopening: abandon the lost bus, open it in the background, or try it out."""
         if self._trial is not None:
             if self._trial >= TRIAL_CYCLES and not self._awaits_frame:
                 self._end_trial()
             return
         if stopping and not self._dead:
-            return  # it may still carry the frames that stop the drives
+            return  # the bus may still carry the frames that stop the drives
         if not isinstance(self.bus, AbsentBus):
             reopening.retire(self.bus)
             self._use(AbsentBus(self._name))
@@ -119,7 +122,7 @@ class Wire:
         self._frames.set_identifiers(self._handlers)
 
     def lose(self, reason: str, *, dead: bool = True) -> None:
-        """Mark the bus as lost, to be reopened, and latch a fault; one that is not `dead` may still send."""
+        """Mark the bus as lost and to be reopened, and latch a fault. A bus that is not `dead` may still send."""
         text = self._down_text(reason)
         if self._reopening is not None:
             self.down = self.down or text
@@ -137,38 +140,38 @@ class Wire:
             self.bus.shutdown()
 
     def fail(self, fault: DriveFault) -> None:
-        """Latch a fault, unless one is latched already."""
+        """Latch a fault, unless one is already latched."""
         if self.fault is None:
             self.fault = fault
             self._stop()
 
     @property
     def carries(self) -> bool:
-        """Whether the bus is usable, or reopened and on trial."""
+        """Whether the bus is usable, or has been reopened and is on trial."""
         return not self.down or self._trial is not None
 
     @property
     def reopens(self) -> bool:
-        """Whether a lost bus is reopened."""
+        """Whether a lost bus will be reopened."""
         return self._reopening is not None
 
     @property
     def access(self) -> BusAccess:
-        """Access of compiled code to the bus."""
+        """Bus access for compiled code."""
         return self._frames.access
 
     @property
     def is_healthy(self) -> bool:
-        """Whether there is no fault and no warning, and the bus takes every frame."""
+        """Whether there is no fault and no warning, and the bus accepts every frame."""
         sends = not self._unsent and self._unsent_cycles == 0
         return self.fault is None and not self._warnings and not self.down and sends
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take back frames that compiled code has received: see frame_calls.LentFrames."""
+        """Take back frames that compiled code has received; see frame_calls.LentFrames."""
         self._frames.return_frames(arrived, handled, number, error)
 
     def warn(self, text: str) -> None:
-        """Add a warning; the same one only once between resets."""
+        """Add a warning; the same warning is added only once between resets."""
         if text not in self._warned:
             self._warned.add(text)
             self._warnings.append(text)
@@ -185,9 +188,9 @@ class Wire:
         self._warned.clear()
 
     def send(self, frame: Frame) -> bool:
-        """Send a frame without waiting; return whether the bus took it.
+        """Send a frame without waiting; return whether the bus accepted it.
 
-        A frame that a full queue refuses is dropped; this is a fault only after UNSENT_CYCLES.
+        A frame that a full queue refuses is dropped; this becomes a fault only after UNSENT_CYCLES cycles.
         """
         try:
             self._frames.send(frame)
@@ -209,7 +212,7 @@ class Wire:
             self.warn(f"CAN bus: {reason}")
         elif canerrors.error_number(error) is not None:  # ENOBUFS, EAGAIN: the interface is there, reopening is no help
             self.fail(DriveFault("", "bus", 0, f"CAN bus: {reason}"))
-        else:  # the queue is full or the adapter is gone: without a number python-can does not say which
+        else:  # The queue is full or the adapter is gone: python-can gives no number and so does not tell which.
             self._awaits_frame = True
             self.lose(reason, dead=False)
 
@@ -225,7 +228,7 @@ class Wire:
             self.lose(f"cannot receive: {canerrors.explain(error, sending=False)}", dead=False)
 
     def wait(self, seconds: float, clock: Clock) -> None:
-        """Wait up to `seconds` for a frame and handle it; not for the cycle. Raises can.CanError, OSError."""
+        """Wait up to `seconds` for a frame and handle it. Not for use in the cycle. Raises can.CanError or OSError."""
         received = self._frames.receive(seconds)
         if received is not None:
             self._dispatch(*received, clock())
@@ -235,7 +238,7 @@ class Wire:
             self._handle_error_frame(canerrors.decode_error_frame(identifier & EXTENDED_BITS, data))
             return
         self.traffic += BITS[min(len(data), 8)]
-        if self._trial is not None:  # a received frame proves that the bus is back
+        if self._trial is not None:  # a received frame proves that the bus is working again
             self._end_trial()
         entry = self._handlers.get(identifier)  # 29-bit identifiers and remote frames have flags, and so no handler
         if entry is None:

@@ -1,4 +1,4 @@
-"""State of one CiA 402 drive from its frames: position, power state, faults."""
+"""State of one CiA 402 drive, taken from its frames: position, power state, faults."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ MISSED_STATUSES = 3
 FOLLOW_TIME = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
 """Longest time until an enabled drive reports that it follows setpoints [s]."""
 REGISTER_TIME = 0.5
-"""Longest time until a drive answers with its error register after a reset [s]."""
+"""Longest time until a drive reports its error register after a reset [s]."""
 ANSWER_TIME = 0.5
-"""Longest time until a drive answers an SDO request of the cycle [s]; a set-up waits for that answer first."""
+"""Longest time until a drive answers an SDO request from the cycle [s]; a set-up first waits for that answer."""
 STANDSTILL_DISTANCE_M = 2e-5
-"""A slider is at rest once it has stayed within this distance for STANDSTILL_TIME_S."""
+"""Distance [m] within which a slider must stay for STANDSTILL_TIME_S to count as at rest."""
 STANDSTILL_TIME_S = 0.1
 RESET_TIME = 2 * canopen_frames.STATUS_PERIOD
-"""Longest time until a drive leaves fault after a fault reset [s]: two periods of its statusword."""
+"""Longest time until a drive leaves the fault state after a fault reset [s]: two periods of its statusword."""
 
 _RESTARTED = "has restarted and lost its set-up: wait until it is configured again, then send reset"
 _NMT_STATES = {canopen_frames.STOPPED: "stopped", canopen_frames.PRE_OPERATIONAL: "pre-operational"}
 _STATE_BITS = 0x6F
-"""Bits of a statusword that code the state."""
+"""Bits of a statusword that encode the state."""
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 _WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
 _ENABLING_STATES = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
-"""States that a drive passes by controlwords while it is enabled."""
+"""States through which controlwords lead a drive while it is enabled."""
 _ENABLED_OR_ENABLING = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED)
-"""States that every drive leaves on a command to stop or to take the power off."""
+"""States that every drive leaves on a command to stop or to remove power."""
 
 
 class Cia402Axis(Axis):
-    """Newest feedback of one drive; the `on_` methods take a frame's data or raise struct.error."""
+    """Newest feedback of one drive. The `on_` methods take the data of a frame; they may raise struct.error."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
@@ -55,52 +55,52 @@ class Cia402Axis(Axis):
         self.status_heard = self.stands_since = math.inf
         self.status_within = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
         self.has_setpoint = False
-        """Whether it has been sent a setpoint."""
+        """Whether the drive has been sent a setpoint."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.controlword = canopen_frames.DISABLE_VOLTAGE
         """Controlword sent last."""
         self.mode_bits = 0
         """Mode-specific controlword bits, added to "enable operation"."""
         self.held: int | None = None
-        """Position [counts] that it gets instead of setpoints."""
+        """Position [counts] sent to the drive instead of setpoints."""
         self.mode = ShownMode(drives.sdo_timeout)
         self.cyclic = True
-        """Whether it is certainly in the mode in which it follows setpoints."""
+        """Whether the drive is certain to be in the mode in which it follows setpoints."""
         self.follows = True
-        """Whether it follows setpoints, or soon will; meanwhile they must hold its position."""
+        """Whether the drive follows setpoints or is about to; until it does, setpoints must hold its position."""
         self.has_followed = False
-        """Whether it has reported that it follows setpoints since it was enabled."""
+        """Whether the drive has reported, since it was enabled, that it follows setpoints."""
         self.sdo_answer: bytes | None = None
-        """Newest SDO answer to `sdo_asked`."""
+        """Newest SDO answer to the request in `sdo_asked`."""
         self.error_code = 0
         """Last error code that the drive reported; 0 once it has reported the end of the error."""
         self.reset_until = -math.inf
         """Time until which a fault reset may take effect [s]."""
         self.pdo_silent = False
-        """Whether its last heartbeat showed a state without PDOs, so that its statusword must be requested."""
+        """Whether the last heartbeat showed a state without PDOs, so that the statusword must be requested."""
         self.left_operational = False
-        """Whether it has left NMT operational and was not started again."""
+        """Whether the drive has left NMT operational and has not been started again."""
         self.sdo_asked: bytes | None = None
         """Index of the object whose SDO answer is pending, little-endian."""
         self.unanswered = 0
-        """Number of SDO requests without an answer."""
+        """Number of unanswered SDO requests."""
         self.answered_by = -math.inf
-        """Time until which the newest of them may be answered [s]."""
+        """Time until which the newest of these requests may be answered [s]."""
         self.poll_due = self._register_until = -math.inf
-        """Time of the next statusword request, and time until which the error register may be answered [s]."""
+        """Time of the next statusword request, and time until which the error register may arrive [s]."""
         self.register_wanted = False
-        """Whether its error register 1001h must be requested."""
+        """Whether the drive's error register 1001h must be requested."""
         self._operational = self._followed = self.stopped = False
         self._unfollowed_since: float | None = None
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
 
     def assign_io(self, io: DigitalIo) -> None:
-        """Set the digital outputs and inputs that the robot uses, and the exchange that the driver expects then."""
+        """Set the digital outputs and inputs that the robot uses, and the exchange that the driver then expects."""
         super().assign_io(io)
         self.set_up(process_data.default_exchange(self.node, io), self.units)
 
     def set_up(self, exchange: process_data.Exchange, units: Units) -> None:
-        """Set the frames and units of the exchange. The set-up has left the outputs safe."""
+        """Set the frames and units of the exchange. The set-up has already made the outputs safe."""
         self.exchange, self.units = exchange, units
         self.maps_outputs, self.outputs_kept = exchange.outputs is not None, exchange.outputs_kept
         self.outputs_sent = NOTHING_SENT
@@ -108,7 +108,7 @@ class Cia402Axis(Axis):
         self.position_at, self.velocity_at = exchange.setpoints.offset(0), exchange.setpoints.offset(1)
 
     def forget_power_state(self) -> None:
-        """Forget the last power state, and trust positions again: a new set-up begins."""
+        """Forget the last power state, and trust positions again, because a new set-up begins."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.unanswered = 0
         self._answers_after.forget()
@@ -119,7 +119,7 @@ class Cia402Axis(Axis):
         self.answered_by = now + ANSWER_TIME
 
     def rejoin(self, exchange: process_data.Exchange, units: Units, now: float, *, homed: bool) -> None:
-        """Take part in the cycle again after a set-up in the background."""
+        """Let the drive take part in the cycle again after a set-up in the background."""
         self.set_up(exchange, units)
         self.restarted = self.silent = self.left_operational = self.pdo_silent = False
         self.stopped = self._operational = False
@@ -131,27 +131,30 @@ class Cia402Axis(Axis):
 
     @property
     def last_heard(self) -> float:
-        """Time of its last sign of life other than a position [s]."""
+        """Time of the last sign of life other than a position [s]."""
         return max(self.status_heard, super().last_heard)
 
     def lose(self, *, stopping: bool) -> None:
-        """Handle the loss of the bus: its set-up must be checked again; unless `stopping`, it has no power any more."""
+        """Handle the loss of the bus: the set-up must be checked again.
+
+        Unless `stopping`, the drive is assumed to have no power.
+        """
         self.silent = True
         if not stopping:
             self.forget_power_state()
 
     def note_setpoint(self, target: int, offset: int) -> None:
-        """Record the position and velocity sent to it, in its units."""
+        """Record the position and velocity sent to the drive, in drive units."""
         self.target, self.offset, self.has_setpoint = target, offset, True
 
     @property
     def setpoint(self) -> tuple[int, int]:
-        """Setpoint sent last, in its units; before the first, its actual position."""
+        """Setpoint sent last, in drive units; before the first setpoint, the drive's actual position."""
         return (self.target, self.offset) if self.has_setpoint else (self.actual, 0)
 
     def on_position(self, data: bytes | bytearray, now: float) -> None:
-        """Handle TPDO2: the position sampled at a SYNC, and the statusword if it is mapped there."""
-        if not self.configured:  # a drive that started by itself may send anything; duplicate nodes are found by it
+        """Handle TPDO2: the position sampled at a SYNC, and the statusword if it is mapped in the same PDO."""
+        if not self.configured:  # a drive that started by itself may send anything; this also detects duplicate nodes
             self.came = True
             return
         counts, statusword = self.exchange.feedback.unpack(data)
@@ -164,7 +167,7 @@ class Cia402Axis(Axis):
         if statusword is not None:
             self.status_heard = now
             self.update_status(statusword)
-        self._operational = True  # CiA 301: PDOs are sent in NMT operational only
+        self._operational = True  # CiA 301: PDOs are sent only in NMT operational
 
     def is_steady(self, wanted: canopen_frames.TargetState) -> bool:
         """Whether the driver has nothing to send or decide as long as the drive's frames do not change."""
@@ -185,7 +188,9 @@ class Cia402Axis(Axis):
         )
 
     def expected_rows(self, number: int) -> list[tuple[Any, ...]]:
-        """Return rows of trirail_drivers.driver.cyclic.EXPECTED: frames of drive `number` that carry no news."""
+        """Return rows of trirail_drivers.driver.cyclic.EXPECTED for the frames of drive `number` that carry no new
+        information.
+        """
         exchange, word = self.exchange, canopen_frames.STATUSWORD.pack(self.statusword)
         decides = canopen_frames.STATUSWORD.pack(
             _STATE_BITS | (canopen_frames.FOLLOWS_SETPOINTS if exchange.tells_following else 0)
@@ -213,7 +218,7 @@ class Cia402Axis(Axis):
         self.position = self.scale.metres(counts)
 
     def on_sdo(self, data: bytes | bytearray, now: float) -> None:
-        """Handle an SDO answer; an answer has eight bytes (CiA 301)."""
+        """Handle an SDO answer, which has eight bytes (CiA 301)."""
         if len(data) != 8:
             return
         if self.setup_listener is not None:
@@ -231,39 +236,41 @@ class Cia402Axis(Axis):
         elif data[:4] == canopen_frames.ERROR_REGISTER_UPLOADED and now < self._register_until:
             self._register_until = -math.inf
             if data[4] == 0:
-                self.error_code = 0  # CiA 301, 1001h: there is no error
+                self.error_code = 0  # CiA 301, 1001h: no error is present
 
     @property
     def awaits_mode(self) -> bool:
-        """Whether it has power but does not show its mode yet, which it must before it gets setpoints."""
+        """Whether the drive has power but does not show its mode yet; it gets setpoints only once it does."""
         return not self.mode.shown and self.cyclic and self.state is PowerState.OPERATION_ENABLED
 
     def _update_mode(self, mode: int) -> None:
-        """Check the mode display 6061h: 0 is no mode yet, another mode is a fault."""
+        """Check the mode display 6061h: 0 means no mode yet; any other unexpected mode is a fault."""
         self.mode.shown = mode == self.exchange.mode
         if not self.mode.shown and mode:
             self.note_fault("state", 0, f"shows mode {mode} (object 6061), with power; expected {self.exchange.mode}")
 
     def request(self) -> bytes:
-        """Return the next SDO request: its statusword, its mode display, or both in turn."""
+        """Return the next SDO request: for the statusword, for the mode display, or for both in turn."""
         both = self.exchange.polled or self.pdo_silent
         for_mode = self.awaits_mode and self.mode.is_next(alone=not both)
         return canopen_frames.MODE_DISPLAY_UPLOAD if for_mode else canopen_frames.STATUSWORD_UPLOAD
 
     @property
     def holds(self) -> int | None:
-        """Position [counts] that it gets instead of setpoints; None if it gets setpoints."""
+        """Position [counts] sent to the drive instead of setpoints; None if setpoints are sent."""
         return self.held if self.mode.shown or self.held is not None else self.actual
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
-        """Handle TPDO1: the statusword, and the inputs if they are mapped there, on change and every STATUS_PERIOD."""
+        """Handle TPDO1, sent on change and every STATUS_PERIOD: the statusword, and the inputs if they are mapped
+        there.
+        """
         if self.exchange.inputs is not None and self.exchange.inputs == self.exchange.status:
             self.on_inputs(data[2:], now)
             data = data[:2]
         self._on_statusword(data, now)
 
     def on_inputs(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Handle TPDO3: the digital inputs, on change and every STATUS_PERIOD."""
+        """Handle TPDO3, sent on change and every STATUS_PERIOD: the digital inputs."""
         (inputs,) = canopen_frames.INPUTS.unpack(data)
         self.inputs = inputs & self.io.inputs
 
@@ -284,14 +291,16 @@ class Cia402Axis(Axis):
             self.powered_up = True
         if state not in _IN_FAULT:
             if self.state in _IN_FAULT:
-                self.error_code = 0  # it was the fault's reason
+                self.error_code = 0  # it was the reason for the fault
             self.reset_until = -math.inf
         self.state = state
 
     def end_cycle(self) -> DriveFault | None:
-        """Check the cycle's frames for a second node with this id: a node answers a SYNC once, only while operational.
+        """Check the cycle's frames for a second node with this id. A node answers each SYNC once, and only while
+        operational.
 
-        Return the fault that was attributed to this drive but caused by the other node; `event` then names that node.
+        Return the fault that was attributed to this drive although the other node caused it; `event` then names that
+        node.
         """
         mistaken = self._answers_after.end_cycle(came=self.came)
         if self._answers_per_sync.from_two_nodes():
@@ -304,14 +313,16 @@ class Cia402Axis(Axis):
 
     @property
     def shown_state(self) -> PowerState:
-        """Its state, but "switched on" while it has power and has not reported yet that it follows setpoints."""
+        """State of the drive, shown as "switched on" while it has power but has not yet reported that it follows
+        setpoints.
+        """
         if not self.configured and self.state not in _ENABLED_OR_ENABLING:
             return PowerState.NOT_READY_TO_SWITCH_ON
         waits = self.cyclic and (not self.mode.shown or (self.exchange.tells_following and not self.has_followed))
         return PowerState.SWITCHED_ON if waits and self.state is PowerState.OPERATION_ENABLED else self.state
 
     def on_emergency(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Handle an EMCY: an error code; codes 00xxh report the end of errors (CiA 301)."""
+        """Handle an EMCY, which contains an error code; codes 00xxh report that errors have ended (CiA 301)."""
         code, register, _ = canopen_frames.EMERGENCY.unpack(data)
         if code & 0xFF00 == 0:
             self.error_code = 0
@@ -322,7 +333,7 @@ class Cia402Axis(Axis):
     def on_heartbeat(self, data: bytes | bytearray, now: float) -> None:
         """Handle a heartbeat, an answer to node guarding, or a boot-up message."""
         (state,) = canopen_frames.NMT_STATE.unpack(data)
-        if self.setup_listener is not None and state != canopen_frames.BOOT_UP:  # set-up tests node guarding
+        if self.setup_listener is not None and state != canopen_frames.BOOT_UP:  # the set-up tests node guarding
             self.setup_listener(canopen_frames.HEARTBEAT + self.node, data)
         if self.exchange.guarded:
             state &= canopen_frames.NMT_STATE_BITS
@@ -336,50 +347,51 @@ class Cia402Axis(Axis):
             self.restarted, self.boots, self.unanswered = True, self.boots + 1, 0
             self.left_operational = self._operational = False
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
-            # Replaces an earlier event: a restart explains it.
+            # This replaces an earlier event, which the restart explains.
             self.event = self.make_fault("state", 0, _RESTARTED)
-            if was_there:  # otherwise later positions are its own: some drives start by themselves
+            if was_there:  # otherwise later positions come from this drive: some drives start by themselves
                 self._answers_after.begin(self.event)
-        elif self._operational:  # before that, it is a heartbeat from before the drive was started
+        elif self._operational:  # until then, the heartbeat was sent before the drive was started
             self.leave_operational()
             self.note_fault("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
         self.pdo_silent = self.left_operational and self.configured and state != canopen_frames.OPERATIONAL
 
     def leave_operational(self) -> None:
-        """Note that it receives no PDOs any more: its state is unknown until an SDO answer."""
+        """Record that the drive no longer receives PDOs; its state is unknown until it answers by SDO."""
         self._operational = False
         self.left_operational = True
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
 
     @property
     def may_miss_pdos(self) -> bool:
-        """Whether it may miss PDOs, so that controlwords must be sent by SDO too."""
+        """Whether the drive may miss PDOs, so that controlwords must also be sent by SDO."""
         return self.left_operational or self.missed > 0
 
     def clear_faults(self, now: float) -> None:
-        """Forget the latched event, not a lasting condition, and allow time for a fault reset."""
+        """Forget the latched event, but not a condition that persists, and allow time for a fault reset."""
         self._answers_after.forget()
         if self.configured:
             self.event = None
-        if self.state is PowerState.FAULT or self.left_operational:  # it could not report a fault
+        if self.state is PowerState.FAULT or self.left_operational:  # it was unable to report a fault
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
             self.clear_missed()
             self.status_heard = now
         if self.error_code and self.state not in _IN_FAULT:
-            # An EMCY without a following "error reset": only the register shows whether it is over.
+            # After an EMCY without a following "error reset", only the error register shows whether the error is over.
             self.register_wanted = True
             self._register_until = now + REGISTER_TIME
 
     def word(self, now: float, wanted: canopen_frames.TargetState) -> int:
-        """Return the controlword for the drive at time `now` [s], for its next transition towards `wanted`."""
+        """Return the controlword for the drive's next transition towards `wanted`, at time `now` [s]."""
         if self.state is PowerState.FAULT and now < self.reset_until:
             # Bit 7 stays set until the drive leaves fault: some drives sample it only every few cycles.
             return canopen_frames.FAULT_RESET
         if self.state is PowerState.QUICK_STOP_ACTIVE and self._is_at_rest(now):
-            # With 605Ah = 5 to 8 it stays there with power (CiA 402-2, transition 12). Sent earlier, it would coast.
+            # With 605Ah = 5 to 8, the drive stays there with power (CiA 402-2, transition 12).
+            # If this were sent earlier, the drive would coast.
             return canopen_frames.DISABLE_VOLTAGE
         word = canopen_frames.controlword(self.state, wanted)
         if word != canopen_frames.ENABLE_OPERATION:
@@ -390,21 +402,22 @@ class Cia402Axis(Axis):
         return word | self.mode_bits
 
     def is_not_followed(self, word: int, wanted: canopen_frames.TargetState) -> bool:
-        """Whether the drive's state shows that a controlword had no effect."""
+        """Whether the drive's state shows that a controlword has had no effect."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
             return word == canopen_frames.DISABLE_VOLTAGE
         if wanted is PowerState.OPERATION_ENABLED:
-            return self.state in _ENABLING_STATES or not self.cyclic  # the state does not show the mode's bits
+            return self.state in _ENABLING_STATES or not self.cyclic  # the state does not show the mode-specific bits
         return self.state in _ENABLED_OR_ENABLING
 
     def _is_at_rest(self, now: float) -> bool:
-        """Whether its slider is at rest, by current positions."""
+        """Whether the slider is at rest, judging by recent positions."""
         return now - self.stands_since >= STANDSTILL_TIME_S and self.missed == 0
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return the fault of a drive that still has power `seconds` [s] after `wanted`, as "quick stop".
+        """Return the fault of a drive that still has power `seconds` [s] after the command `wanted`, such as "quick
+        stop".
 
-        A drive in fault, or not operational, has another fault already.
+        A drive in fault, or not operational, already has another fault.
         """
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None
@@ -412,7 +425,7 @@ class Cia402Axis(Axis):
         return self.make_fault("timeout", 0, text)
 
     def find_fault(self, now: float, wanted: canopen_frames.TargetState) -> DriveFault | None:
-        """Return the drive's fault at time `now` [s], if it is commanded to the state `wanted`."""
+        """Return the drive's fault at time `now` [s]; `wanted` is the state that it is commanded to."""
         if self.event is not None:
             return self.event
         if self.state in _IN_FAULT:
@@ -422,7 +435,7 @@ class Cia402Axis(Axis):
                 return self.make_fault("fault", self.error_code, f"{self.state}{reason}")
         elif (
             self.error_code and now >= self._register_until
-        ):  # CiA 301: in force until the drive sends "error reset", code 00xxh
+        ):  # CiA 301: the error persists until the drive sends "error reset", code 00xxh
             return self.make_fault(
                 "emcy", self.error_code, f"emergency {describe_error(self.error_code, ' is still in force')}"
             )
@@ -441,7 +454,9 @@ class Cia402Axis(Axis):
         return None
 
     def _following_fault(self, now: float, wanted: canopen_frames.TargetState) -> DriveFault | None:
-        """Check bit 12 of the statusword: setpoints are followed, not ignored (CiA 402-2, modes 7 and 8)."""
+        """Check bit 12 of the statusword, which shows whether setpoints are followed or ignored (CiA 402-2, modes 7 and
+        8).
+        """
         if (waited := self.mode.waited(now, awaited=self.awaits_mode)) is not None:
             return self.make_fault("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it got power")
         enabled = wanted is self.state is PowerState.OPERATION_ENABLED

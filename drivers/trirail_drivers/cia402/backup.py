@@ -1,4 +1,4 @@
-"""Saving and restoring of all parameters of drives, for `trirail drives save`, `compare` and `restore`."""
+"""Saving and restoring of all drive parameters, for `trirail drives save`, `compare` and `restore`."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ from trirail_drivers.errors import DriveError, DriveTimeout
 from trirail_drivers.interface import NAMES, Clock, PowerState
 
 LISTEN_TIME_S: Final = 0.5
-"""Shortest time of listening for another master before the first frame is sent; at least three heartbeats."""
+"""Shortest time spent listening for another master before the first frame is sent [s]; at least three heartbeats."""
 MAX_TIMEOUTS: Final = 3
-"""Number of consecutive unanswered requests after which a drive counts as gone."""
+"""Number of consecutive unanswered requests after which a drive counts as lost."""
 MAX_WRITE_ROUNDS: Final = 3
-"""Largest number of passes over differing values: writing one may change another."""
+"""Maximum number of passes over differing values: writing one value may change another."""
 STORE_TIMEOUT_S: Final = 20.0
-"""Longest time of storing parameters: the drive answers at the end (CiA 301, 1010h)."""
+"""Longest time to store parameters [s]: the drive answers only when it has finished (CiA 301, 1010h)."""
 _STORE: Final[Key] = 0x1010, 1
 _SAVE: Final = b"save"
 _SDO_CHANNELS: Final = range(0x1200, 0x1300)
-"""SDO parameters of CiA 301: their identifiers follow the node id."""
+"""SDO parameters of CiA 301, whose identifiers depend on the node id."""
 _POWERED: Final = (*HAS_POWER, PowerState.FAULT_REACTION_ACTIVE, None)
-"""States with power; None is a statusword without a CiA 402 state."""
+"""States with power; None stands for a statusword that encodes no CiA 402 state."""
 
 T = TypeVar("T")
 
 
 class UnrestoredParameter(NamedTuple):
-    """A parameter of a file that differs in the drive after a restore."""
+    """Parameter of a file that still differs in the drive after a restore."""
 
     different: ParameterDifference
-    """Values of file and drive."""
+    """Values in the file and in the drive."""
     why: str
     intended: bool
-    """Whether it was skipped on purpose: the set-up writes it, or it is node id or bitrate."""
+    """Whether the parameter was skipped on purpose, because the set-up writes it or it is the node id or bit rate."""
 
 
 class RestoreResult(NamedTuple):
@@ -65,7 +65,7 @@ class RestoreResult(NamedTuple):
     left: tuple[UnrestoredParameter, ...]
     stored: bool
     not_stored: str
-    """Reason for which they were not stored as requested, or ""."""
+    """Reason why the parameters were not stored as requested, or ""."""
 
     @property
     def ok(self) -> bool:
@@ -76,7 +76,7 @@ class RestoreResult(NamedTuple):
 def save(
     bus: can.BusABC, drives: Drives, clock: Clock, names: Sequence[str] = NAMES
 ) -> dict[str, SavedParameters | DriveError]:
-    """Read the parameters of the named drives concurrently; nothing is written.
+    """Read the parameters of the named drives concurrently, without writing anything.
 
     Raises DriveError if another master is on the bus.
     """
@@ -96,9 +96,10 @@ def restore(
 ) -> RestoreResult:
     """Write the parameters that differ from a file, read each back, and report the remaining differences.
 
-    Objects that the set-up writes, node id and bitrate are skipped. The drive must be the file's product; with
-    `replace` it may have another revision, serial number or node id. With `store` the drive stores the parameters
-    (1010h) once all are restored. Raises DriveError if the drive has power, or another master is on the bus.
+    Objects that the set-up writes, the node id and the bit rate are skipped. The drive must be the same product as in
+    the file; with `replace`, its revision, serial number or node id may differ. With `store`, the drive stores the
+    parameters (1010h) once all are restored. Raises DriveError if the drive has power, or if another master is on the
+    bus.
     """
     begun = _Progress()
     (result,) = _run_conversations(
@@ -115,7 +116,7 @@ def restore(
 
 
 class _Progress:
-    """Progress of each drive: objects done, and their total."""
+    """Progress of each drive: number of finished objects, and their total number."""
 
     def __init__(self) -> None:
         self.doing = "reading parameters"
@@ -133,7 +134,7 @@ def _run_conversations(
     progress: _Progress,
     conversation: Callable[[Remote, Drive], Coroutine[Any, Any, T]],
 ) -> dict[str, T | DriveError]:
-    """Run a conversation with each named drive, as long as no other master sends."""
+    """Run a conversation with each named drive, unless another master sends frames."""
     of = dict(zip(NAMES, drives.each, strict=True))
     with ExclusiveBus(bus, [drive.node for drive in drives.each], drives.master_node) as watched:
         remotes = [remote for remote in setup.remotes(watched, drives, clock) if remote.name in names]
@@ -176,7 +177,7 @@ async def _save(remote: Remote, drive: Drive, progress: _Progress) -> SavedParam
 
 
 async def _extend_arrays(remote: Remote) -> None:
-    """Add the array elements that the EDS leaves out to the dictionary: the drive reports their number (CiA 301)."""
+    """Add array elements that the EDS omits to the dictionary; the drive reports their number (CiA 301)."""
     for index, item in remote.client.od.items():
         if isinstance(item, ODArray) and 1 in item.subindices and is_parameter(item.subindices[1]):
             for subindex in range(1, (await remote.peek(index) or 0) + 1):
@@ -222,13 +223,13 @@ async def _restore(
 async def _write(
     remote: Remote, intended: Mapping[Key, Parameter], progress: _Progress
 ) -> tuple[list[Key], dict[Key, str]]:
-    """Write differing parameters; refused ones are tried again after the others, which may have blocked them.
+    """Write differing parameters. Refused parameters are tried again after the others, which may have blocked them.
 
-    Return the written objects, and the reasons for the others.
+    Return the objects that were written, and the reasons why the others were not.
     """
     held = await _read_held(remote, intended, progress)
     due = [key for key, each in intended.items() if key not in held or held[key].data != each.data]
-    for key in due:  # at the first round, before anything is written
+    for key in due:  # in the first round, before anything is written
         size = len(held[key].data) if key in held else len(intended[key].data)
         if intended[key].fixed_size and size != len(intended[key].data):
             raise DriveError(
@@ -253,7 +254,7 @@ async def _write(
 
 
 async def _write_one(remote: Remote, key: Key, wanted: Parameter, held: Parameter | None) -> str:
-    """Write one object and read it back; return the reason for which the drive does not hold it, or ""."""
+    """Write one object and read it back; return the reason why the drive does not hold the value, or ""."""
     if held is None:
         return "the drive does not let it be read"
     try:
@@ -268,7 +269,7 @@ async def _write_one(remote: Remote, key: Key, wanted: Parameter, held: Paramete
 
 
 async def _read_held(remote: Remote, parameters: Mapping[Key, Parameter], progress: _Progress) -> dict[Key, Parameter]:
-    """Return the current values of those parameters that the drive lets be read."""
+    """Return the current values of those parameters that can be read from the drive."""
     progress.doing = "reading parameters"
     held = {}
     for number, (key, each) in enumerate(parameters.items()):
@@ -281,7 +282,7 @@ async def _read_held(remote: Remote, parameters: Mapping[Key, Parameter], progre
 
 
 def _skip_reason(remote: Remote, drive: Drive, key: Key, saved: Parameter, of_file: Origin, of_drive: Origin) -> str:
-    """Return the reason for which a parameter is skipped, or ""."""
+    """Return the reason why a parameter is skipped, or ""."""
     variable = remote.client.od.get_variable(*key) if drive.eds else None
     if variable is not None and not is_parameter(variable):
         return "is no parameter of the drive"
@@ -292,7 +293,7 @@ def _skip_reason(remote: Remote, drive: Drive, key: Key, saved: Parameter, of_fi
 
 
 def _check(name: str, of_file: Origin, of_drive: Origin, *, replace: bool) -> None:
-    """Raise DriveError for a file of another product and, unless `replace`, for one of another drive."""
+    """Raise DriveError if the file belongs to another product or, unless `replace`, to another drive."""
     others = []
     for field in ("device_type", "vendor", "product", "revision", "serial", "node"):
         theirs, mine = getattr(of_file, field), getattr(of_drive, field)
@@ -321,7 +322,7 @@ async def _check_without_power(remote: Remote) -> None:
 
 
 async def _store(remote: Remote) -> str:
-    """Let the drive store its parameters; return the reason for which it does not, or ""."""
+    """Let the drive store its parameters; return the reason why it does not, or ""."""
     await _check_without_power(remote)
     client = remote.client
     patience, client.timeout = client.timeout, max(client.timeout, STORE_TIMEOUT_S)

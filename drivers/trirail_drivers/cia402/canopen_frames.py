@@ -9,7 +9,7 @@ from trirail_drivers.bus.frames import Frame, frame_bits
 from trirail_drivers.bus.load import Traffic
 from trirail_drivers.interface import PowerState
 
-# Identifiers of the predefined connection set (CiA 301); all but the first two are bases for a node id.
+# Identifiers of the predefined connection set (CiA 301); all but the first two are added to a node id.
 NMT: Final = 0x000
 SYNC: Final = 0x080
 EMCY: Final = 0x080
@@ -24,7 +24,7 @@ SDO_REQUEST: Final = 0x600
 HEARTBEAT: Final = 0x700
 
 NMT_COMMAND: Final = Struct("<BB")
-"""Command and node id."""
+"""NMT command: command specifier and node id."""
 SETPOINT: Final = Struct("<ii")
 """RPDO2: target position 607Ah [counts] and velocity offset 60B1h [counts/s]."""
 POSITION: Final = Struct("<i")
@@ -36,30 +36,30 @@ STATUSWORD: Final = Struct("<H")
 OUTPUTS: Final = Struct("<I")
 """RPDO3: digital outputs 60FEh:01."""
 INPUTS: Final = Struct("<I")
-"""Digital inputs 60FDh: in TPDO1 behind the statusword, or in TPDO3."""
+"""Digital inputs 60FDh: in TPDO1 after the statusword, or in TPDO3."""
 EMERGENCY: Final = Struct("<HB5s")
-"""Error code, error register 1001h, manufacturer-specific bytes."""
+"""EMCY: error code, error register 1001h, manufacturer-specific bytes."""
 NMT_STATE: Final = Struct("<B")
-"""Heartbeat and boot-up: the sender's NMT state."""
+"""Heartbeat and boot-up message: the sender's NMT state."""
 
 STATUSWORD_UPLOAD: Final = b"\x40\x41\x60\x00" + bytes(4)
 """SDO request for the statusword 6041h."""
 ERROR_REGISTER_UPLOAD: Final = b"\x40\x01\x10\x00" + bytes(4)
 """SDO request for the error register 1001h."""
 ERROR_REGISTER_UPLOADED: Final = b"\x4f\x01\x10\x00"
-"""Beginning of its answer; the byte of the register follows."""
+"""First bytes of the answer to ERROR_REGISTER_UPLOAD; the register's byte follows."""
 MODE_DISPLAY_UPLOAD: Final = b"\x40\x61\x60\x00" + bytes(4)
 """SDO request for the modes of operation display 6061h."""
 CONTROLWORD_DOWNLOAD: Final = b"\x2b\x40\x60\x00"
-"""Beginning of the SDO that writes the controlword 6040h; its two bytes and two empty ones follow."""
+"""First bytes of the SDO request that writes the controlword 6040h; its two bytes and two padding bytes follow."""
 OUTPUTS_DOWNLOAD: Final = b"\x23\xfe\x60\x01"
-"""Beginning of the SDO that writes the digital outputs 60FEh:01; their four bytes follow."""
+"""First bytes of the SDO request that writes the digital outputs 60FEh:01; their four bytes follow."""
 OUTPUTS_REFUSED: Final = b"\x80\xfe\x60\x01"
-"""Beginning of the answer that refuses it; the abort code follows."""
+"""First bytes of the SDO answer that refuses the digital outputs; the abort code follows."""
 MODE_DISPLAY_UPLOADED: Final = b"\x4f\x61\x60\x00"
-"""Beginning of the answer with the mode display; the byte of the mode follows."""
+"""First bytes of the SDO answer with the mode display; the mode's byte follows."""
 STATUSWORD_UPLOADED: Final = b"\x4b\x41\x60\x00"
-"""Beginning of the answer with the statusword; its two bytes follow."""
+"""First bytes of the SDO answer with the statusword; its two bytes follow."""
 
 NMT_START: Final = 0x01
 NMT_PRE_OPERATIONAL: Final = 0x80
@@ -78,9 +78,9 @@ SWITCH_ON: Final = 0x07
 ENABLE_OPERATION: Final = 0x0F
 FAULT_RESET: Final = 0x80
 HOMING_START: Final = 0x10
-"""Bit 4 in homing mode, beside ENABLE_OPERATION."""
+"""Bit 4 in homing mode, in addition to ENABLE_OPERATION."""
 HALT: Final = 0x100
-"""Bit 8: stop and hold, with power."""
+"""Bit 8: stop and hold the position, with power."""
 
 STATUS_PERIOD: Final = 0.1
 """Period in which a drive repeats an unchanged statusword: event timer 1800h:05 [s]."""
@@ -88,9 +88,9 @@ STATUS_PERIOD: Final = 0.1
 POLL_PERIOD: Final = 0.02
 """Period of requests for a statusword that no PDO repeats [s]."""
 INTERPOLATE: Final = 0x10
-"""Bit 4 in interpolated position mode, beside ENABLE_OPERATION."""
+"""Bit 4 in interpolated position mode, in addition to ENABLE_OPERATION."""
 FOLLOWS_SETPOINTS: Final = 1 << 12
-"""Statusword bit of a drive that follows setpoints: modes 8 and 7."""
+"""Statusword bit that shows that a drive follows setpoints, in modes 8 and 7."""
 
 # CiA 402-2, statusword coding: mask 4Fh (bit 5 is free) for the first four states, 6Fh for the others.
 _STATES: Final = {
@@ -108,7 +108,7 @@ _STATES: Final = {
     0x07: PowerState.QUICK_STOP_ACTIVE,
 }
 
-# A quick stop is not interrupted: it ends by itself in switch on disabled (605Ah = 2), or see Cia402Axis.word.
+# A quick stop is not interrupted: it ends by itself in switch on disabled (605Ah = 2); otherwise, see Cia402Axis.word.
 _TOWARDS_OPERATION: Final = {
     PowerState.SWITCH_ON_DISABLED: SHUTDOWN,
     PowerState.READY_TO_SWITCH_ON: SWITCH_ON,
@@ -118,7 +118,7 @@ _TOWARDS_OPERATION: Final = {
 }
 
 TargetState = Literal[PowerState.SWITCH_ON_DISABLED, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE]
-"""States that can be commanded; the others are transitional, or the drive's own."""
+"""States that can be commanded; the drive passes through or enters all others by itself."""
 
 
 def nmt(command: int, node: int) -> Frame:
@@ -127,7 +127,7 @@ def nmt(command: int, node: int) -> Frame:
 
 
 def power_state(statusword: int) -> PowerState | None:
-    """Decode statusword 6041h; None if its bits code no CiA 402 state."""
+    """Decode statusword 6041h; return None if its bits encode no CiA 402 state."""
     return _STATES.get(statusword & 0x6F)
 
 
@@ -141,7 +141,7 @@ def controlword(state: PowerState, wanted: TargetState) -> int:
 
 
 def _background(heartbeat: float) -> float:
-    """Return the bits per second of repeated statuswords and of four heartbeats of this period [s]."""
+    """Return the bits per second of repeated statuswords and of four heartbeats with this period [s]."""
     return 3 * frame_bits(STATUSWORD.size) / STATUS_PERIOD + 4 * frame_bits(NMT_STATE.size) / heartbeat
 
 
@@ -151,5 +151,8 @@ TRAFFIC: Final = Traffic(
     most_sent=11,
     output_bits=frame_bits(OUTPUTS.size),
 )
-"""One cycle: SYNC, three setpoints, three positions. At most the service sends SYNC, a heartbeat, three setpoints, and
-three controlwords both before and after them."""
+"""Traffic of one cycle: SYNC, three setpoints, three positions.
+
+In one cycle, the service sends at most SYNC, a heartbeat, three setpoints, and three controlwords both before and after
+the setpoints.
+"""

@@ -15,7 +15,7 @@ from trirail_drivers.interface import NAMES
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield checks for settings that a drive does not have, or whose values it cannot take or resolve."""
+    """Yield checks for settings that a drive does not have, or whose values it cannot accept or resolve."""
     nodes = tuple(f"drives.{name}.node" for name in NAMES)
     yield Rule("drives.master_node", nodes, partial(settings.check_nodes, drives))
     for name, drive in zip(NAMES, drives.each, strict=True):
@@ -38,7 +38,7 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
 
 
 def files(drives: Drives) -> Iterator[Rule]:
-    """Yield checks for an EDS that is missing or invalid."""
+    """Yield checks that report a missing or invalid EDS."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.eds is not None:
             yield Rule(f"drives.{name}.eds", (), partial(_check_eds, name, drive))
@@ -65,7 +65,7 @@ def _check_window(name: str, drive: Drive, drives: Drives) -> None:
 
 
 def _check_velocity(name: str, drive: Drive, required: Requirements) -> None:
-    """Check that the velocity limit fits the configured unit: a 32-bit integer other than 0."""
+    """Check that the velocity limit is a non-zero 32-bit integer in the configured unit."""
     key = f"drives.{name}.velocity_unit"
     unit = units.parse_unit(key, drive.velocity_unit, 1) if drive.velocity_unit is not None else None
     per_metre = unit.per_metre(drive.counts_per_metre, drive.revolutions_per_metre) if unit is not None else None
@@ -82,7 +82,7 @@ def _check_counts(name: str, drive: Drive, required: Requirements) -> None:
     scale, leg = scale_of(name, drive), NAMES.index(name)
     low, high, velocity = required.low[leg], required.high[leg], required.velocity[leg]
     reach = max(abs(scale.exact(low)), abs(scale.exact(high)))
-    # A position may exceed the travel by a following error, and a velocity its limit by a little.
+    # A position may exceed the travel by the following error, and a velocity may slightly exceed its limit.
     if reach + drive.counts_per_metre * required.following_error >= INT32_MAX:
         raise DriveError(
             f"drives.{name}.counts_per_metre = {drive.counts_per_metre:g}, offset = {drive.offset:g}: "

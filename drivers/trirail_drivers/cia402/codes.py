@@ -1,7 +1,7 @@
-"""Error codes of EMCY and object 603Fh in words, with remedies.
+"""Descriptions of the error codes in EMCY and object 603Fh, with remedies.
 
-CiA 301, table "emergency error code classes", and CiA 402-2 (IEC 61800-7-201), table of error codes. A code in
-neither table is described by the class of its first digits; FFxxh are the maker's own.
+The sources are CiA 301, table "emergency error code classes", and CiA 402-2 (IEC 61800-7-201), table of error codes. A
+code in neither table is described by the class of its first digits; codes FFxxh are manufacturer-specific.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ _CODES = {
     0x8A00: "control",
     0xF001: "deceleration",
 }
-"""Most common codes of makers; others are described by their class."""
+"""Codes that manufacturers use most; other codes are described by their class."""
 
 _CLASSES = {
     0x10: "generic error",
@@ -164,7 +164,7 @@ _DEFAULT_REMEDY = "see the drive's manual"
 
 
 def describe_error(code: int, also: str = "") -> str:
-    """Return an error code [0, FFFFh] as a hexadecimal number with its meaning, the text `also`, and a remedy."""
+    """Describe an error code [0, FFFFh]: a hexadecimal number with its meaning, the text `also`, and a remedy."""
     meaning = _CODES.get(code) or _by_class(_CLASSES, code) or _UNKNOWN_CLASS
     remedy = _REMEDIES.get(code) or _by_class(_REMEDIES, code) or _DEFAULT_REMEDY
     return f"0x{code:04X} ({meaning}){also}; {remedy}"

@@ -1,4 +1,7 @@
-"""Differences between a drive's objects and the required values: read first, write only differences, record them."""
+"""Differences between a drive's objects and the required values.
+
+Objects are read first; only differences are written.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,10 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 
 class Difference(NamedTuple):
-    """Value to change in a drive."""
+    """Value that must be changed in a drive."""
 
     object: str
-    """Index and subindex, as 6085:00."""
+    """Index and subindex, such as 6085:00."""
     name: str
     found: str
     """Current value; "" if it cannot be read."""
@@ -24,7 +27,7 @@ class Difference(NamedTuple):
 
 
 class Differences:
-    """Writer of one drive's differing objects."""
+    """Writer that corrects and records the differing objects of one drive."""
 
     def __init__(self, remote: Remote) -> None:
         self.remote = remote
@@ -35,9 +38,11 @@ class Differences:
         """Missing protections by their names in PROTECTIONS, each with the reason."""
 
     async def ensure(self, index: int, subindex: int, value: int, also: Sequence[int] = ()) -> int | None:
-        """Write an object unless it holds a value, or one of those in `also`; return the value that it holds, or None.
+        """Write an object unless it holds `value` or one of the values in `also`; return the value that it holds, or
+        None.
 
-        Raises SdoRefused if a needed object is not accepted, ConfigurationRefused if another value is read back.
+        Raises SdoRefused if the drive does not accept a needed object, and ConfigurationRefused if another value is
+        read back.
         """
         key = index, subindex
         if not await self.remote.has(*key):
@@ -62,7 +67,7 @@ class Differences:
         return None
 
     async def try_ensure(self, key: Key, value: int) -> bool:
-        """Write an object unless it holds a value; return whether the drive accepts it."""
+        """Write an object unless it already holds the value; return whether the drive accepts it."""
         current = await self.remote.peek(*key)
         if current is None or not same(*key, current, value):
             try:
@@ -72,13 +77,19 @@ class Differences:
         return True
 
     async def put(self, key: Key, current: int | None, value: int, why: str = "") -> None:
-        """Write an object, record that, and read it back; SdoRefused if it is not accepted, and as `confirm`."""
+        """Write an object, record the change, and read the value back.
+
+        Raises SdoRefused if the drive does not accept the value, and the errors of `confirm`.
+        """
         await self.remote.write(*key, value)
         self.note(key, current, value, why)
         await self.confirm(key, value)
 
     async def confirm(self, key: Key, value: int) -> None:
-        """Read a written value back; ConfigurationRefused if it stays another one. An unreadable object passes."""
+        """Read a written value back. An object that cannot be read counts as confirmed.
+
+        Raises ConfigurationRefused if the object keeps a different value.
+        """
         read, waited = await self.remote.wait_until(key, lambda current: same(*key, current, value))
         if read is not None and not same(*key, read, value):
             name = self.remote.name_of(key)
@@ -114,12 +125,12 @@ class Differences:
             self.add_note(f"{title(key)}, for {used.purpose}: {reason}; instead: {used.without}")
 
     def add_note(self, text: str) -> None:
-        """Add a note on a deviation, once."""
+        """Add a note about a deviation, unless it has already been added."""
         if text not in self.notes:
             self.notes.append(text)
 
     def refusal(self, accepted: Sequence[str]) -> str:
-        """Return the refusal for missing protections that are not `accepted`, or ""; add notes on the accepted ones."""
+        """Return the refusal for missing protections that are not `accepted`, or ""; add notes about accepted ones."""
         refused, notes = review_protections(self.remote.name, self.missing_protections, accepted, PROTECTIONS)
         for text in notes:
             self.add_note(text)

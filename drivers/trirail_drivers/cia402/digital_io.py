@@ -1,4 +1,4 @@
-"""Set-up of a drive's digital outputs 60FEh and check of its digital inputs 60FDh (CiA 402-2)."""
+"""Set-up of a drive's digital outputs 60FEh, and check of its digital inputs 60FDh (CiA 402-2)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ MASK: Final[Key] = 0x60FE, 2
 async def configure_outputs(drive: Differences, io: DigitalIo) -> int:
     """Write the safe values of the outputs, and allow exactly these bits; return the bits that must be kept.
 
-    A drive without the mask 60FEh:02, which is optional, would take every bit: its other bits are kept as they are.
+    The mask 60FEh:02 is optional. A drive without it would apply every bit, so its other bits are kept as they are.
 
-    Raises DriveError if the drive lacks 60FEh:01, or if bits read back differently: those are the maker's.
+    Raises DriveError if the drive lacks 60FEh:01, or if bits read back differently because the manufacturer reserves
+    them.
     """
     if not io.outputs:
         return 0
@@ -30,13 +31,13 @@ async def configure_outputs(drive: Differences, io: DigitalIo) -> int:
     current = await remote.peek(*OUTPUTS)
     has_mask = await remote.has(*MASK)
     kept = 0 if has_mask else (current or 0) & ~io.outputs
-    # The value first: with the new mask it takes effect.
+    # The value is written first, since it takes effect as soon as the new mask is written.
     await _write(drive, OUTPUTS, kept | io.safe, io.outputs, "safe values")
     if has_mask:
         await _write(drive, MASK, io.outputs, 0xFFFF_FFFF, "the named outputs, and no others")
     held, _ = await remote.wait_until(OUTPUTS, lambda value: not (value ^ io.safe) & io.outputs)
     if held is not None and (held ^ io.safe) & io.outputs:
-        # Some drives show, or store, only the bits that the mask allowed at the time of the write.
+        # Some drives show or store only the bits that the mask allowed at the time of the write.
         await remote.write(*OUTPUTS, kept | io.safe)
         held, _ = await remote.wait_until(OUTPUTS, lambda value: not (value ^ io.safe) & io.outputs)
         _refuse_differing(drive, OUTPUTS, held, io.safe, io.outputs)
@@ -50,7 +51,7 @@ async def check_inputs(drive: Differences) -> None:
 
 
 async def _write(drive: Differences, key: Key, value: int, bits: int, why: str) -> None:
-    """Write an object unless it holds a value in these bits; DriveError if a mask reads back differently."""
+    """Write an object unless these bits already hold the value. Raises DriveError if a mask reads back differently."""
     remote = drive.remote
     current = await remote.peek(*key)
     if current is not None and not (current ^ value) & bits:
@@ -66,7 +67,7 @@ async def _write(drive: Differences, key: Key, value: int, bits: int, why: str) 
 
 
 def _refuse_differing(drive: Differences, key: Key, held: int | None, wanted: int, bits: int) -> None:
-    """Raise DriveError if an object, which may be unreadable, holds other values of these bits."""
+    """Raise DriveError if these bits of an object, which may be unreadable, hold a different value."""
     differing = 0 if held is None else (held ^ wanted) & bits
     if not differing or held is None:
         return

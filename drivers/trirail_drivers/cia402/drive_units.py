@@ -1,4 +1,4 @@
-"""Reading of a drive's units, checked against the configuration: 60A8h to 60AAh, 608Fh to 6097h."""
+"""Reading of a drive's units, which are checked against the configuration: 60A8h to 60AAh, 608Fh to 6097h."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from trirail_drivers.driver.scaling import Scale
 from trirail_drivers.errors import DriveError
 
 TOLERANCE: Final = 0.01
-"""Largest relative difference between configured counts or revolutions per metre and the drive's own."""
+"""Largest relative difference between the configured counts or revolutions per metre and those of the drive."""
 
 _IN_COUNTS: Final = {0x60A9: 0x00B5_0300, 0x60AA: 0x00B5_5700}
-"""Increments per second, and per second squared."""
+"""Codes of the units increments per second, and increments per second squared."""
 _KEYS: Final = {0x60A9: "velocity_unit", 0x60AA: "acceleration_unit"}
 _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
 
@@ -33,8 +33,8 @@ _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
 async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
     """Return the units of a drive whose positions have a `scale`.
 
-    Raises DriveError if the drive contradicts its configuration, or if neither defines a required unit: that of the
-    velocity offset or the quick-stop ramp.
+    Raises DriveError if the drive contradicts its configuration, or if neither of them defines a required unit, which
+    may be that of the velocity offset or of the quick-stop ramp.
     """
     remote, counts = drive.remote, abs(scale.counts_per_metre)
     revolutions = await _revolutions(remote, config, counts)
@@ -56,7 +56,7 @@ def _per_metre(unit: Unit | None, counts: float, revolutions: float | None) -> f
 
 
 async def _revolutions(remote: Remote, config: Drive, counts: float) -> float | None:
-    """Return the revolutions per metre, from the configuration or the drive's own objects."""
+    """Return the revolutions per metre, from the configuration or from the drive's own objects."""
     derived, source = None, ""
     reported = await remote.peek(0x60A8)
     unit = position_unit(reported) if reported is not None else None
@@ -105,7 +105,7 @@ async def _unit(
     decoded: Callable[[int], Unit | None],
     velocity: Unit | None = None,
 ) -> Unit | None:
-    """Return the drive's unit, checked against the configuration, or else the configured one, or None."""
+    """Return the drive's unit, checked against the configuration; otherwise the configured unit, or None."""
     remote, key = drive.remote, _KEYS[index]
     text = config.velocity_unit if index == 0x60A9 else config.acceleration_unit
     configured = (
@@ -135,7 +135,7 @@ async def _unit(
 
 
 async def _unit_from_factor(remote: Remote, index: int, velocity: Unit | None) -> Unit | None:
-    """Return the unit of 6096h or 6097h: counts per second, or velocity per second, * divisor / numerator."""
+    """Return the unit given by 6096h or 6097h: counts per second, or velocity per second, * divisor / numerator."""
     factor = await _ratio(remote, _FACTORS[index])
     if factor is None:
         return None
@@ -147,7 +147,7 @@ async def _unit_from_factor(remote: Remote, index: int, velocity: Unit | None) -
 
 
 async def _switch_to_counts(drive: Differences, index: int, reported: Unit) -> Unit:
-    """Set the drive's unit to counts, since its own is unknown in metres."""
+    """Set the drive's unit to counts, because its present unit cannot be converted to metres."""
     wanted = Unit(UnitBase.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
     code, remote = _IN_COUNTS[index], drive.remote
     drive.note((index, 0), await remote.peek(index), code, "its unit, since its revolutions per metre are unknown")

@@ -1,7 +1,7 @@
-"""Three CiA 402 drives on CANopen that follow positions, and homing: trirail_drivers.interface.DriveGroup.
+"""Three CiA 402 drives on CANopen that follow positions, and their homing: trirail_drivers.interface.DriveGroup.
 
-The identifiers give the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
-setpoints, heartbeats. So the controlword of a quick stop overtakes setpoints that still wait.
+The identifiers determine the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
+setpoints, heartbeats. Thus the controlword of a quick stop overtakes setpoints that are still waiting.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
-"""SYNCs after which a controlword without effect is sent again: the frame may be lost."""
+"""Number of SYNCs after which a controlword without effect is sent again, since the frame may have been lost."""
 
 
 class Cia402(Driver[Cia402Axis]):
@@ -48,7 +48,7 @@ class Cia402(Driver[Cia402Axis]):
         reopening: Reopening | None = None,
         io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
-        """`reopening` reopens a lost bus; `io`: digital outputs and inputs of each drive."""
+        """`reopening` reopens a lost bus; `io` contains the digital outputs and inputs of each drive."""
         super().__init__(bus, bitrate, drives, clock, Cia402Axis, reopening=reopening, io=io)
         self._other_masters = OtherMasters(self._wire, self._axes, drives.master_node)
         for axis in self._axes:
@@ -66,17 +66,17 @@ class Cia402(Driver[Cia402Axis]):
         self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
         self._lent_state: list[tuple[int, int, int]] = []
-        """Controlwords, statuswords and inputs for which the tables are filled."""
+        """Controlwords, statuswords and inputs for which the tables have been filled."""
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
-        """Set the drives up for a cycle of `period` seconds, read every value back, start them without power.
+        """Set up the drives for a cycle of `period` seconds, read every value back, and start the drives without power.
 
         With `awaits`, drives that do not answer latch a fault and are configured when they appear; a missing bus
         latches a fault and is opened when it appears.
 
-        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout, ConfigurationRefused, or
-        DriveError if a drive's unit of velocity does not fit the sliders' limit `fastest` [m/s], if that is given.
-        A drive in fault raises nothing: the feedback reports it and `reset` clears it.
+        Raises BusError if the cycle does not fit on the bus, DriveTimeout, ConfigurationRefused, or DriveError if a
+        drive's unit of velocity does not fit `fastest`, the velocity limit of the sliders [m/s], if given. A drive in
+        fault does not raise: the feedback reports the fault and `reset` clears it.
         """
         self._set_period(period, process_data.traffic(axis.exchange for axis in self._axes))
         scales = tuple(axis.scale for axis in self._axes)
@@ -104,7 +104,7 @@ class Cia402(Driver[Cia402Axis]):
         self._report_absent(lost)
 
     def _apply_start(self, axis: Cia402Axis, start: Start) -> None:
-        """Adopt the state that a drive had at the end of its set-up."""
+        """Take over the state that a drive had at the end of its set-up."""
         self._listen(axis)
         axis.update_position(start.counts)
         axis.inputs = start.inputs & axis.io.inputs
@@ -140,16 +140,16 @@ class Cia402(Driver[Cia402Axis]):
         self._other_masters.listen_to(axis)
 
     def sync(self) -> None:
-        """Send SYNC: the drives adopt the setpoints written since the last one, and sample their positions.
+        """Send SYNC: the drives apply the setpoints written since the last SYNC, and sample their positions.
 
-        Frames that have arrived are handled first: positions among them answer the previous SYNC.
+        Frames that have already arrived are handled first, since positions among them answer the previous SYNC.
         """
         self._stopped_in_this_cycle = False
         now = self._synced = self._clock()
         self._begin_cycle(now)
         self._wire.receive(now)
         if self._heartbeat_due is None:
-            # The drives' watchdogs and ours start with the first cycle, however long ago the set-up was.
+            # The watchdogs of drives and service start with the first cycle, no matter how long ago the set-up was.
             self._heartbeat_due = now
             for axis in self._axes:
                 axis.status_heard = now
@@ -157,7 +157,7 @@ class Cia402(Driver[Cia402Axis]):
         self._begin(now, self._heartbeat_due)
 
     def _begin(self, now: float, heartbeat_due: float, sent: int = 0) -> None:
-        """Send SYNC and due heartbeats, without the first `sent` of these frames, which are on the bus."""
+        """Send SYNC and due heartbeats, except the first `sent` of these frames, which are already on the bus."""
         frames_due = [self._sync]
         if now >= heartbeat_due:
             self._heartbeat_due = now + self._drives.heartbeat
@@ -169,7 +169,7 @@ class Cia402(Driver[Cia402Axis]):
             axis.command_age += 1
 
     def read(self) -> Feedback:
-        """Handle every frame that has arrived; return the feedback."""
+        """Handle every frame that has arrived, and return the feedback."""
         now = self._clock()
         self._wire.receive(now)
         for axis in self._axes:
@@ -210,11 +210,11 @@ class Cia402(Driver[Cia402Axis]):
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Send setpoints [m] and velocity feed-forward [m/s], which the drives adopt at the next SYNC.
+        """Send setpoints [m] and velocity feed-forward [m/s], which the drives apply at the next SYNC.
 
-        Setpoints that are not finite or beyond 32-bit counts latch a fault of cause "setpoint" instead. The next
-        controlwords of powering up follow the setpoints, so that no drive gets power without one. Outputs follow last,
-        also without setpoints.
+        Setpoints that are not finite or exceed 32-bit counts latch a fault with cause "setpoint" instead. During
+        power-up, the next controlwords are sent after the setpoints, so that no drive gets power without a setpoint.
+        Outputs are sent last, even if there are no setpoints.
         """
         if not self._stopped_in_this_cycle:
             self._write_setpoints(position, velocity)
@@ -223,7 +223,7 @@ class Cia402(Driver[Cia402Axis]):
     def _write_setpoints(self, position: Triple, velocity: Triple) -> None:
         late = self._clock() - self._synced > self._period
         if self._wanted is not PowerState.OPERATION_ENABLED:
-            self._command()  # if frames have to wait, stop commands go first
+            self._command()  # if frames have to wait, stop commands are sent first
         for axis, frame, metres, rate in zip(self._axes, self._setpoints, position, velocity, strict=True):
             if not axis.configured:
                 continue
@@ -249,13 +249,15 @@ class Cia402(Driver[Cia402Axis]):
         self._recover()
 
     def _output_frames(self) -> tuple[Frame, ...]:
-        """Return a frame of outputs for each drive, or none if no drive takes its outputs by a frame."""
+        """Return a frame of outputs for each drive, or no frames if no drive receives its outputs in a frame."""
         if not any(axis.maps_outputs for axis in self._axes):
             return ()
         return tuple(Frame(axis.exchange.outputs or 0, bytes(canopen_frames.OUTPUTS.size)) for axis in self._axes)
 
     def _send_outputs(self) -> None:
-        """Send outputs that differ from those sent last; the drives adopt them at the next SYNC, or by SDO."""
+        """Send outputs that differ from those sent last; the drives apply them at the next SYNC or, if sent by SDO, on
+        receipt.
+        """
         for number, axis in enumerate(self._axes):
             if not (axis.outputs_pending and axis.configured):
                 continue
@@ -284,7 +286,7 @@ class Cia402(Driver[Cia402Axis]):
             self._wire.wait(left, self._clock)
 
     def lend(self) -> Cyclic | None:
-        """Return the tables of a cycle; None unless every drive is in its target state and nothing else is pending."""
+        """Return the tables of a cycle, or None unless all drives are in their target states and nothing is pending."""
         due = self._heartbeat_due
         if due is None or not (self._wire.is_healthy and self._homing.idle) or self._period == 0.0:
             return None
@@ -310,7 +312,7 @@ class Cia402(Driver[Cia402Axis]):
         return lent
 
     def take_back(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
-        """Continue from the tables: see trirail_drivers.driver.cyclic.Lender."""
+        """Continue from the tables; see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._heartbeat_due = float(times["beat_due"])
         self._wire.return_frames(self._tables.arrived, handled, arrived, error)
@@ -322,15 +324,16 @@ class Cia402(Driver[Cia402Axis]):
         return feedback
 
     def send_on(self, first: int) -> None:
-        """Send the setpoints in the tables that the bus has refused, one at a time, and changed outputs."""
+        """Send the setpoints in the tables that the bus refused, one at a time, and changed outputs."""
         for axis, packed in zip(self._axes[first:], self._tables.setpoints.frames[first:], strict=True):
             axis.setpoints_lost += not self._wire.send(Frame.from_packed(packed.tobytes()))
         self._send_outputs()
 
     def enable(self, alone: str | None = None) -> None:
-        """Begin to power up all drives, or one `alone`; the following writes carry it out, as the states show.
+        """Begin to power up all drives, or only the drive `alone`; the following writes complete it, as the states
+        show.
 
-        Does nothing while a fault is latched, or while the drives are enabled.
+        This does nothing while a fault is latched or the drives are already enabled.
         """
         if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
@@ -343,35 +346,41 @@ class Cia402(Driver[Cia402Axis]):
         self._homing.restore()
 
     def home(self) -> None:
-        """Begin to home the drives that have a homing method, one after the other: see cia402.homing.
+        """Begin to home the drives that have a homing method, one after the other; see cia402.homing.
 
-        Does nothing unless all enabled drives have power and no fault is latched.
+        This does nothing unless all enabled drives have power and no fault is latched.
         """
         ready = (axis.left_out or axis.state is PowerState.OPERATION_ENABLED for axis in self._axes)
         if self._wire.fault is None and self._wants_power() and all(ready):
             self._homing.start()
 
     def stop_homing(self) -> None:
-        """Halt the drive that is being homed; then it follows setpoints again, at its present position."""
+        """Halt the drive that is being homed; it then follows setpoints again, starting at its present position."""
         self._homing.stop()
 
     def disable(self) -> None:
-        """Take the power off, at standstill. A drive that keeps it latches a fault of cause "timeout"."""
+        """Remove power from the drives, which must be at standstill.
+
+        A drive that still has power after `stop_timeout` latches a fault with cause "timeout".
+        """
         self._power_off(PowerState.SWITCH_ON_DISABLED, "disable")
         self._command()
 
     def quick_stop(self) -> None:
-        """Begin every drive's own quick-stop ramp in this cycle; the power is off at its end.
+        """Begin the quick-stop ramp of every drive in this cycle. Each drive removes its power when its ramp ends.
 
-        A drive that still has power after `stop_timeout` gets "disable voltage"; its fault of cause "timeout" replaces
-        the one that caused the stop.
+        A drive that still has power after `stop_timeout` is sent "disable voltage", and a fault with cause "timeout"
+        replaces the fault that caused the stop.
         """
         self._power_off(PowerState.QUICK_STOP_ACTIVE, "quick stop")
         self._stopped_in_this_cycle = True
         self._command()
 
     def reset(self) -> None:
-        """Clear the latched fault and the drives' faults, without powering up. Lasting conditions are found again."""
+        """Clear the latched fault and the faults of the drives, without powering up.
+
+        Conditions that persist latch again.
+        """
         self._wire.reset()
         now = self._clock()
         if self._wanted is not PowerState.OPERATION_ENABLED:
@@ -379,9 +388,9 @@ class Cia402(Driver[Cia402Axis]):
         for axis in self._axes:
             if not axis.configured:
                 continue
-            if axis.left_operational:  # its set-up is still valid: only a restarted drive needs a new one
+            if axis.left_operational:  # the set-up is still valid: only a restarted drive needs a new one
                 self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
-                axis.outputs_sent = NOTHING_SENT  # it may have missed them, or changed them by itself
+                axis.outputs_sent = NOTHING_SENT  # the drive may have missed them, or changed them by itself
             axis.clear_faults(now)
             if axis.register_wanted:
                 axis.register_wanted = False
@@ -389,7 +398,7 @@ class Cia402(Driver[Cia402Axis]):
         self._command()
 
     def _cut_power(self) -> None:
-        # By PDO and SDO: an operational node gets both, a pre-operational one only the SDO (CiA 301).
+        # By PDO and SDO: an operational node receives both, a pre-operational node only the SDO (CiA 301).
         for axis in self._axes:
             self._send_word(axis, canopen_frames.DISABLE_VOLTAGE)
             self._send_word_by_sdo(axis, canopen_frames.DISABLE_VOLTAGE)
@@ -397,7 +406,7 @@ class Cia402(Driver[Cia402Axis]):
             self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
 
     def _poll_by_sdo(self, axis: Cia402Axis, now: float) -> None:
-        """Request values that no PDO carries, without waiting: one request at a time."""
+        """Request values that no PDO carries, one request at a time, without waiting."""
         if axis.sdo_asked is not None or self._is_being_configured(axis):
             return
         if axis.pdo_silent or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
@@ -406,7 +415,7 @@ class Cia402(Driver[Cia402Axis]):
             axis.poll_due = now + canopen_frames.POLL_PERIOD
 
     def _command(self) -> None:
-        """Send the due controlwords: one transition per drive at a time."""
+        """Send the controlwords that are due, one transition per drive at a time."""
         now = self._clock()
         for axis in self._axes:
             if self._is_being_configured(axis):
@@ -418,7 +427,7 @@ class Cia402(Driver[Cia402Axis]):
             if not (word != axis.controlword or repeat):
                 continue
             if deaf:
-                # PDOs are received in NMT operational only (CiA 301): stop commands are sent by PDO and SDO.
+                # PDOs are received only in NMT operational (CiA 301), so stop commands are sent by PDO and SDO.
                 self._send_word_by_sdo(axis, word)
             if self._send_word(axis, word):
                 axis.controlword = word
@@ -428,7 +437,7 @@ class Cia402(Driver[Cia402Axis]):
         return self._recovery is not None and self._recovery.is_configuring(axis)
 
     def _send_word(self, axis: Cia402Axis, word: int) -> bool:
-        """Send a controlword by PDO; if it is mapped beside the setpoint, with the last setpoint."""
+        """Send a controlword by PDO; if it is mapped in the setpoint's PDO, send it with the last setpoint."""
         if axis.exchange.controlword is not None:
             return self._wire.send(Frame(axis.exchange.controlword, canopen_frames.CONTROLWORD.pack(word)))
         frame = axis.exchange.setpoints.frame()
@@ -436,14 +445,16 @@ class Cia402(Driver[Cia402Axis]):
         return self._wire.send(frame)
 
     def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:
-        """Send a controlword by SDO, which works in pre-operational too; a stopped node is first switched to that."""
+        """Send a controlword by SDO, which also works in pre-operational; a stopped node is first switched to
+        pre-operational.
+        """
         if axis.stopped:
             self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
         data = canopen_frames.CONTROLWORD_DOWNLOAD + canopen_frames.CONTROLWORD.pack(word) + bytes(2)
         self._ask(axis, data)
 
     def _ask(self, axis: Cia402Axis, request: bytes) -> bool:
-        """Send a request by SDO; return whether the bus took it."""
+        """Send an SDO request; return whether the bus accepted it."""
         sent = self._wire.send(Frame(canopen_frames.SDO_REQUEST + axis.node, request))
         if sent:
             axis.note_request(self._clock())
@@ -479,6 +490,8 @@ class Cia402(Driver[Cia402Axis]):
 
 
 def _target_of(axis: Cia402Axis, wanted: canopen_frames.TargetState) -> canopen_frames.TargetState:
-    """Return the target state of a drive if that of the drives is `wanted`: one that is left out gets no power."""
+    """Return the target state of a drive when the drives' target state is `wanted`; a drive that is left out gets no
+    power.
+    """
     left_off = axis.left_out and wanted is PowerState.OPERATION_ENABLED
     return PowerState.SWITCH_ON_DISABLED if left_off else wanted

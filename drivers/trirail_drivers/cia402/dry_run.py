@@ -1,4 +1,4 @@
-"""Dry run of a drive's set-up: the values that it would hold, and whether it would accept them."""
+"""Dry run of a drive's set-up, which shows the resulting values and whether the drive would accept them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from trirail_drivers.cia402.sdo import Remote, shown
 
 
 class DryRun(Remote):
-    """A drive's object dictionary to which nothing is written; written values are read back as if the drive held them.
+    """Object dictionary of a drive to which nothing is written. Written values are read back as if the drive held them.
 
-    With `read_only` (and no change of its power), the drive is asked whether an object may be written; whether it
-    accepts a value shows only when that is written.
+    With `read_only`, the power of the drive is not changed either, and the drive is asked whether an object may be
+    written. Whether it accepts a value is only known once the value is written.
     """
 
     rehearsed = True
@@ -29,11 +29,14 @@ class DryRun(Remote):
         return value if value is None else self._would_be((index, subindex), value)
 
     async def read(self, index: int, subindex: int = 0) -> int:
-        """Return the value that an object would have; SdoRefused if it cannot be read."""
+        """Return the value that an object would have. Raises SdoRefused if it cannot be read."""
         return self._would_be((index, subindex), await super().read(index, subindex))
 
     async def write(self, index: int, subindex: int, value: int) -> None:
-        """Keep a value as if it were written; SdoRefused if the drive reports that it may not be."""
+        """Store a value as if it were written.
+
+        Raises SdoRefused if the drive reports that the object may not be written.
+        """
         key = index, subindex
         data = await self._encoded(key, value)
         if self.read_only:
@@ -45,7 +48,7 @@ class DryRun(Remote):
     async def wait_until(
         self,
         key: Key,
-        predicate: Callable[[int], bool],  # noqa: ARG002  nothing is written, so nothing takes time
+        predicate: Callable[[int], bool],  # noqa: ARG002  nothing is written, so there is nothing to wait for
         seconds: float | None = None,  # noqa: ARG002
     ) -> tuple[int | None, float]:
         """Return the value that an object would have, without waiting."""

@@ -1,7 +1,7 @@
 """Detection of two nodes with the same node id, which CiA 301 does not prevent.
 
-Either each SYNC is answered by two positions, or one node boots or is not operational while the other still sends
-positions.
+There are two signs: each SYNC is answered by two positions, or a node boots or reports that it is not operational while
+the other node still sends positions.
 """
 
 from __future__ import annotations
@@ -12,25 +12,30 @@ from trirail_drivers.driver.axis_row import AxisRow
 from trirail_drivers.interface import DriveFault
 
 FAR_APART_M: Final = 0.005
-"""Distance of two positions after one SYNC from which they are those of two sliders."""
+"""Distance between two positions after one SYNC from which they must come from two sliders [m]."""
 FAR_SYNCS: Final = 3
-"""Number of consecutive SYNCs with such positions that prove two nodes."""
+"""Number of consecutive SYNCs with positions this far apart that proves that there are two nodes."""
 COUNT_WINDOW_SYNCS: Final = 20
-"""SYNCs over which those with two positions are counted, at any distance."""
+"""Number of SYNCs over which SYNCs with two positions are counted, whatever the distance of the positions."""
 MAX_DOUBLE_ANSWERS: Final = 15
-"""Largest number of them from a single node: if every other answer is a cycle late, every other SYNC has two."""
+"""Maximum number of SYNCs with two positions from a single node.
+
+If every other answer is a cycle late, every other SYNC has two.
+"""
 ANSWERS_AFTER: Final = 3
-"""Number of positions after a node reported that it is not operational that prove another node: its own PDOs have
-ended, except one that was on its way."""
+"""Number of positions that prove another node after a node has reported that it is not operational.
+
+The node's own PDOs have then ended, except one that may still have been on its way.
+"""
 
 
 def warning(node: int, by: str) -> str:
-    """Return the warning for people."""
+    """Return the warning about two nodes, for people."""
     return f"a second node with id {node} on the bus: {by}; give each its own node id"
 
 
 class AnswersAfterStop:
-    """Detection of positions after a boot-up message or a heartbeat of a node that sends none (CiA 301, NMT)."""
+    """Detection of positions after a node's boot-up message or heartbeat in a state without PDOs (CiA 301, NMT)."""
 
     __slots__ = ("_answers", "_fault")
 
@@ -40,20 +45,22 @@ class AnswersAfterStop:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is being counted."""
+        """Whether no positions are being counted."""
         return self._fault is None
 
     def begin(self, fault: DriveFault | None) -> None:
-        """Begin to count; `fault` is the one attributed to the node."""
+        """Begin to count positions; `fault` is the fault that was attributed to the node."""
         if self._fault is None:
             self._fault, self._answers = fault, 0
 
     def forget(self) -> None:
-        """Stop counting: the node may be started again."""
+        """Stop counting, because the node may be started again."""
         self._fault = None
 
     def end_cycle(self, *, came: bool) -> DriveFault | None:
-        """Count a cycle with a position, if one `came`; return the fault once another node is proved, else None."""
+        """End a cycle and count its position, if one `came`; return the fault once another node is proved, otherwise
+        None.
+        """
         fault = self._fault
         if fault is None:
             return None
@@ -67,8 +74,8 @@ class AnswersAfterStop:
 class AnswersPerSync:
     """Detection of two positions per SYNC with one identifier.
 
-    A frame or SYNC that the bus repeats brings the same position again or, in motion, a later one. The positions of two
-    sliders alternate, except in a motion that is faster than their distance per cycle.
+    If the bus repeats a frame or a SYNC, the same position arrives again or, in motion, a later one. Positions of two
+    sliders alternate, except in a motion that covers more than their distance in one cycle.
     """
 
     __slots__ = ("_counted_from", "_counts_far", "_far", "_far_in_a_row", "_row", "_two", "_with_two")
@@ -97,7 +104,7 @@ class AnswersPerSync:
         return not (self._far_in_a_row or self._with_two or self._two or self._far)
 
     def from_two_nodes(self) -> bool:
-        """End a cycle; return whether its positions and the earlier ones prove two nodes."""
+        """End a cycle; return whether its positions, together with earlier ones, prove two nodes."""
         self._far_in_a_row = self._far_in_a_row + 1 if self._far else 0
         self._with_two += self._two
         two_nodes = self._far_in_a_row >= FAR_SYNCS or self._with_two > MAX_DOUBLE_ANSWERS

@@ -1,4 +1,4 @@
-"""Object dictionary of a drive from its EDS, the maker's file (CiA 306)."""
+"""Object dictionary of a drive from its EDS, the manufacturer's file (CiA 306)."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from trirail_drivers.errors import DriveError, FileError
 
 _OBJECT = re.compile(r"([0-9A-Fa-f]{4})((?:[Ss]ub[0-9A-Fa-f]+)|Name)?")
 _PADDED_DIGIT = re.compile(r"0+([0-7])")
-"""Digit with leading zeros: the same number in decimal and octal."""
+"""Digit with leading zeros, which is the same number in decimal and octal."""
 _VERBATIM = ("parametervalue", "defaultvalue")
-"""Keys whose digits may be an octet string, in which zeros count."""
+"""Keys whose digits may be an octet string, in which zeros are significant."""
 _AFTER = "\x1a\0"
 """Characters that old editors wrote after the end of a text."""
 
 
 class Section(NamedTuple):
-    """A section, its line in the file, and its keys."""
+    """Section of a file: its first line number and its keys."""
 
     name: str
     line: int
@@ -33,13 +33,13 @@ class Section(NamedTuple):
 
     @property
     def object(self) -> int | None:
-        """Index of the object that it describes or belongs to."""
+        """Index of the object that the section describes or belongs to."""
         match = _OBJECT.fullmatch(self.name)
         return int(match[1], 16) if match else None
 
     @property
     def parent(self) -> str:
-        """Name of the section that it depends on, or ""."""
+        """Name of the section on which this section depends, or ""."""
         match = _OBJECT.fullmatch(self.name)
         return match[1].upper() if match and match[2] else ""
 
@@ -49,7 +49,7 @@ class Section(NamedTuple):
 
 
 def sections_of(text: str) -> tuple[list[Section], list[str]]:
-    """Return a text's sections, and notes on skipped lines: those without a value, and duplicates.
+    """Return a text's sections, and notes about skipped lines, which have no value or are duplicates.
 
     Comments are dropped. A key without a value counts as absent, since many tools write such keys.
     """
@@ -80,7 +80,7 @@ def sections_of(text: str) -> tuple[list[Section], list[str]]:
 
 
 def _parse_line(values: dict[str, str], line: str) -> str:
-    """Add a line to a section's values; return the reason for which it is skipped, or ""."""
+    """Add a line to a section's values; return the reason why it is skipped, or ""."""
     key, equals, value = (part.strip() for part in line.partition("="))
     if not equals:
         return "no value"
@@ -94,24 +94,25 @@ def _parse_line(values: dict[str, str], line: str) -> str:
 
 
 def sort_sections(sections: list[Section]) -> list[Section]:
-    """Return the sections sorted such that each follows the one that it depends on."""
+    """Return the sections sorted so that each one follows the section on which it depends."""
     return sorted(sections, key=lambda section: section.parent != "")
 
 
-# The DriveError has canopen's reason; standard error shows only that one line.
+# The DriveError contains canopen's reason; standard error shows only that line.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 SERVO: Final = Path(__file__).with_name("servo.eds")
-"""Object dictionary of the simulated CiA 402 servo drive: names and types of objects without a maker's EDS."""
+"""Object dictionary of the simulated CiA 402 servo drive; it names and types objects if no manufacturer's EDS is given.
+"""
 REQUIRED: Final = frozenset((0x1000, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064))
-"""Objects needed in every mode: a file in which one cannot be read is refused."""
+"""Objects needed in every mode; a file in which one of them cannot be read is refused."""
 MAX_SHOWN_NOTES: Final = 3
-"""Number of skipped sections and lines that a warning names."""
+"""Maximum number of skipped sections and lines that a warning names."""
 _UNREADABLE = configparser.Error, ValueError, KeyError, AttributeError
 
 
 def load(drive: str, file: Path, node: int) -> tuple[ObjectDictionary, str]:
-    """Return the objects of the drive called `drive`, and one warning of skipped lines, or "".
+    """Return the objects of the drive called `drive`, and one warning about skipped lines, or "".
 
     Raises DriveError if the file cannot be used.
     """
@@ -124,17 +125,17 @@ def load(drive: str, file: Path, node: int) -> tuple[ObjectDictionary, str]:
 
 
 def read(file: Path, node: int) -> ObjectDictionary:
-    """Return the objects of a device with this node id. Raises DriveError if the file is no EDS."""
+    """Return the objects of a device with this node id. Raises DriveError if the file is not an EDS."""
     return _read(file, node)[0]
 
 
 def open_text(file: Path) -> io.StringIO:
-    """Open a maker's file as text that canopen can read: unreadable lines are repaired or left out."""
+    """Open a manufacturer's file as text that canopen can read; unreadable lines are repaired or omitted."""
     return _text(file, sort_sections(sections_of(_content(file))[0]))
 
 
 def _content(file: Path) -> str:
-    """Read a maker's file, whose encoding may be any: numbers are ASCII in all of them."""
+    """Read a manufacturer's file in any encoding, since all of them represent numbers in ASCII."""
     try:
         with files.open_regular(file) as source:
             return source.read().decode("utf-8-sig", errors="replace")
@@ -143,14 +144,14 @@ def _content(file: Path) -> str:
 
 
 def _text(file: Path, sections: list[Section]) -> io.StringIO:
-    lacks = not any(section.name == "DeviceInfo" for section in sections)  # canopen refuses a file without it
+    lacks = not any(section.name == "DeviceInfo" for section in sections)  # canopen refuses a file without this section
     text = io.StringIO("".join(map(str, [Section("DeviceInfo", 0, {}), *sections] if lacks else sections)))
-    text.name = str(file)  # canopen recognises an EDS by its name
+    text.name = str(file)  # canopen recognises an EDS by its file name
     return text
 
 
 def _read(file: Path, node: int) -> tuple[ObjectDictionary, list[str]]:
-    """Return the readable objects of a file, and notes on skipped lines. Raises DriveError."""
+    """Return the readable objects of a file, and notes about skipped lines. Raises DriveError."""
     sections, notes = sections_of(_content(file))
     sections = sort_sections(sections)
     try:
@@ -165,7 +166,10 @@ def _read(file: Path, node: int) -> tuple[ObjectDictionary, list[str]]:
 
 
 def _readable(file: Path, sections: list[Section], node: int, notes: list[str]) -> list[Section]:
-    """Return the sections that canopen can read, each tried with the one that it depends on; note the others."""
+    """Return the sections that canopen can read, and add notes about the others.
+
+    Each section is tried together with the section on which it depends.
+    """
     sound: dict[str, Section] = {}
     for section in sections:
         parent = sound.get(section.parent) if section.parent else None

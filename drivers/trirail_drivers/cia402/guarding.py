@@ -1,4 +1,6 @@
-"""Supervision of drive and service: heartbeats, or node guarding without a heartbeat consumer; EMCY (CiA 301)."""
+"""Supervision of drive and service by heartbeats, or by node guarding if there is no heartbeat consumer; EMCY (CiA
+301).
+"""
 
 from __future__ import annotations
 
@@ -15,11 +17,11 @@ from trirail_drivers.config import Drives
 from trirail_drivers.driver.conversations import Wait
 
 _EMCY_BITS: Final = 0x8000_07FF
-"""Bits of 1014h: whether the EMCY is off, and its identifier."""
+"""Bits of 1014h: whether the EMCY is disabled, and its identifier."""
 MOST_WATCHED: Final = 8
-"""Largest number of entries of 1016h that are read."""
+"""Maximum number of entries of 1016h that are read."""
 MISSED: Final = 3
-"""Number of consecutive missed heartbeats or guardings that are a loss."""
+"""Number of consecutive missed heartbeats or guarding requests that count as a loss."""
 
 
 class Supervision(NamedTuple):
@@ -28,7 +30,7 @@ class Supervision(NamedTuple):
     guarded: bool
     heard: bool
     emergency: int
-    """Identifier of its EMCY."""
+    """Identifier of the drive's EMCY."""
 
 
 async def configure_watchdogs(drive: Differences, drives: Drives, period: int, node: int) -> Supervision:
@@ -38,42 +40,42 @@ async def configure_watchdogs(drive: Differences, drives: Drives, period: int, n
     if not guarded:
         heard = await drive.ensure(0x1017, 0, period) is not None
         await _watch_master(drive, drives.master_node, MISSED * period)
-    await drive.ensure(0x1029, 1, 0)  # a drive without its master turns pre-operational, so that it ignores setpoints
+    await drive.ensure(0x1029, 1, 0)  # a drive without its master becomes pre-operational, so that it ignores setpoints
     return Supervision(guarded, heard, await _emergency(drive, drives, node))
 
 
 async def _watch_master(drive: Differences, master: int, period: int) -> None:
-    """Let the drive monitor the master's heartbeat, in an entry of 1016h that is not used for another node."""
+    """Make the drive monitor the master's heartbeat, in an entry of 1016h that no other node uses."""
     remote, wanted = drive.remote, master << 16 | period
     entries = range(1, 1 + min(await remote.peek(0x1016) or 1, MOST_WATCHED))
     held = {entry: await remote.peek(0x1016, entry) or 0 for entry in entries}
     own = [entry for entry, value in held.items() if value >> 16 & 0x7F == master]
     free = [entry for entry, value in held.items() if not (value >> 16 & 0x7F and value & 0xFFFF)]
-    for entry in dict.fromkeys((*own, *free)):  # CiA 301: no two entries have one node
+    for entry in dict.fromkeys((*own, *free)):  # CiA 301: a node may appear in only one entry
         if await drive.try_ensure((0x1016, entry), wanted):
             return
     await drive.ensure(0x1016, 1, wanted)
 
 
 async def _configure_guarding(drive: Differences, period: int, node: int) -> bool:
-    """Set node guarding up, and try whether the drive answers; False, with all as it was, where it does not."""
+    """Set up node guarding. If the drive does not answer, restore the previous state and return False."""
     remote = drive.remote
     if not (await remote.has(0x100C) and await remote.has(0x100D)):
         return False
     current = await remote.peek(0x100C), await remote.peek(0x100D)
     heartbeats = await remote.peek(0x1017)
     if heartbeats:
-        await drive.ensure(0x1017, 0, 0)  # CiA 301: a node has heartbeats or is guarded, not both
+        await drive.ensure(0x1017, 0, 0)  # CiA 301: a node uses either heartbeats or guarding, not both
     unset = 0 in current
     if remote.rehearsed and (heartbeats or unset):
-        await _set_guarding(drive, period, MISSED)  # without writing, its answers cannot be tested
+        await _set_guarding(drive, period, MISSED)  # without a write, its answers cannot be tested
         return True
-    # Tested before it is set: its life time begins with the first guarding after that (CiA 301, 7.2.8.2.2).
+    # Tested before it is set up: its life time starts with the first guarding request after that (CiA 301, 7.2.8.2.2).
     answers = await _answers(drive, node)
     if answers or unset:
         await _set_guarding(drive, period, MISSED)
     if not answers and unset:
-        answers = await _answers(drive, node)  # some drives, such as lely-core, answer only once it is set
+        answers = await _answers(drive, node)  # some drives, such as lely-core, answer only once guarding is set up
         if not answers:
             await _set_guarding(drive, *current)
     drive.add_note(
@@ -106,7 +108,7 @@ async def _answers(drive: Differences, node: int) -> bool:
 
 
 async def _emergency(drive: Differences, drives: Drives, node: int) -> int:
-    """Return the identifier of the drive's EMCY: the predefined one, or the one that it keeps instead."""
+    """Return the identifier of the drive's EMCY, which is the predefined one or another that it keeps."""
     remote, usual = drive.remote, canopen_frames.EMCY + node
     current = await remote.peek(0x1014)
     if current is not None and current & _EMCY_BITS != usual and not await drive.try_ensure((0x1014, 0), usual):

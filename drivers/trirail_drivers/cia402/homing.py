@@ -1,11 +1,13 @@
-"""Homing of CiA 402 drives within the cycle: homing mode (CiA 402-2, mode 6).
+"""Homing of CiA 402 drives within the cycle, in homing mode (CiA 402-2, mode 6).
 
-The drives are homed one after the other, while the others hold their positions in their setpoint mode. All three
-sliders move the platform, and before homing its pose is unknown. With a single slow slider, the platform moves on a
-path that a person can foresee and watch, a wrong direction or a missing switch concerns one slider, and the two drives
-that hold report a following error if the platform jams. If all three moved, it could go anywhere, and jam unnoticed.
+The drives are homed one after the other, while the others hold their positions in their setpoint mode. Each of the
+three sliders moves the platform, and before homing its pose is unknown. With a single slow slider, the platform moves
+on a path that a person can foresee and watch, a wrong direction or a missing switch affects only one slider, and the
+two drives that hold report a following error if the platform jams. If all three moved, the platform could go anywhere,
+and jam unnoticed.
 
-The home offset 607Ch is 0: makers differ in its sign. The position at home is the `offset` of [drives.X].
+The home offset 607Ch is 0, since manufacturers use different signs for it. The position at home is the `offset` of
+[drives.X].
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ HOMING = 6
 _MODE, _MODE_DISPLAY, _STATUSWORD = 0x6060, 0x6061, 0x6041
 
 FRESH_ANSWERS: Final = 4
-"""Number of answers to SYNCs after homing from which a position certainly counts from home: one may be on its way, and
-one may be assigned to the wrong SYNC."""
+"""Number of answers to SYNCs after homing from which a position is certain to be relative to home.
+
+One answer may still be on its way, and one may be assigned to the wrong SYNC.
+"""
 SETPOINT_SYNCS: Final = 2
-"""Number of SYNCs after which a written setpoint is adopted."""
+"""Number of SYNCs after which a drive has applied a written setpoint."""
 
 _SDO: Final = Struct("<BHB4s")
 _WRITE_BYTE: Final = 0x2F
@@ -45,11 +49,11 @@ Steps = Generator[None, None, None]
 
 
 class HomingFailedError(Exception):
-    """Homing has failed; the text is the reason."""
+    """Homing has failed; the text states the reason."""
 
 
 class HomingSequence:
-    """Homing of the drives that have a homing method, one step at each `step`."""
+    """Homing of the drives that have a homing method; each call of `step` advances it by one step."""
 
     def __init__(self, axes: tuple[Cia402Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
         self._plan = [
@@ -67,27 +71,29 @@ class HomingSequence:
         self.under_way = False
         """Whether drives are being homed."""
         self.restoring = False
-        """Whether drives are switched back to their setpoint mode before they get power."""
+        """Whether drives are being switched back to their setpoint mode before they get power."""
         self._forget_homes()
 
     def start(self) -> None:
-        """Begin to home all drives with a homing method and power; none of them counts as homed until it is done."""
+        """Begin to home all powered drives with a homing method; none of them counts as homed until its homing is
+        complete.
+        """
         self._forget_homes()
         self.under_way, self._stopping = True, False
         self._steps = self._home_all()
 
     def stop(self) -> None:
-        """Halt the moving drive, switch it back to its setpoint mode, and home no other."""
+        """Halt the moving drive, switch it back to its setpoint mode, and home no further drive."""
         self._stopping = True
 
     def restore(self) -> None:
-        """Switch drives that a quick stop left in homing mode back to their setpoint mode."""
+        """Switch drives back to their setpoint mode that a quick stop left in homing mode."""
         if not all(axis.cyclic for axis, _ in self._plan):
             self.restoring = True
             self._steps = self._restore_all()
 
     def abandon(self) -> None:
-        """Abort the sequence: the drives are losing their power."""
+        """Abort the sequence, because the drives are losing power."""
         self._end()
         for axis, _ in self._plan:
             axis.mode_bits = 0
@@ -95,11 +101,11 @@ class HomingSequence:
 
     @property
     def idle(self) -> bool:
-        """Whether no sequence is under way."""
+        """Whether no sequence is in progress."""
         return self._steps is None
 
     def step(self, now: float) -> DriveFault | None:
-        """Continue after the frames of a cycle; return a fault if homing fails."""
+        """Continue after the frames of a cycle have been handled; return a fault if homing fails."""
         self._now = now
         axis = self._axis
         if self._steps is None:
@@ -139,7 +145,7 @@ class HomingSequence:
         axis.cyclic = False
         yield from self._change_mode(axis, HOMING)
         axis.follows = False
-        # The newest statusword may be from another mode, in which its bits have other meanings.
+        # The newest statusword may come from another mode, in which its bits have other meanings.
         yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword
         if not self._stopping:
@@ -162,12 +168,12 @@ class HomingSequence:
         )
 
     def _follow_setpoints(self, axis: Cia402Axis) -> Steps:
-        """Switch back to the setpoint mode, once the drive's setpoint is its actual position."""
+        """Switch back to the setpoint mode once the drive's setpoint equals its actual position."""
         answered = axis.sampled + FRESH_ANSWERS
         yield from self._wait_until(lambda: axis.sampled >= answered, self._sdo_timeout, "there was no new position")
         standing = axis.actual
         yield
-        # The control has seen this position, and holds it from now on, as is done here meanwhile.
+        # The control loop has received this position and holds it from now on, as this sequence does until then.
         axis.held = standing
         axis.follows = True
         taken_up = axis.syncs + SETPOINT_SYNCS
@@ -181,12 +187,12 @@ class HomingSequence:
         deadline = self._now + self._sdo_timeout
         while (shown := (yield from self._sdo(axis, _READ, _MODE_DISPLAY))[4]) != mode:
             if shown == 0 and not axis.mode.shown and axis.state is not PowerState.OPERATION_ENABLED:
-                return  # it shows its mode only with power
+                return  # the drive shows its mode only with power
             if self._now >= deadline:
                 raise HomingFailedError(f"object 6061:00 (Modes of operation display): expected {mode}, found {shown}")
 
     def _sdo(self, axis: Cia402Axis, command: int, index: int, value: int = 0) -> Generator[None, None, bytes]:
-        """Do one SDO transfer across cycles, without blocking; return the answer."""
+        """Perform one SDO transfer over several cycles, without blocking; return the answer."""
         axis.sdo_answer, axis.sdo_asked = None, index.to_bytes(2, "little")
         self._send(Frame(canopen_frames.SDO_REQUEST + axis.node, _SDO.pack(command, index, 0, bytes([value]))))
         deadline = self._now + self._sdo_timeout
@@ -209,7 +215,7 @@ class HomingSequence:
 
 
 def _attained(axis: Cia402Axis) -> bool:
-    """Whether homing is attained; bit 12 may be left from an earlier homing, so it must have been clear since."""
+    """Whether homing is attained. Bit 12 may be left over from an earlier homing, so it must have been clear since."""
     if axis.statusword & _ERROR:
         raise HomingFailedError(f"the drive reports a homing error (statusword {axis.statusword:04X})")
     both = _HOMING_ATTAINED | _TARGET_REACHED

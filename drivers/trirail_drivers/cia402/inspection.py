@@ -29,11 +29,11 @@ def inspect(
 ) -> list[dict[str, Any]]:
     """Return a description of each drive, with the differences between its values and those that the cycle needs.
 
-    `fastest` is the sliders' velocity limit [m/s], which must fit the drives' units; `io` the digital outputs and
-    inputs of each drive.
+    `fastest` is the velocity limit of the sliders [m/s], which must fit the drives' units; `io` contains the digital
+    outputs and inputs of each drive.
 
-    With `apply` the differences are written to all three drives or none, without power, and not stored in the drives;
-    otherwise nothing is written. "refused" has the reason for a drive that does not answer or is refused. Raises
+    With `apply`, the differences are written to all three drives or to none, without power, and are not stored in the
+    drives; otherwise nothing is written. "refused" contains the reason if a drive does not answer or is refused. Raises
     DriveError if `apply` fails.
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
@@ -60,9 +60,9 @@ def inspect(
 
 
 def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int | None]:
-    """Return a function that reads the digital inputs 60FDh of a named drive, or None if they cannot be read.
+    """Return a function that reads the digital inputs 60FDh of a named drive, or returns None if they cannot be read.
 
-    It waits for the answer and drops other frames: only for drives without power, between two cycles.
+    The function waits for the answer and drops other frames. Use it only for drives without power, between two cycles.
     """
     remotes = {remote.name: remote for remote in setup.remotes(bus, drives, clock)}
 

@@ -1,4 +1,4 @@
-"""Writing of the maker's objects that the configuration lists: [[drives.A.write]]."""
+"""Writing of the manufacturer-specific objects that the configuration lists: [[drives.A.write]]."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _STORES: Final = "would store it in the drive, or restore what is stored"
 _ADDRESS: Final = "changes node id or bitrate: that is for its maker's tool"
 _FORBIDDEN: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
 _UNITS: Final = (0x60A9, 0x60AA)
-"""Further objects that the set-up itself may write."""
+"""Additional objects that the set-up itself may write."""
 _ADDRESSES: Final = {
     0x0000_00FB: (0x2000, 0x2001),  # maxon, EPOS4 Firmware Specification: Node-ID, CAN bit rate
     0x0000_026C: (0x2005, 0x2009),  # Nanotec, manuals, object dictionary: CANopen Baudrate, CANopen NodeID
 }
-"""Objects with node id and bitrate, by vendor (1018h:01)."""
+"""Objects that contain the node id and bit rate, by vendor (1018h:01)."""
 _ADDRESS_NAMES: Final = re.compile(r"node.?id|bit.?rate|baud", re.IGNORECASE)
 
 
 def check(name: str, drive: Drive, number: int) -> None:
-    """Raise DriveError if entry `number` of the drive's configuration writes an object that it must not."""
+    """Raise DriveError if entry `number` of the drive's configuration names an object that it must not write."""
     each = drive.write[number]
     key = each.object, each.sub
     twice = key in [(other.object, other.sub) for other in drive.write[:number]]
@@ -35,7 +35,11 @@ def check(name: str, drive: Drive, number: int) -> None:
 
 
 def owned(key: Key) -> str:
-    """Return the reason for which only the set-up may write an object, or none at all (storing, address); else ""."""
+    """Return the reason why the configuration may not write an object, because the set-up writes it or nobody may; else
+    "".
+
+    Nobody may write the objects that store parameters or set the address.
+    """
     used = find_use(key)
     if used is not None or is_pdo(key[0]) or key[0] in _UNITS:
         return f"is written by the set-up{f', for {used[1].purpose}' if used else ''}"
@@ -43,12 +47,12 @@ def owned(key: Key) -> str:
 
 
 def address(key: Key, name: str, vendor: int | None) -> str:
-    """Return the refusal of an object that is node id or bitrate, by its maker or name; "" for others."""
+    """Return the refusal of an object that holds the node id or bit rate, by its vendor or name; otherwise ""."""
     return _ADDRESS if key[0] in _ADDRESSES.get(vendor or 0, ()) or _ADDRESS_NAMES.search(name) else ""
 
 
 async def write_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...]) -> None:
-    """Write differing objects and read them back; DriveError if an object is missing or has another size."""
+    """Write differing objects and read them back. Raises DriveError if an object is missing or has a different size."""
     remote = drive.remote
     for each in writes:
         key = each.object, each.sub

@@ -1,8 +1,8 @@
-"""Objects of a CiA 402 drive that the driver uses: type, purpose, and the consequence if one is missing.
+"""Objects of a CiA 402 drive that the driver uses: type, purpose, and the consequence if an object is missing.
 
-Makers leave out objects that are optional in CiA 301 and CiA 402-2. A drive without a NEEDED object is refused. A
-REPLACEABLE object has a substitute, which is noted. Without a PROTECTION the drive would continue where this service
-promises that it stops, so it is refused unless `accept_without` names the object.
+Manufacturers omit objects that are optional in CiA 301 and CiA 402-2. A drive without a NEEDED object is refused. A
+REPLACEABLE object has a substitute, whose use is noted. Without a PROTECTION, the drive would continue where this
+service promises that it stops, so the drive is refused unless `accept_without` names the object.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ObjectUse(NamedTuple):
     name: str
     purpose: str
     without: str
-    """Substitute, or consequence, if a drive lacks it."""
+    """Substitute for the object, or consequence of lacking it."""
 
 
 _N, _R, _P = Need.NEEDED, Need.REPLACEABLE, Need.PROTECTION
@@ -78,9 +78,11 @@ USES: Final = {
     "60FE": ObjectUse(_N, "Digital outputs", "digital outputs, where configured", "refused"),
     "6502": ObjectUse(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried, then 7"),
 }
-"""Objects by index, or index and subindex, of CiA 301 or, from 6000h on, of CiA 402-2. 605B (shutdown) and 605C
-(disable operation) are not used: the driver takes the power off by "disable voltage" and "quick stop", which do not
-depend on them."""
+"""Objects by index, or by index and subindex, of CiA 301 or, from 6000h on, of CiA 402-2.
+
+605B (shutdown) and 605C (disable operation) are not used: the driver removes power with "disable voltage" and
+"quick stop", which do not depend on these objects.
+"""
 
 FOLLOWING_BIT: Final = "6041"
 """Name in `accept_without` for a drive that does not set bit 12 of its statusword."""
@@ -97,14 +99,14 @@ _WIDTHS: Final = {
     **dict.fromkeys((0x6007, 0x605A, 0x605E, 0x60C0), 2),
     0x100D: 1,
 }
-"""Size of each object's value [bytes], unless it is four (CiA 301, CiA 402-2)."""
+"""Size of each object's value [bytes] if it is not four (CiA 301, CiA 402-2)."""
 _SIGNED: Final = frozenset(
     (0x6007, 0x605A, 0x605E, 0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x6098, 0x60B1, 0x60C0, 0x60C1)
 )
 
 
 def width(key: Key) -> int:
-    """Return the size of an object's value [bytes] by the standards."""
+    """Return the size of an object's value [bytes] according to the standards."""
     index, subindex = key
     if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
         return {1: 4, 3: 2, 5: 2}.get(subindex, 1)
@@ -116,7 +118,7 @@ def width(key: Key) -> int:
 
 
 def signed(key: Key) -> bool:
-    """Whether an object's value has a sign."""
+    """Whether an object's value is signed."""
     return key[0] in _SIGNED or key == (0x60C2, 2)
 
 

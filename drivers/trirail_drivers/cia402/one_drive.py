@@ -1,4 +1,4 @@
-"""Set-up of one CiA 402 drive over SDO: wait for it, read, write the differences, read them back."""
+"""Set-up of one CiA 402 drive over SDO: wait for it, read its objects, write the differences, and read them back."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import PowerState
 
 HAS_POWER = (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
-"""States in which a drive may have current in its motor."""
+"""States in which current may flow in a drive's motor."""
 
 BOOT_TIMEOUTS: Final = 10
-"""Longest boot of a drive, as a multiple of `sdo_timeout`."""
+"""Longest boot time of a drive, as a multiple of `sdo_timeout`."""
 
 
 class Identity(NamedTuple):
-    """Identity of a drive, from its own objects."""
+    """Identity of a drive, as reported in its own objects."""
 
     device_type: int
-    """1000h."""
+    """Device type, 1000h."""
     vendor: int | None
     product: int | None
     revision: int | None
     serial: int | None
-    """1018h."""
+    """Serial number, 1018h."""
     modes: int | None
-    """6502h."""
+    """Supported modes, 6502h."""
 
 
 class SetUp(NamedTuple):
@@ -60,15 +60,15 @@ class SetUp(NamedTuple):
     exchange: Exchange
     units: Units
     differences: tuple[Difference, ...]
-    """Values that were written, or would be."""
+    """Values that were written or, in a dry run, would be written."""
     notes: tuple[str, ...]
-    """Deviations from the usual set-up, and missing protections: lines for people."""
+    """Deviations from the usual set-up, and missing protections; one line for people each."""
     missing_protections: tuple[str, ...]
-    """Protections that it lacks, as `accept_without` names them."""
+    """Protections that the drive lacks, by their names in `accept_without`."""
     refused: str
     """Refusal for missing protections, or ""."""
     home_offset: int | None = None
-    """607Ch: zero of its positions."""
+    """Home offset 607Ch, the zero of the drive's positions."""
 
 
 class Start(NamedTuple):
@@ -77,11 +77,11 @@ class Start(NamedTuple):
     counts: int
     """Actual position 6064h."""
     statusword: int
-    """6041h."""
+    """Statusword 6041h."""
     error_code: int
-    """603Fh if the drive is in fault, else 0."""
+    """Error code 603Fh if the drive is in fault, otherwise 0."""
     inputs: int = 0
-    """60FDh if the robot uses digital inputs of the drive, else 0."""
+    """Digital inputs 60FDh if the robot uses inputs of the drive, otherwise 0."""
 
 
 class SetupTask(NamedTuple):
@@ -97,7 +97,7 @@ class SetupTask(NamedTuple):
 
 
 async def rehearse_setup(one: SetupTask, *, read_only: bool = False) -> SetUp:
-    """Wait for a drive and do a dry run of its whole set-up, after taking its power off.
+    """Wait for a drive, remove its power, and do a dry run of its whole set-up.
 
     With `read_only`, its power is not changed either, and the drive is asked which objects may be written.
     """
@@ -170,9 +170,10 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
 
 
 async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool) -> None:
-    """Wait until the node answers, for as long as a boot may take; check that it is a CiA 402 drive.
+    """Wait until the node answers, for at most the duration of a boot; check that it is a CiA 402 drive.
 
-    After its boot-up message it is asked again and, with `to_pre_operational`, first switched to NMT pre-operational.
+    With `to_pre_operational`, the node is first switched to NMT pre-operational. After a boot-up message, the request
+    is repeated.
     """
     client = remote.client
     begun = client.clock()
@@ -200,7 +201,7 @@ async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool)
 
 
 async def _switch_off(remote: Remote, seconds: float) -> None:
-    """Take a drive's power off, and wait until its state shows that: a brake takes time to close."""
+    """Remove a drive's power, and wait until its state shows this, since a brake takes time to close."""
     await remote.write(0x6040, 0, canopen_frames.DISABLE_VOLTAGE)
     statusword, waited = await remote.wait_until(
         (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in HAS_POWER, seconds

@@ -10,16 +10,16 @@ from trirail_drivers.cia402.sdo import Remote, SdoRefused
 from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 _LINEAR = 0
-"""60C0h: linear interpolation."""
+"""Value of 60C0h for linear interpolation."""
 _NONE = 0
-"""6061h: no mode (CiA 402-2); some drives show their mode only with power."""
+"""Value of 6061h for no mode (CiA 402-2); some drives show their mode only with power."""
 
 
 async def choose_modes(remote: Remote, *, homes: bool) -> tuple[int, ...]:
-    """Return the modes to try: cyclic synchronous position mode, or interpolated position mode if it has no other.
+    """Return the modes to try: cyclic synchronous position mode or, without it, interpolated position mode.
 
-    Bit n - 1 of 6502h means mode n; without that object both modes are returned. DriveError if the drive has neither,
-    or `homes` without homing mode.
+    Bit n - 1 of 6502h stands for mode n; without that object, both modes are returned. Raises DriveError if the drive
+    has neither mode, or if it `homes` but has no homing mode.
     """
     modes = await remote.peek(0x6502)
     if modes is not None and homes and not modes >> (HOMING - 1) & 1:
@@ -43,9 +43,9 @@ async def choose_modes(remote: Remote, *, homes: bool) -> tuple[int, ...]:
 
 
 async def configure_mode(drive: Differences, modes: tuple[int, ...]) -> tuple[int, bool]:
-    """Set the first of these modes that the drive accepts; return it, and whether 6061h shows it already.
+    """Set the first of these modes that the drive accepts; return the mode, and whether 6061h already shows it.
 
-    Some drives show no mode until they have power. ConfigurationRefused if it shows another mode.
+    Some drives show no mode until they have power. Raises ConfigurationRefused if the drive shows another mode.
     """
     refusal: DriveError | None = None
     untold = None
@@ -96,7 +96,7 @@ async def _configure_interpolation(drive: Differences) -> None:
     if await remote.has(0x60C0):
         await drive.ensure(0x60C0, 0, _LINEAR)
     if await remote.has(0x60C4, 6):
-        for value in (0, 1):  # 0 empties the buffer and closes it, 1 opens it
+        for value in (0, 1):  # 0 empties and closes the buffer, 1 opens it
             try:
                 await remote.write(0x60C4, 6, value)
             except SdoRefused as refusal:

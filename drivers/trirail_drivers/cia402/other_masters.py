@@ -1,4 +1,7 @@
-"""Frames that only this service may send: any other sender is another master, and the robot stops (CiA 301)."""
+"""Detection of frames that only this service may send.
+
+Any other sender is another master, and the robot stops (CiA 301).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ _NMT_STOP: Final = 0x02
 
 
 class OtherMasters:
-    """Detection of other masters by their frames: NMT commands, SYNC, PDOs, this service's heartbeat."""
+    """Detection of other masters by their frames: NMT commands, SYNC, PDOs, and the heartbeat of this service."""
 
     def __init__(self, wire: Wire, axes: Sequence[Cia402Axis], master_node: int) -> None:
         self._wire = wire
@@ -38,7 +41,7 @@ class OtherMasters:
             self.listen_to(axis)
 
     def listen_to(self, axis: Cia402Axis) -> None:
-        """Listen for setpoints, controlwords and outputs of another sender to a drive."""
+        """Listen for setpoints, controlwords and outputs that another sender sends to a drive."""
         exchange = axis.exchange
         for identifier in {exchange.setpoints.identifier, exchange.controlword, exchange.outputs} - {None}:
             self._wire.listen(identifier or 0, self, self._sends(f"sends drive {axis.name} PDOs ({identifier:03X})"))
@@ -72,7 +75,7 @@ class OtherMasters:
 
 
 class ExclusiveBus(can.BusABC):
-    """A bus that raises DriveError on the first frame of another master. Closing it leaves the inner bus open."""
+    """Bus that raises DriveError on the first frame of another master. Closing it leaves the inner bus open."""
 
     def __init__(self, bus: can.BusABC, nodes: Sequence[int], master_node: int) -> None:
         self.inner = bus
@@ -93,7 +96,7 @@ class ExclusiveBus(can.BusABC):
         self.inner.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Receive a frame; DriveError if another master sent it."""
+        """Receive a frame. Raises DriveError if another master sent it."""
         frame = self.inner.recv(timeout)
         if frame is None or frame.is_error_frame or frame.is_extended_id:
             return frame

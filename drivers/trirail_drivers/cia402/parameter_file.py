@@ -1,4 +1,4 @@
-"""A drive's parameters in a file: a DCF (CiA 306), or the TOML file that earlier versions saved."""
+"""File with the parameters of a drive: a DCF (CiA 306), or the TOML file that earlier versions saved."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ IDENTITY: Final[Mapping[str, Key]] = {
     "serial": (0x1018, 4),
 }
 _UNUSED: Final = re.compile("FileInfo|Comments|DummyUsage|DeviceComm?issioning", re.IGNORECASE)
-"""Sections that describe no object: canopen refuses some that other programs write."""
+"""Sections that describe no object; canopen refuses some that other programs write."""
 _KEYWORDS: Final = {each.lower(): each for each in ("ParameterValue", "NodeID", "LSS_SerialNumber")}
 _COMPACT: Final = re.compile("([0-9a-f]{4})value", re.IGNORECASE)
 _TOML_TYPES: Final = {
@@ -43,7 +43,7 @@ _Number = Annotated[int, Meta(ge=1)]
 
 
 class Origin(Struct, frozen=True):
-    """Identity of a file's drive. None is unknown, and so is 0, which matches every drive (CiA 302-2)."""
+    """Identity of the drive in a file. None means unknown, and so does 0, which matches every drive (CiA 302-2)."""
 
     node: Annotated[int, Meta(ge=1, le=127)] | None = None
     device_type: _Number | None = None
@@ -55,7 +55,7 @@ class Origin(Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class SavedParameters:
-    """Parameters of a drive at one time."""
+    """Parameters of a drive at one point in time."""
 
     origin: Origin
     parameters: Mapping[Key, Parameter]
@@ -64,25 +64,28 @@ class SavedParameters:
     objects: ObjectDictionary = field(default_factory=ObjectDictionary, compare=False, repr=False)
     """All objects of the drive, for other programs that open the file."""
     complete: bool = field(default=True, compare=False)
-    """Whether the drive lacks every object that is not listed; a DCF may list only some objects."""
+    """Whether the drive lacks every object that is not listed.
+
+    This may be False for a DCF, which may list only some objects.
+    """
 
     def knows(self, key: Key) -> bool:
-        """Whether it has an object's value, or the drive lacks that object."""
+        """Whether the value of an object is known, or the drive is known to lack the object."""
         return key in self.parameters or (self.complete and key not in self.unread)
 
 
 class ParameterDifference(NamedTuple):
-    """A parameter that differs between two drives or files."""
+    """Parameter that differs between two drives or files."""
 
     key: Key
     name: str
     one: Parameter | None
-    """None where there is none."""
+    """Parameter on each side; None if that side lacks it."""
     other: Parameter | None
 
 
 def comparable(one: SavedParameters, other: SavedParameters) -> list[Key]:
-    """Return the objects that both know, in order."""
+    """Return the objects that are known on both sides, in order."""
     return [key for key in sorted({*one.parameters, *other.parameters}) if one.knows(key) and other.knows(key)]
 
 
@@ -98,12 +101,12 @@ def compare(one: SavedParameters, other: SavedParameters) -> list[ParameterDiffe
 
 
 def format_number(value: int | None) -> str:
-    """Return a number of an origin for people."""
+    """Return a number of an origin as text for people."""
     return "unknown" if value is None else f"{value:08X}h"
 
 
 def origin(numbers: Mapping[str, Any]) -> Origin:
-    """Return the origin from numbers by its field names, without zeros. Raises ValueError."""
+    """Return the origin given its numbers by field name, without zeros. Raises ValueError."""
     return msgspec.convert({name: number for name, number in numbers.items() if number}, Origin)
 
 
@@ -132,7 +135,7 @@ def write(path: Path, saved: SavedParameters, bitrate: int | None = None) -> Non
     head = {"FileName": path.name, "ModifiedBy": "trirail", "ModificationDate": date, "ModificationTime": time}
     commissioning = f"[DeviceComissioning]\nLSS_SerialNumber={numbers.serial or 0}\n"
     output = io.StringIO()
-    # Not canopen.export_od: it shares one head among all files of a process.
+    # canopen.export_od is not used: all files of a process would share its header.
     export_dcf(objects, output, head)  # type: ignore[no-untyped-call]
     try:
         files.replace(path, output.getvalue().replace("[DeviceComissioning]\n", commissioning, 1).encode())
@@ -141,10 +144,10 @@ def write(path: Path, saved: SavedParameters, bitrate: int | None = None) -> Non
 
 
 def read(path: Path, node: int | None = None) -> SavedParameters:
-    """Return the parameters in a file: a DCF by its suffix, else a TOML file.
+    """Return the parameters in a file, which is a DCF if it has that suffix, otherwise a TOML file.
 
-    Values relative to the node id use `node`, or else the file's. Raises FileError if the file cannot be read,
-    DriveError if any of its values is wrong.
+    Values relative to the node id use `node` or, if it is None, the node id in the file. Raises FileError if the file
+    cannot be read, and DriveError if any of its values is wrong.
     """
     try:
         return _read_dcf(path, node) if path.suffix.lower() in (".dcf", ".eds") else _read_toml(path)
@@ -199,7 +202,7 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
     """Return the sections that describe objects, in a form that canopen reads, and the node id and serial number."""
     sections = configparser.RawConfigParser(inline_comment_prefixes=(";",))
     sections.optionxform = lambda optionstr: _KEYWORDS.get(optionstr.lower(), optionstr)  # type: ignore[method-assign]
-    # Strict, unlike an EDS: which of two duplicate values to write into a drive cannot be guessed.
+    # Strict, unlike an EDS: it is impossible to tell which of two duplicate values to write into a drive.
     strict = configparser.RawConfigParser(allow_no_value=True)
     strict.read_string(path.read_text(encoding="utf-8-sig", errors="replace").rstrip("\x1a\0 \r\n\t"))
     with eds.open_text(path) as text:
@@ -209,7 +212,7 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
         for option, content in sections.items(name):
             if not content and option != "ParameterName":
                 sections.remove_option(name, option)
-            elif content.startswith("0x-"):  # as canopen writes a negative number, and cannot read it
+            elif content.startswith("0x-"):  # canopen writes negative numbers this way, and cannot read them
                 sections[name][option] = f"-0x{content[3:]}"
         if _UNUSED.fullmatch(name):
             commissioned |= {key: int(sections[name][key], 0) for key in _KEYWORDS.values() if key in sections[name]}
@@ -220,7 +223,7 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
 
 
 def _expand(sections: configparser.RawConfigParser, index: str, values: Mapping[str, str]) -> None:
-    """Expand the values of an array in one section, [1234Value], into a section for each element."""
+    """Expand the values of an array in one section, [1234Value], into one section for each element."""
     for number in filter(str.isdigit, values):
         element = f"{index}sub{int(number):X}"
         if element not in sections:
@@ -229,7 +232,7 @@ def _expand(sections: configparser.RawConfigParser, index: str, values: Mapping[
 
 
 def _parse(variable: ODVariable, raw: str) -> Parameter:
-    """Return an object with its ParameterValue. Raises ValueError if that is invalid."""
+    """Return an object with its ParameterValue. Raises ValueError if the value is invalid."""
     where = f"object {named((variable.index, variable.subindex))}: "
     value, bits, data_type = variable.value, len(variable), variable.data_type or 0
     if data_type in SIGNED_TYPES and raw.lower().startswith("0x") and value is not None and value >> bits - 1 == 1:
@@ -241,7 +244,7 @@ def _parse(variable: ODVariable, raw: str) -> Parameter:
 
 
 def _is_within_limits(variable: ODVariable, value: Value | None) -> bool:
-    """Whether the EDS allows a value; limits that exclude every value, as in some files, are ignored."""
+    """Whether the EDS allows a value. Limits that exclude every value, which some files contain, are ignored."""
     low, high = variable.min, variable.max
     if low is None or high is None or low > high or not isinstance(value, int | float):
         return True

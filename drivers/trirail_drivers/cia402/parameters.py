@@ -1,4 +1,4 @@
-"""Choice of the objects that are a drive's parameters, and their values for people."""
+"""Selection of the objects that are a drive's parameters, and their values for people."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from trirail_drivers.cia402.objects import Key
 Value = int | float | str | bytes
 
 _COMMANDS: Final = frozenset((0x1003, 0x1010, 0x1011, 0x1013, 0x1020, *range(0x1023, 0x1027)))
-"""Commands of CiA 301: error field, store and restore, time stamp, objects that any write clears, OS command."""
+"""Command objects of CiA 301: error field, store and restore, time stamp, objects cleared by any write, OS command."""
 _PROGRAMS: Final = range(0x1F50, 0x1F60)
 _NMT_REQUESTS: Final = (0x1F82, 0x1F83)
-"""Commands of CiA 302: program download and control; a master's requests."""
+"""Command objects of CiA 302: program download and control, and requests to the NMT master."""
 _PROCESS: Final = frozenset(
     (0x603F, *range(0x6040, 0x6046), *range(0x6060, 0x6065), 0x6069, 0x606B, 0x606C, 0x6071, 0x6074,
      *range(0x6077, 0x607B), *range(0x60B0, 0x60B3), *range(0x60B8, 0x60BE), 0x60C1, *range(0x60D1, 0x60DA),
@@ -46,7 +46,7 @@ class Parameter(NamedTuple):
     data_type: int
     """CiA 301 data type."""
     data: bytes
-    """Value as SDO transfers it."""
+    """Value as transferred by SDO."""
     name: str
 
     @property
@@ -57,24 +57,24 @@ class Parameter(NamedTuple):
 
     @property
     def fixed_size(self) -> bool:
-        """Whether every value of its type has the same length."""
+        """Whether all values of the data type have the same length."""
         return self.data_type in ODVariable.STRUCT_TYPES
 
 
 def named(key: Key) -> str:
-    """Return an object's index and subindex as in files and tables: 6065:00."""
+    """Return an object's index and subindex as written in files and tables, such as 6065:00."""
     return f"{key[0]:04X}:{key[1]:02X}"
 
 
 def variables(objects: ObjectDictionary) -> Iterator[tuple[Key, ODVariable]]:
-    """Yield every object and sub-object of a dictionary, in their order."""
+    """Yield every object and sub-object of a dictionary in order."""
     for index, item in objects.items():
         members = [item] if isinstance(item, ODVariable) else item.subindices.values()
         yield from sorted(((index, each.subindex), each) for each in members)
 
 
 def is_parameter(variable: ODVariable) -> bool:
-    """Whether an object is a parameter: readable and writable, neither process data nor a command."""
+    """Whether an object is a parameter: it can be read and written, and is neither process data nor a command."""
     index, access = variable.index, variable.access_type
     if not (variable.readable and variable.writable) or variable.data_type == DOMAIN:
         return False
@@ -88,7 +88,7 @@ def is_parameter(variable: ODVariable) -> bool:
 
 
 def parameter(data_type: int | None, data: bytes, name: str) -> Parameter:
-    """Return bytes as a parameter of a type, or of one that fits their length if the EDS' type does not."""
+    """Return bytes as a parameter of a data type, or of one that fits their length if the type in the EDS does not."""
     sign = next((types for types in (SIGNED_TYPES, (BOOLEAN, *UNSIGNED_TYPES)) if data_type in types), ())
     for each in (data_type or OCTET_STRING, *sign):
         if _is_exact(each, data):
@@ -97,13 +97,13 @@ def parameter(data_type: int | None, data: bytes, name: str) -> Parameter:
 
 
 def decode(data_type: int, data: bytes) -> Value:
-    """Decode bytes by a data type of CiA 301."""
+    """Decode bytes according to a data type of CiA 301."""
     value = _variable(data_type).decode_raw(data)
     return int(value) if isinstance(value, bool) else bytes(value) if isinstance(value, bytearray) else value
 
 
 def encode(data_type: int, value: Value, where: str = "") -> bytes:
-    """Encode a value as SDO transfers it. Raises ValueError if the type cannot hold it."""
+    """Encode a value for transfer by SDO. Raises ValueError if the data type cannot hold it."""
     try:
         data = bytes(_variable(data_type).encode_raw(value))
         if data_type in FLOAT_TYPES or decode(data_type, data) == value:
@@ -120,7 +120,7 @@ def _variable(data_type: int) -> ODVariable:
 
 
 def _is_exact(data_type: int, data: bytes) -> bool:
-    """Whether a file can hold the bytes exactly as a value of a type."""
+    """Whether a file can represent the bytes exactly as a value of a data type."""
     codec = ODVariable.STRUCT_TYPES.get(data_type)
     if codec is not None and codec.size != len(data):
         return False

@@ -1,4 +1,4 @@
-"""Mapping of a CiA 402 drive's PDOs, or use of fixed ones that fit (CiA 301, 1400h to 1BFFh)."""
+"""Mapping of a CiA 402 drive's PDOs, or use of suitable fixed PDOs (CiA 301, 1400h to 1BFFh)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from trirail_drivers.errors import DriveError
 RPDO: Final = 0x1400
 TPDO: Final = 0x1800
 MAX_PDOS: Final = 512
-"""Largest number of PDOs in one direction (CiA 301)."""
+"""Maximum number of PDOs in one direction (CiA 301)."""
 _MAX_GAP: Final = 4
-"""Number of consecutive missing PDOs after which a drive has no more, except those in its EDS."""
+"""Number of consecutive missing PDOs after which a drive has no more, except those listed in its EDS."""
 _IDENTIFIER: Final = 0x7FF
 EVERY_SYNC: Final = 1
 ON_CHANGE: Final = 255
@@ -46,17 +46,17 @@ class PdoParameters(NamedTuple):
     kind: int | None
     """Transmission type."""
     entries: tuple[int, ...] | None
-    """Its mapping, without empty entries; None if the drive does not report it."""
+    """Mapping without empty entries; None if the drive does not report it."""
     number: int | None
-    """Number of its entries, including empty ones."""
+    """Number of mapped entries, including empty ones."""
 
     def maps(self, entries: tuple[int, ...]) -> bool:
-        """Whether it has exactly this mapping."""
+        """Whether the PDO has exactly this mapping."""
         return self.entries == entries and self.number == len(entries)
 
     @property
     def valid(self) -> bool:
-        """Whether it is in use."""
+        """Whether the PDO is in use."""
         return self.cob_id is not None and not self.cob_id & INVALID
 
     @property
@@ -72,9 +72,9 @@ class _TargetPdo(NamedTuple):
     kind: int
     entries: tuple[int, ...]
     timer: tuple[int, int] | None
-    """Subindex and value of its event timer, if it must change."""
+    """Subindex and value of the event timer, if it must change."""
     inhibit: tuple[int, int] | None
-    """Subindex and value of its inhibit time, if it must change."""
+    """Subindex and value of the inhibit time, if it must change."""
 
 
 class Pdos:
@@ -87,9 +87,9 @@ class Pdos:
         self._used: set[int] = set()
 
     async def setpoints(self, mode: int) -> tuple[SetpointPdo, int | None]:
-        """Return the setpoints' RPDO, with SYNC, and the identifier of the controlword's event-driven RPDO.
+        """Return the SYNC-driven RPDO of the setpoints, and the identifier of the event-driven RPDO of the controlword.
 
-        DriveError if one of them cannot be mapped and no fixed PDO fits.
+        Raises DriveError if one of them cannot be mapped and no fixed PDO fits.
         """
         position = POSITIONS[mode]
         wanted: list[tuple[int, ...]] = [(position,)]
@@ -112,7 +112,7 @@ class Pdos:
         return chosen, control
 
     async def outputs(self) -> int | None:
-        """Return the identifier of the digital outputs' RPDO, with SYNC, or None if the drive has none for them."""
+        """Return the identifier of the SYNC-driven RPDO of the digital outputs, or None if there is none."""
         entries, number = (DIGITAL_OUTPUTS,), canopen_frames.RPDO3 + self._node
         for index in (RPDO + 2, RPDO + 3, RPDO):
             if (
@@ -126,10 +126,11 @@ class Pdos:
         return None if pdo is None else pdo.identifier
 
     async def feedback(self, *, inputs: bool = False) -> tuple[FeedbackPdo, int | None, bool, int | None]:
-        """Return the position's TPDO, with SYNC; the identifier of the statusword's, or None; whether to poll; inputs'.
+        """Return the TPDOs of the position, the statusword and the digital inputs.
 
-        The last is the identifier of the TPDO of the digital `inputs`, if they are wanted, which may be the
-        statusword's. DriveError if no TPDO takes them.
+        The result is the SYNC-driven TPDO of the position; the identifier of the TPDO of the statusword, or None;
+        whether the statusword must be polled; and the identifier of the TPDO of the digital `inputs`, if they are
+        wanted, which may be the same as for the statusword. Raises DriveError if no TPDO can carry them.
         """
         chosen, status, polled, beside = await self._feedback_and_status(inputs=inputs)
         if not inputs or beside:
@@ -137,7 +138,7 @@ class Pdos:
         return chosen, status, polled, await self._inputs()
 
     async def _inputs(self) -> int:
-        """Return the identifier of a TPDO of the digital inputs alone; DriveError if there is none."""
+        """Return the identifier of a TPDO that carries only the digital inputs. Raises DriveError if there is none."""
         entries, number = (DIGITAL_INPUTS,), canopen_frames.TPDO3 + self._node
         for index in (TPDO + 2, TPDO + 3, TPDO):
             if (
@@ -161,7 +162,9 @@ class Pdos:
         return None
 
     async def _feedback_and_status(self, *, inputs: bool) -> tuple[FeedbackPdo, int | None, bool, bool]:
-        """Return position and statusword as `feedback` does, and whether wanted inputs are beside the statusword."""
+        """Return position and statusword as `feedback` does, and whether wanted inputs are mapped in the statusword's
+        PDO.
+        """
         timed = await self._remote.has(TPDO, 5) and await self._can_be_prompt(TPDO)
         wanted = [(ACTUAL_POSITION,)] if timed else [(ACTUAL_POSITION, STATUSWORD), (ACTUAL_POSITION,)]
         for entries in wanted:
@@ -185,7 +188,7 @@ class Pdos:
         return chosen, status, polled, beside
 
     async def switch_off_others(self) -> None:
-        """Switch off unused PDOs: they add bus load that is not budgeted, or accept frames of other senders."""
+        """Switch off unused PDOs: they add bus load that is not budgeted, or accept frames from other senders."""
         for base in (RPDO, TPDO):
             for index in await self._all(base):
                 pdo = await self._pdo(index)
@@ -201,7 +204,7 @@ class Pdos:
     # ------------------------------------------------------------------ mapping
 
     async def _map(self, index: int, identifier: int, kind: int, entries: tuple[int, ...]) -> int | None:
-        """Map a PDO in the order of CiA 301; return its identifier, or None if the drive refuses."""
+        """Map a PDO in the order that CiA 301 prescribes; return its identifier, or None if the drive refuses."""
         if not await self._remote.has(index, 1) or not await self._remote.has(index + 0x200):
             return None
         current = await self._pdo(index)
@@ -227,11 +230,11 @@ class Pdos:
         return kept
 
     async def _is_mappable(self, entry: int, sending: bool) -> bool:
-        """Whether the drive has an object of that length that PDOs of this direction may carry (CiA 301, 1600h)."""
+        """Whether the drive has an object of that length that PDOs in this direction may carry (CiA 301, 1600h)."""
         index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
         remote = self._remote
         if not remote.read_only:
-            return True  # the mapping itself will show it
+            return True  # the mapping itself will show this
         if not await remote.has(index, subindex) or await remote.bits(index, subindex) != bits:
             return False
         if sending:
@@ -243,7 +246,7 @@ class Pdos:
         index, write, wait_until = current.at, self._remote.write, self._remote.wait_until
         fixed = False
         try:
-            # CiA 301: the identifier changes only while the PDO is invalid, so it is invalidated under its old one.
+            # CiA 301: the identifier may change only while the PDO is invalid, so it is invalidated under its old one.
             await write(
                 index, 1, (current.cob_id if current.valid and current.cob_id is not None else cob_id) | INVALID
             )
@@ -280,7 +283,10 @@ class Pdos:
         return cob_id & _IDENTIFIER
 
     async def _set_timer(self, index: int, subindex: int, value: int) -> None:
-        """Set the event timer; if a TPDO's is refused, keep the PDO: its statusword is polled as well."""
+        """Set the event timer.
+
+        If the drive refuses it for a TPDO, the PDO is kept and its statusword is polled as well.
+        """
         try:
             await self._remote.write(index, subindex, value)
         except SdoRefused as refusal:
@@ -293,7 +299,9 @@ class Pdos:
         await self._drive.confirm((index, subindex), value)
 
     async def _event_timer(self, index: int, kind: int) -> tuple[int, int] | None:
-        """Return the event timer to set: a TPDO's repeats the statusword, an RPDO's is a deadline and must be off."""
+        """Return the event timer to set: in a TPDO it repeats the statusword; in an RPDO it is a deadline and must be
+        off.
+        """
         if index < TPDO:
             return await self._parameter(index, 5, 0)
         return (
@@ -301,7 +309,9 @@ class Pdos:
         )
 
     async def _parameter(self, index: int, subindex: int, value: int) -> tuple[int, int] | None:
-        """Return a communication parameter to change, or None if the drive lacks it or has the value."""
+        """Return a communication parameter that must be changed, or None if the drive lacks it or already has the
+        value.
+        """
         if not await self._remote.has(index, subindex) or await self._remote.peek(index, subindex) == value:
             return None
         return subindex, value
@@ -335,7 +345,7 @@ class Pdos:
     async def _find_fixed(
         self, base: int, fits: Callable[[tuple[int, ...]], bool], name: str, kind: int
     ) -> PdoParameters:
-        """Return a PDO whose fixed mapping fits; DriveError if there is none."""
+        """Return a PDO whose fixed mapping fits. Raises DriveError if there is none."""
         seen = []
         for index in await self._all(base):
             pdo = await self._pdo(index)
@@ -365,7 +375,9 @@ class Pdos:
     # ------------------------------------------------------------------ the statusword
 
     async def _status(self, *, inputs: bool) -> tuple[int | None, bool]:
-        """Return the identifier of the statusword's TPDO, or None, and whether wanted inputs are mapped beside it."""
+        """Return the identifier of the statusword's TPDO, or None, and whether wanted inputs are mapped in the same
+        TPDO.
+        """
         number = canopen_frames.TPDO1 + self._node
         if inputs:
             identifier = await self._map(TPDO, number, ON_CHANGE, (STATUSWORD, DIGITAL_INPUTS))
@@ -382,7 +394,7 @@ class Pdos:
         return await self._remote.peek(TPDO, 5) == round(1000 * canopen_frames.STATUS_PERIOD)
 
     async def _can_be_prompt(self, index: int) -> bool:
-        """Whether the inhibit time is 0 or can be set to 0; otherwise a statusword may be late."""
+        """Whether the inhibit time is 0 or can be set to 0; otherwise a statusword may be delayed."""
         if not await self._remote.has(index, 3) or await self._remote.peek(index, 3) == 0:
             return True
         cob_id = await self._remote.peek(index, 1) or 0
@@ -398,7 +410,7 @@ class Pdos:
     # ------------------------------------------------------------------ reading
 
     async def _mappable(self, entry: int) -> bool:
-        """Whether the drive has an object that its EDS, if there is one, allows in PDOs."""
+        """Whether the drive has an object that, according to its EDS if there is one, may be mapped to PDOs."""
         variable = self._remote.client.od.get_variable(entry >> 16, entry >> 8 & 0xFF)
         there = await self._remote.has(entry >> 16, entry >> 8 & 0xFF)
         return there and (variable is None or bool(variable.pdo_mappable))

@@ -23,16 +23,16 @@ VELOCITY_OFFSET: Final = 0x60B1_00_20
 INTERPOLATION_DATA: Final = 0x60C1_01_20
 DIGITAL_INPUTS: Final = 0x60FD_00_20
 DIGITAL_OUTPUTS: Final = 0x60FE_01_20
-"""Entries of PDO mappings: index, subindex, bits (CiA 301, 1600h)."""
+"""Entries of PDO mappings: index, subindex, number of bits (CiA 301, 1600h)."""
 
 POSITIONS: Final = {CYCLIC_SYNCHRONOUS_POSITION: TARGET_POSITION, INTERPOLATED_POSITION: INTERPOLATION_DATA}
-"""Object of the setpoint in each mode."""
+"""Setpoint object in each mode."""
 
 _FORMATS: Final = {8: "b", 16: "h", 32: "i", 64: "q"}
 
 
 class SetpointPdo:
-    """RPDO of the setpoints: its identifier, and its layout of position, velocity and controlword."""
+    """RPDO of the setpoints: its identifier, and the layout of position, velocity and controlword."""
 
     __slots__ = ("_layout", "_order", "entries", "identifier", "size")
 
@@ -50,16 +50,16 @@ class SetpointPdo:
         self.size = self._layout.size
 
     def frame(self) -> Frame:
-        """Return a frame to fill in each cycle."""
+        """Return a frame that is filled in each cycle."""
         return Frame(self.identifier, bytes(self.size))
 
     def fill(self, frame: Frame, counts: int, velocity: int, controlword: int) -> None:
-        """Fill a frame; struct.error if a number is too large."""
+        """Fill a frame. Raises struct.error if a number is too large."""
         values = counts, velocity, controlword
         frame.fill(self._layout, *[values[field] for field in self._order])
 
     def offset(self, field: int) -> int:
-        """Return the offset of the position (0) or velocity (1) in a frame's data [bytes]; -1 for none."""
+        """Return the offset of the position (0) or velocity (1) in a frame's data [bytes]; -1 if it is not mapped."""
         if field not in self._order:
             return -1
         before = self.entries[: self._order.index(field)]
@@ -72,12 +72,12 @@ class SetpointPdo:
 
     @property
     def has_controlword(self) -> bool:
-        """Whether the controlword is mapped beside the setpoint, since it has no PDO of its own."""
+        """Whether the controlword is mapped in the setpoint's PDO, because it has no PDO of its own."""
         return CONTROLWORD in self.entries
 
 
 class FeedbackPdo:
-    """TPDO of the position, and of the statusword if it is mapped beside it."""
+    """TPDO of the position, and of the statusword if it is mapped in the same PDO."""
 
     __slots__ = ("_layout", "_position", "_status", "entries", "has_status", "identifier", "size")
 
@@ -92,25 +92,25 @@ class FeedbackPdo:
         self.size = self._layout.size
 
     def offset(self, entry: int) -> int:
-        """Return the offset of an entry in a frame's data [bytes]; -1 for none."""
+        """Return the offset of an entry in a frame's data [bytes]; -1 if it is not mapped."""
         if entry not in self.entries:
             return -1
         return sum((each & 0xFF) // 8 for each in self.entries[: self.entries.index(entry)])
 
     def unpack(self, data: bytes | bytearray) -> tuple[int, int | None]:
-        """Return position [counts] and statusword, or None; struct.error for a wrong length."""
+        """Return the position [counts], and the statusword or None. Raises struct.error for a wrong length."""
         values = self._layout.unpack(data)
         return values[self._position], values[self._status] if self.has_status else None
 
 
 def fits_setpoints(entries: tuple[int, ...], mode: int) -> bool:
-    """Whether a fixed mapping takes setpoints, and nothing that this service does not provide."""
+    """Whether a fixed mapping contains setpoints, and only objects that this service provides."""
     known = {POSITIONS[mode], VELOCITY_OFFSET, CONTROLWORD}
     return POSITIONS[mode] in entries and set(entries) <= known
 
 
 def fits_feedback(entries: tuple[int, ...]) -> bool:
-    """Whether a fixed mapping has the position."""
+    """Whether a fixed mapping contains the position."""
     return ACTUAL_POSITION in entries and all(entry & 0xFF in _FORMATS for entry in entries)
 
 
@@ -119,33 +119,36 @@ class Exchange:
     """Exchange of setpoints and feedback with one drive."""
 
     mode: int
-    """6060h: cyclic synchronous position, or interpolated position."""
+    """Mode 6060h: cyclic synchronous position, or interpolated position."""
     setpoints: SetpointPdo
     controlword: int | None
-    """Identifier of the controlword's RPDO; None if it is mapped beside the setpoint."""
+    """Identifier of the controlword's RPDO; None if the controlword is mapped in the setpoint's RPDO."""
     feedback: FeedbackPdo
     status: int | None
-    """Identifier of the event-driven TPDO of the statusword; None if it is mapped beside the position."""
+    """Identifier of the event-driven TPDO of the statusword; None if the statusword is mapped in the position's TPDO.
+    """
     polled: bool = False
-    """Whether the statusword is requested by SDO, since no PDO repeats it."""
+    """Whether the statusword is requested by SDO, because no PDO repeats it."""
     guarded: bool = False
-    """Whether node guarding is used, since it has no heartbeat consumer."""
+    """Whether node guarding is used, because the drive has no heartbeat consumer."""
     heard: bool = True
-    """Whether it sends heartbeats or answers node guarding."""
+    """Whether the drive sends heartbeats or answers node guarding."""
     emergency: int = 0
-    """Identifier of its EMCY."""
+    """Identifier of the drive's EMCY."""
     tells_following: bool = True
-    """Whether bit 12 of its statusword must show that it follows setpoints."""
+    """Whether bit 12 of the statusword must show that the drive follows setpoints."""
     mode_shown: bool = True
-    """Whether 6061h shows the mode without power too."""
+    """Whether 6061h also shows the mode without power."""
     outputs: int | None = None
-    """Identifier of the RPDO of the digital outputs, which take effect at the SYNC; None if there are none, or if
-    an SDO writes them."""
+    """Identifier of the RPDO of the digital outputs, which take effect at the SYNC; None if there are no outputs, or if
+    an SDO writes them.
+    """
     outputs_kept: int = 0
-    """Bits of 60FEh:01 that are sent as they were at set-up, beside the outputs."""
+    """Bits of 60FEh:01 next to the outputs that are sent unchanged since set-up."""
     inputs: int | None = None
-    """Identifier of the event-driven TPDO of the digital inputs: the statusword's if they are mapped beside it, else
-    one of their own; None if there are none."""
+    """Identifier of the event-driven TPDO of the digital inputs, which may be the statusword's TPDO; None if there are
+    no inputs.
+    """
 
     @property
     def status_size(self) -> int:
@@ -154,7 +157,7 @@ class Exchange:
 
     @property
     def identifiers(self) -> set[int]:
-        """Identifiers of all its PDOs."""
+        """Identifiers of all PDOs of the drive."""
         each = (
             self.setpoints.identifier,
             self.controlword,
@@ -167,7 +170,7 @@ class Exchange:
 
     @property
     def name(self) -> str:
-        """Description in words."""
+        """Description of the exchange for people."""
         mode = "interpolated position" if self.mode == INTERPOLATED_POSITION else "cyclic synchronous position"
         offset = " with velocity offset" if self.setpoints.has_velocity else ""
         status = "with the position" if self.feedback.has_status else "event-driven" if self.status else ""
@@ -176,7 +179,7 @@ class Exchange:
 
 
 def default_exchange(node: int, io: DigitalIo = NO_IO[0]) -> Exchange:
-    """Return the exchange of a drive that has every optional object of CiA 301 and CiA 402-2."""
+    """Return the exchange with a drive that has every optional object of CiA 301 and CiA 402-2."""
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
         SetpointPdo(canopen_frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),
@@ -190,7 +193,7 @@ def default_exchange(node: int, io: DigitalIo = NO_IO[0]) -> Exchange:
 
 
 def traffic(exchanges: Iterable[Exchange]) -> Traffic:
-    """Return the bus traffic of the service and of drives with these exchanges."""
+    """Return the bus traffic of the service and of the drives with these exchanges."""
     exchanges = tuple(exchanges)
     cycle = frame_bits(0) + sum(
         frame_bits(exchange.setpoints.size) + frame_bits(exchange.feedback.size) for exchange in exchanges

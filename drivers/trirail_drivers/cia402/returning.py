@@ -1,4 +1,4 @@
-"""Set-up of a returning CiA 402 drive in the background: see trirail_drivers.driver.recovery."""
+"""Set-up of a returning CiA 402 drive in the background; see trirail_drivers.driver.recovery."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock
 
 SETTLED_AFTER: Final = 2 * ANSWERS_AFTER
-"""SYNCs after a boot-up in which another node with that id shows itself by its answers."""
+"""Number of SYNCs after a boot-up within which the answers of another node with the same id reveal it."""
 _NUMBERS: Final = {"vendor": "vendor", "product": "product code", "revision": "revision", "serial": "serial number"}
 """Fields of an Identity, and their names in CiA 301 (1018h)."""
 _MAY_DIFFER: Final = ("revision", "serial")
@@ -26,7 +26,7 @@ _MAY_DIFFER: Final = ("revision", "serial")
 
 
 class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
-    """One CiA 402 drive; its set-up is `setup.configure_one`."""
+    """One CiA 402 drive; `setup.configure_one` sets it up."""
 
     work, counted = "configuring", "objects"
 
@@ -38,7 +38,9 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         configured: Callable[[SetUp, Start], None],
         setups: Callable[[], Sequence[SetUp]],
     ) -> None:
-        """`configured` lets the drive take part in the cycle, and may raise DriveError; `setups` are those of all."""
+        """`configured` lets the drive take part in the cycle, and may raise DriveError; `setups` returns those of all
+        drives.
+        """
         super().__init__(axis)
         self.one = one
         self._fastest = fastest
@@ -54,7 +56,7 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         return configure_one(self.one._replace(remote=remote), self._fastest, self._check), client
 
     def accept(self, made: SetUp, begun: Start) -> str:
-        """Let the drive take part in the cycle; it is not homed if its home offset has changed."""
+        """Let the drive take part in the cycle; it counts as not homed if its home offset has changed."""
         self._configured(made, begun)
         if self.setup is None or made.home_offset == self.setup.home_offset:
             return ""
@@ -65,7 +67,7 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         )
 
     def may_have_power(self, *, stopping: bool) -> bool:
-        """Whether its statusword shows power; while drives stop, a silent one may have it too."""
+        """Whether the statusword shows power; while drives are stopping, a silent drive may have power too."""
         axis = self.axis
         if axis.restarted:
             return False
@@ -74,15 +76,17 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
 
     @property
     def settled(self) -> bool:
-        """Whether another node with its id would have shown itself by now."""
+        """Whether another node with the same id would have revealed itself by now."""
         return self.axis.syncs >= self.booted_at + SETTLED_AFTER
 
     def has_answered(self, now: float) -> bool:
-        """Whether the cycle's SDO request is answered or timed out: a server takes one at a time (CiA 301)."""
+        """Whether the cycle's SDO request has been answered or has timed out: a server handles one request at a time
+        (CiA 301).
+        """
         return not self.axis.unanswered or now >= self.axis.answered_by
 
     def _check(self, looked: SetUp) -> None:
-        """Raise DriveError for another drive than the one before, and for PDO identifiers that another drive uses."""
+        """Raise DriveError if the drive is not the same as before, or has a PDO identifier that another drive uses."""
         name, allowed = self.axis.name, self.one.drive.allow_replacement
         if self.setup is not None:
             before, now = self.setup.identity, looked.identity

@@ -1,4 +1,4 @@
-"""A drive's object dictionary over SDO: reads, writes and checks whose errors name drive and object."""
+"""Object dictionary of a drive over SDO, with reads, writes and checks whose errors name the drive and the object."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ READ_ONLY: Final = 0x0601_0002
 """SDO abort code: an attempt to write a read-only object."""
 TOO_LONG: Final = 0x0607_0012
 WRONG_LENGTH: Final = (0x0607_0010, TOO_LONG, 0x0607_0013)
-"""SDO abort codes: the value's length differs from the object's, is larger, is smaller."""
+"""SDO abort codes: the value's length differs from the object's, is too large, or is too small."""
 INVALID: Final = 1 << 31
-"""Bit of a PDO's COB-ID: the PDO is not used."""
+"""Bit of a PDO's COB-ID that marks the PDO as not used."""
 NO_REMOTE_REQUEST: Final = 1 << 30
-"""Bit of a TPDO's COB-ID; some drives always report it, some never."""
+"""Bit of a TPDO's COB-ID; some drives always report it, some never do."""
 _BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x60FD, 0x60FE, 0x6502)
 
 
 class SdoRefused(DriveError):
-    """A drive refused a request about an object."""
+    """A drive refused a request for an object."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -45,21 +45,22 @@ class RestartedError(DriveError):
 
 
 class Remote:
-    """A drive's object dictionary over SDO; errors name the drive and the object.
+    """Object dictionary of a drive over SDO; errors name the drive and the object.
 
-    Read values are cached until they are written: only this service sets the drive up meanwhile.
+    Values that have been read are cached until they are written, since only this service configures the drive
+    meanwhile.
     """
 
     rehearsed = False
-    """Whether nothing is written."""
+    """Whether nothing is written, as in a dry run."""
     read_only = False
     """Whether the drive is only asked which objects may be written."""
 
     boots = False
-    """Whether the drive's boot is awaited."""
+    """Whether the client is waiting for the drive to boot."""
 
     logs = True
-    """Whether that is logged; the cycle logs nothing."""
+    """Whether that wait is logged; the cycle does not log."""
 
     def __init__(self, name: str, client: Client, skipped: str = "") -> None:
         self.name = name
@@ -76,7 +77,7 @@ class Remote:
         self._described[key] = size, signed
 
     async def peek(self, index: int, subindex: int = 0) -> int | None:
-        """Return the value of an object, cached; None if the drive lacks the object or it cannot be read."""
+        """Return the cached or read value of an object; None if the drive lacks the object or it cannot be read."""
         key = index, subindex
         if key not in self._read and key not in self._missing:
             try:
@@ -96,29 +97,29 @@ class Remote:
         return (index, subindex) not in self._missing
 
     async def read(self, index: int, subindex: int = 0) -> int:
-        """Return the present value of an object; SdoRefused if it cannot be read."""
+        """Return the present value of an object. Raises SdoRefused if it cannot be read."""
         key = index, subindex
         return self._value(key, await self.content(key))
 
     async def content(self, key: Key) -> bytes:
-        """Return the present bytes of an object; SdoRefused if it cannot be read."""
+        """Return the present bytes of an object. Raises SdoRefused if it cannot be read."""
         with self._as_drive_error("read", key):
             data = self._read[key] = await self.client.upload(*key)
         return self._own(key, data)
 
     async def write(self, index: int, subindex: int, value: int) -> None:
-        """Write the value of an object; SdoRefused if the drive refuses it."""
+        """Write the value of an object. Raises SdoRefused if the drive refuses it."""
         key = index, subindex
         await self.put(key, await self._encoded(key, value), shown(index, subindex, value))
 
     async def put(self, key: Key, data: bytes, value: str) -> None:
-        """Write the bytes of an object, shown to people as `value`; SdoRefused if the drive refuses them."""
+        """Write the bytes of an object, shown to people as `value`. Raises SdoRefused if the drive refuses them."""
         self._read.pop(key, None)
         with self._as_drive_error(f"write {value} to", key):
             await self.client.download(*key, data)
 
     async def may_be_written(self, index: int, subindex: int = 0) -> bool:
-        """Whether the drive allows writing an object, as far as it reports that before the write."""
+        """Whether the drive allows an object to be written, as far as it reports that before the write."""
         key = index, subindex
         if key not in self._writable:
             try:
@@ -130,27 +131,29 @@ class Remote:
         return self._writable[key]
 
     async def _try_to_write(self, attempt: str, key: Key, size: int) -> None:
-        """Begin and abort a write; SdoRefused if the drive refuses to write the object, or this size.
+        """Begin and abort a write. Raises SdoRefused if the drive does not allow the object, or a value of this size.
 
-        Other refusals do not count, such as one of segmented transfers.
+        Other refusals, such as that of a segmented transfer, are ignored.
         """
         try:
             with self._as_drive_error(attempt, key):
                 await self.client.try_download(*key, size)
         except SdoRefused as refusal:
-            read = len(self._read.get(key) or b"") == size  # then the length is right
+            read = len(self._read.get(key) or b"") == size  # in that case, the length is right
             if refusal.code in (READ_ONLY, *NO_SUCH_OBJECT, *(() if read else WRONG_LENGTH)):
                 raise
 
     async def bits(self, index: int, subindex: int = 0) -> int:
-        """Return the length of an object [bits]: as read, else by the drive's EDS, else by the standards."""
+        """Return the length of an object [bits], as read or, failing that, according to the drive's EDS or the
+        standards.
+        """
         key = index, subindex
         await self.peek(index, subindex)
         known = self._read.get(key)
         return 8 * (self._size(key) if known is None else len(self._own(key, known)))
 
     async def _encoded(self, key: Key, value: int) -> bytes:
-        """Encode a value for an SDO; SdoRefused if it is too long for the object."""
+        """Encode a value for an SDO. Raises SdoRefused if it is too long for the object."""
         size = await self.bits(*key) // 8
         if not size or not -1 << 8 * size - 1 <= value < 1 << 8 * size:
             raise SdoRefused(
@@ -163,9 +166,9 @@ class Remote:
     async def wait_until(
         self, key: Key, predicate: Callable[[int], bool], seconds: float | None = None
     ) -> tuple[int | None, float]:
-        """Read an object until `predicate` holds, for up to `seconds`, or the time of an answer.
+        """Read an object until `predicate` holds, for up to `seconds`, or for the time of one answer.
 
-        Return its value, None if it cannot be read, and the time waited [s]. A drive may accept a value immediately
+        Return the value, or None if it cannot be read, and the time waited [s]. A drive may accept a value immediately
         and show it later.
         """
 
@@ -188,14 +191,18 @@ class Remote:
         return self._described[key][1] if key in self._described else signed(key)
 
     def _own(self, key: Key, data: bytes) -> bytes:
-        """Return the bytes of an answer that belong to the object, by its EDS: some drives pad to four."""
+        """Return the bytes of an answer that belong to the object according to its EDS, since some drives pad to four
+        bytes.
+        """
         variable = self.client.od.get_variable(*key)
         if len(data) > EXPEDITED or variable is None or not variable.fixed_size:
             return data
         return data[: len(variable) // 8]
 
     def _size(self, key: Key) -> int:
-        """Return the size of an unreadable object [bytes]: as described, else by its EDS, else by the standards."""
+        """Return the size of an unreadable object [bytes], as described, or according to the drive's EDS or the
+        standards.
+        """
         if key in self._described:
             return self._described[key][0]
         variable = self.client.od.get_variable(*key)
@@ -241,7 +248,7 @@ def run_setups(
     doing: str,
     conversations: Sequence[Coroutine[Any, Any, T]],
 ) -> list[T | DriveError]:
-    """Run a conversation with each drive concurrently, and log the progress every second: see `run_concurrently`."""
+    """Run one conversation with each drive concurrently, and log the progress every second; see `run_concurrently`."""
     over: set[str] = set()
 
     async def followed(remote: Remote, conversation: Coroutine[Any, Any, T]) -> T:
@@ -272,19 +279,19 @@ def reason(code: int) -> str:
 
 
 def is_pdo(index: int) -> bool:
-    """Whether an object is a PDO's parameter or mapping."""
+    """Whether an object is a communication or mapping parameter of a PDO."""
     return 0x1400 <= index < 0x1C00
 
 
 def shown(index: int, subindex: int, value: int) -> str:  # noqa: ARG001
-    """Return a value for people; bit fields in hexadecimal, as in the standards."""
+    """Return a value for people, with bit fields in hexadecimal as in the standards."""
     if is_pdo(index) or index in _BIT_FIELDS:
         return f"{value & 0xFFFF_FFFF:08X}h"
     return str(value)
 
 
 def same(index: int, subindex: int, one: int, other: int) -> bool:
-    """Whether two values are equivalent for this service."""
-    # Bit 30 of a PDO's COB-ID, whether remote requests are answered, does not matter here.
+    """Whether this service treats two values as equivalent."""
+    # Bit 30 of a PDO's COB-ID, which states whether remote requests are answered, is irrelevant here.
     ignored = NO_REMOTE_REQUEST if is_pdo(index) and not index & 0x200 and subindex == 1 else 0
     return one | ignored == other | ignored

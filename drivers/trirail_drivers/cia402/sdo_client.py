@@ -16,20 +16,20 @@ from trirail_drivers.driver.conversations import Wait
 from trirail_drivers.interface import Clock
 
 MAX_SECOND_ANSWERS: Final = 10
-"""Number of requests with a second answer, in one set-up, that prove two nodes."""
+"""Number of requests with a second answer that prove two nodes, within one set-up."""
 EXPEDITED: Final = 4
-"""Largest value in an expedited transfer [bytes]."""
+"""Maximum size of a value in an expedited transfer [bytes]."""
 ABORT_PAUSE_S: Final = 0.002
-"""Pause after an abort, for the drive to handle it."""
+"""Pause after an abort, in which the drive handles it [s]."""
 
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)
-"""Command specifiers of the client: the top bits of the first byte."""
+"""Command specifiers of the client, in the top bits of the first byte."""
 _ANSWERS: Final = {_DOWNLOAD_SEGMENT: 1, _DOWNLOAD: 3, _UPLOAD: 2, _UPLOAD_SEGMENT: 0, _ABORT: 4}
 """Command specifiers of the server's answers."""
 _SEGMENTS: Final = (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT)
 """Command specifiers of frames without index and subindex."""
 _IS_EXPEDITED, _HAS_SIZE, _TOGGLE, _LAST = 0x02, 0x01, 0x10, 0x01
-"""Bits of a first byte; the last two are those of segments."""
+"""Bits of the first byte; the last two belong to segments."""
 _TIMED_OUT: Final = 0x0504_0000
 _NOT_ALTERNATED: Final = 0x0503_0000
 _GENERAL_ABORT: Final = 0x0800_0000
@@ -37,7 +37,7 @@ _GENERAL_ABORT: Final = 0x0800_0000
 
 
 class TwoNodesError(SdoCommunicationError):
-    """Requests get two answers."""
+    """Requests receive two answers."""
 
     def __init__(self, node: int) -> None:
         super().__init__(duplicate_node.warning(node, "both answer"))
@@ -52,10 +52,10 @@ class BootedError(SdoCommunicationError):
 
 
 class Client:
-    """SDO requests to one node, whose answers and boot-up message are picked out of all received frames.
+    """SDO requests to one node. The client picks the answers and boot-up messages out of all received frames.
 
-    A drive may still answer an earlier request, of this service's last run or of an aborted attempt. So the answer to
-    a request must have its command specifier and object.
+    A drive may still answer an earlier request from the previous run of the service or from an aborted attempt.
+    Therefore the answer to a request must have the expected command specifier and object.
     """
 
     def __init__(self, bus: FrameSender, node: int, objects: ObjectDictionary, timeout: float, clock: Clock) -> None:
@@ -72,11 +72,11 @@ class Client:
         self._knows_no_segments = False
 
     async def pause(self, seconds: float) -> None:
-        """Wait [s]."""
+        """Wait for `seconds` [s]."""
         await Wait(self._is_awaited, self.clock() + seconds)
 
     async def upload(self, index: int, subindex: int) -> bytes:
-        """Read an object; some drives pad a shorter value to four bytes.
+        """Read an object. Some drives pad a shorter value to four bytes.
 
         Raises SdoAbortedError if the drive refuses, NoAnswerError, and SdoCommunicationError for other failures.
         """
@@ -96,7 +96,7 @@ class Client:
             toggle ^= _TOGGLE
 
     async def download(self, index: int, subindex: int, data: bytes) -> None:
-        """Write an object; raises as `upload` does."""
+        """Write an object. Raises the same errors as `upload`."""
         if 1 <= len(data) <= EXPEDITED:
             first = _DOWNLOAD << 5 | (EXPEDITED - len(data)) << 2 | _IS_EXPEDITED | _HAS_SIZE
             await self._request(struct.pack("<BHB4s", first, index, subindex, data))
@@ -111,10 +111,11 @@ class Client:
             toggle ^= _TOGGLE
 
     async def try_download(self, index: int, subindex: int, size: int) -> None:
-        """Begin to write `size` bytes and abort before the first; SdoAbortedError if the drive refuses.
+        """Begin to write `size` bytes and abort before the first one. Raises SdoAbortedError if the drive refuses.
 
-        This is a segmented download, whose first frame has only the size (CiA 301, SDO download initiate). A drive that
-        does not answer one only takes expedited transfers, and is not asked again: each request would time out.
+        This is a segmented download, whose first frame contains only the size (CiA 301, SDO download initiate). A drive
+        that does not answer it accepts only expedited transfers. It is not asked again, since each request would time
+        out.
         """
         if self._knows_no_segments:
             return
@@ -124,7 +125,7 @@ class Client:
             self._knows_no_segments = True
             return
         self._abort(index, subindex, code=_GENERAL_ABORT)
-        # An abort has no answer, and the next request could overwrite it in a drive with a buffer of one frame.
+        # An abort has no answer, and the next request could overwrite it in a drive that buffers only one frame.
         await self.pause(ABORT_PAUSE_S)
 
     async def _request(self, request: bytes) -> bytes:
@@ -152,12 +153,12 @@ class Client:
         try:
             self.bus.send(Frame(canopen_frames.SDO_REQUEST + self.node, data).message())
         except (can.CanError, OSError) as error:
-            # While all drives are off no node acknowledges, so the queue fills; the request then times out.
+            # While all drives are off, no node acknowledges frames, so the queue fills; the request then times out.
             if not canerrors.queue_is_full(error):
                 raise
 
     def _is_awaited(self, message: can.Message) -> bool:
-        """Whether a frame ends the wait: the answer, a boot-up message instead, or one second answer too many.
+        """Whether a frame ends the wait: the answer, a boot-up message instead of it, or one second answer too many.
 
         A single second answer may be a late one; MAX_SECOND_ANSWERS of them prove two servers.
         """
@@ -175,7 +176,7 @@ class Client:
 
 
 def answers(request: bytes, data: bytes) -> bool:
-    """Whether a frame of an SDO server can be the answer to a request (CiA 301, 7.2.4.3: the first byte's top bits)."""
+    """Whether a frame of an SDO server can be the answer to a request (CiA 301, 7.2.4.3: top bits of first byte)."""
     if len(data) != 8:
         return False
     asked, answered = request[0] >> 5, data[0] >> 5

@@ -1,4 +1,4 @@
-"""Required values of a CiA 402 drive's objects before the cycle runs, and accepted alternatives."""
+"""Values that a CiA 402 drive's objects must have before the cycle runs, and accepted alternatives."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 from trirail_drivers.interface import NAMES
 
 PREFERRED_EXPONENT: Final = -3
-"""Exponent of 60C2h for milliseconds, which every drive takes; some take no other."""
+"""Exponent of 60C2h for milliseconds, which every drive accepts; some accept no other."""
 
 
 def interpolation_periods(period: float) -> list[tuple[int, int]]:
-    """Return values and powers of ten [s] for object 60C2h that equal `period`, milliseconds first; else DriveError."""
+    """Return values and powers of ten [s] for object 60C2h that equal `period`, milliseconds first.
+
+    Raises DriveError if there are none.
+    """
     candidates = [
         (round(period * 10**-exponent), exponent)
         for exponent in range(0, -7, -1)
@@ -37,7 +40,7 @@ def interpolation_periods(period: float) -> list[tuple[int, int]]:
 
 
 def check_nodes(drives: Drives) -> None:
-    """Raise DriveError for node ids that CANopen does not have, or that two nodes share."""
+    """Raise DriveError for node ids that are not valid in CANopen, or that two nodes share."""
     nodes = {f"drives.{name}.node": drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
     nodes["drives.master_node"] = drives.master_node
     for key, node in nodes.items():
@@ -49,7 +52,7 @@ def check_nodes(drives: Drives) -> None:
 
 
 def heartbeat_period_ms(drives: Drives) -> int:
-    """Return the heartbeat period [ms]; DriveError if a drive cannot take it."""
+    """Return the heartbeat period [ms]. Raises DriveError if a drive cannot accept it."""
     heartbeat = round(1000 * drives.heartbeat)
     if not 1 <= 3 * heartbeat <= 0xFFFF or heartbeat < 1:
         raise DriveError(f"heartbeat {drives.heartbeat:g} s: a drive takes 0.001 to 21.845 s")
@@ -67,9 +70,9 @@ async def configure_cycle_period(drive: Differences, period: float) -> None:
 PLAIN_SYNC: Final = (
     ((0x1005, 0), 0x80, 0x4000_07FF),  # bit 30: the drive would send SYNC itself
     ((0x1007, 0), 0, 0xFFFF_FFFF),  # setpoints and positions outside this window are dropped
-    ((0x1019, 0), 0, 0xFF),  # a drive that expects a counter answers a SYNC without one by EMCY 8240h
+    ((0x1019, 0), 0, 0xFF),  # a drive that expects a counter answers a SYNC without one with EMCY 8240h
 )
-"""Objects of SYNC that another master may have changed: key, required value, and its bits."""
+"""SYNC objects that another master may have changed: key, required value, and the relevant bits."""
 
 
 async def _configure_sync(drive: Differences, key: Key, wanted: int, bits: int) -> None:
@@ -79,7 +82,7 @@ async def _configure_sync(drive: Differences, key: Key, wanted: int, bits: int) 
         return
     if key == (0x1019, 0) and await remote.peek(0x1006):
         with suppress(SdoRefused):
-            await remote.write(0x1006, 0, 0)  # CiA 301: the counter changes only while the period is 0
+            await remote.write(0x1006, 0, 0)  # CiA 301: the counter may change only while the period is 0
             await remote.wait_until((0x1006, 0), lambda held: held == 0)
     await drive.ensure(*key, wanted)
     if (await remote.peek(*key) or 0) & bits != wanted:
@@ -122,10 +125,10 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
 async def configure_reactions(drive: Differences, drives: Drives, units: Units) -> None:
     """Configure the drive's reactions to faults: 6007h, 605Ah, 605Eh, 6065h, 6085h."""
     name = drive.remote.name
-    # 6007h = 3: a drive without its master quick-stops; power off (2) or a fault (1) will do.
+    # 6007h = 3: a drive without its master does a quick stop; removing power (2) or a fault (1) is also accepted.
     await drive.ensure(0x6007, 0, 3, also=(2, 1))
-    await drive.ensure(0x605A, 0, 2)  # quick stop: down the ramp 6085h, then without power
-    # 605Eh = 2: on its own fault it follows the quick-stop ramp; another ramp (1) or coasting (0) is a stop as well.
+    await drive.ensure(0x605A, 0, 2)  # quick stop: follow the ramp 6085h, then remove power
+    # 605Eh = 2: on its own fault, the drive follows the quick-stop ramp; another ramp (1) or coasting (0) also stops.
     await drive.ensure(0x605E, 0, 2, also=(1, 0))
     if await drive.remote.has(0x6085):
         ramp = units.acceleration(name, "quick_stop_deceleration", drives.quick_stop_deceleration)
@@ -145,4 +148,4 @@ async def configure_homing(drive: Differences, homing: Homing, units: Units) -> 
         await drive.ensure(0x609A, 0, units.acceleration(name, "homing.acceleration", homing.acceleration))
     else:
         drive.lack((0x609A, 0), "it has no such object")
-    await drive.ensure(0x607C, 0, 0)  # makers differ in its sign; the drive's `offset` in [drives] is used instead
+    await drive.ensure(0x607C, 0, 0)  # makers use different signs; the drive's `offset` in [drives] is used instead

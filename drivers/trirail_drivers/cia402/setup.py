@@ -23,18 +23,18 @@ from trirail_drivers.interface import NAMES, Clock
 def configure(
     bus: can.BusABC, drives: Drives, each: Sequence[SetupTask], fastest: float | None = None, *, awaits: bool = False
 ) -> tuple[tuple[SetUp, Start] | None, ...]:
-    """Set three drives up concurrently, without power; at the end they are NMT operational.
+    """Set up three drives concurrently, without power; afterwards they are NMT operational.
 
-    `fastest` is the sliders' velocity limit [m/s]; if given, it must fit the drives' units. With `awaits`, the result
-    of a drive that does not answer is None.
+    `fastest` is the velocity limit of the sliders [m/s]; if given, it must fit the drives' units. With `awaits`, the
+    result of a drive that does not answer is None.
 
-    Raises DriveError: ConfigurationRefused for a value that reads back differently, DriveTimeout for a drive that does
-    not answer.
+    Raises ConfigurationRefused for a value that reads back differently, DriveTimeout for a drive that does not answer,
+    and DriveError for other failures.
     """
     clock = each[0].remote.client.clock
     for drive in drives.each:
         send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
-    # Every check that needs only reading is done for all drives before the first value is written.
+    # Every check that only needs to read is made for all drives before the first value is written.
     looked = run_setups(bus, clock, [one.remote for one in each], "reading", [rehearse_setup(one) for one in each])
     absent = [awaits and isinstance(end, DriveAbsentError) for end in looked]
     _accepted([end for end, away in zip(looked, absent, strict=True) if not away])
@@ -55,7 +55,10 @@ def configure(
 
 
 async def configure_one(one: SetupTask, fastest: float | None, check: Callable[[SetUp], None]) -> tuple[SetUp, Start]:
-    """Set one drive up as `configure` does; `check` raises for the wrong drive, after the dry run."""
+    """Set up one drive as `configure` does.
+
+    After the dry run, `check` is called; it raises if this is the wrong drive.
+    """
     bus, node = one.remote.client.bus, one.drive.node
     send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
     looked = await rehearse_setup(one)
@@ -78,7 +81,9 @@ def survey(
     fastest: float | None = None,
     io: Sequence[DigitalIo] = NO_IO,
 ) -> list[SetUp | DriveError]:
-    """Read the drives' identities and the changes of their set-up; nothing is written, and no state changes."""
+    """Read the identities of the drives and the changes of their set-up, without writing anything or changing any
+    state.
+    """
     each = _drives(bus, drives, scales, period, clock, io)
     conversations = [rehearse_setup(one, read_only=True) for one in each]
     ends = run_setups(bus, clock, [one.remote for one in each], "reading", conversations)
@@ -93,9 +98,9 @@ def setup_tasks(
     clock: Clock,
     io: Sequence[DigitalIo] = NO_IO,
 ) -> list[SetupTask]:
-    """Return the set-up tasks of the three drives, for a cycle of `period` seconds and their digital `io`.
+    """Return the set-up tasks of the three drives, for a cycle of `period` seconds and the drives' digital `io`.
 
-    Raises DriveError for settings that no drive can take.
+    Raises DriveError for settings that no drive can accept.
     """
     check_nodes(drives)
     heartbeat_period_ms(drives)
@@ -117,7 +122,9 @@ def _drives(
 
 
 def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
-    """Raise the errors and refusals of all drives as one; otherwise check that the drives can share a bus."""
+    """Raise the errors and refusals of all drives as one error; if there are none, check that the drives can share a
+    bus.
+    """
     refused = [end if isinstance(end, DriveError) else DriveError(end.refused) if end.refused else None for end in ends]
     raise_combined([error for error in refused if error is not None])
     accepted = [end for end in ends if not isinstance(end, DriveError)]
@@ -126,7 +133,7 @@ def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
 
 
 def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
-    """Return an error if the velocity unit is unknown or does not fit; it is irrelevant without a mapped velocity."""
+    """Return an error if the velocity unit is unknown or does not fit; it is irrelevant if no velocity is mapped."""
     if made.exchange.setpoints.has_velocity:
         try:
             made.units.check_velocity(made.name, fastest)
@@ -136,7 +143,7 @@ def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
 
 
 def check_identifiers(done: Sequence[SetUp]) -> None:
-    """Raise DriveError if two drives have PDOs of one identifier, as drives with fixed, equal defaults do."""
+    """Raise DriveError if two drives have PDOs with the same identifier, as drives with equal, fixed defaults do."""
     owners: dict[int, str] = {}
     for made in done:
         for identifier in sorted(made.exchange.identifiers):

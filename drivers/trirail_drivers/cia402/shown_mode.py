@@ -1,4 +1,4 @@
-"""Check that a drive shows its setpoint mode: some do so only with power (6061h, CiA 402-2)."""
+"""Check that a drive shows its setpoint mode, which some drives do only with power (6061h, CiA 402-2)."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ class ShownMode:
 
     def __init__(self, timeout: float) -> None:
         self.shown = True
-        """Whether it shows the setpoint mode; until then it gets its own position as setpoint."""
+        """Whether the drive shows the setpoint mode; until then, its own position is sent to it as setpoint."""
         self._timeout = timeout
         self._since = math.inf
         self._asked = False
 
     def is_next(self, *, alone: bool) -> bool:
-        """Whether the mode display is the next request: always if it is requested `alone`, else every other time."""
+        """Whether the mode display is requested next: always if it is requested `alone`, otherwise every other time."""
         self._asked = alone or not self._asked
         return self._asked
 
     def waited(self, now: float, *, awaited: bool) -> float | None:
-        """Return the time that the drive has had power without showing the mode [s], if it is too long; else None."""
+        """Return the time for which the drive has had power without showing the mode [s] if it is too long; otherwise
+        None.
+        """
         if not awaited:
             self._since = math.inf
             return None

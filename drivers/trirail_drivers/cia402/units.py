@@ -1,11 +1,12 @@
-"""A drive's units of velocity and acceleration, from the drive or its configuration, and their conversion to SI.
+"""Units of velocity and acceleration of a drive, from the drive or its configuration, and their conversion to SI.
 
-Positions are in `counts_per_metre`: the unit of 6064h. A drive reports its units of position, velocity and acceleration
-in 60A8h, 60A9h and 60AAh (CiA 402-2), each as a power of ten, a numerator and a denominator (CiA 303-2), or relates
-velocity to position by 6096h and 6097h, the velocity and acceleration factor: velocity = position units per second *
-numerator / divisor. Kollmorgen's AKD2G has this in its manual (6096h), and Beckhoff's AX8000 in its defaults:
-600000 / 1048576 at 2^20 counts per turn is 0.0001 rpm, and 6097h = 360 / 600000 of that makes degrees per second
-squared. A drive that uses the inverse contradicts a correct `velocity_unit`, and is refused.
+Positions are in the unit of 6064h, of which there are `counts_per_metre`. A drive reports its units of position,
+velocity and acceleration in 60A8h, 60A9h and 60AAh (CiA 402-2), each as a power of ten, a numerator and a denominator
+(CiA 303-2). Alternatively, it relates velocity to position by 6096h and 6097h, the velocity and acceleration factor:
+velocity = position units per second * numerator / divisor. Kollmorgen's AKD2G states this in its manual (6096h), and
+Beckhoff's AX8000 uses it in its defaults: 600000 / 1048576 at 2^20 counts per turn is 0.0001 rpm, and 6097h =
+360 / 600000 of that makes degrees per second squared. A drive that uses the inverse contradicts a correct
+`velocity_unit`, and is refused.
 
 If a drive reports neither, `velocity_unit` and `acceleration_unit` are required. No unit is assumed: a velocity offset
 in the wrong unit moves metal.
@@ -28,31 +29,33 @@ class UnitBase(StrEnum):
     """Base quantity of a unit."""
 
     COUNTS = "counts"
-    """Units of 6064h."""
+    """Unit of 6064h."""
     TURNS = "revolutions"
     METRES = "metres"
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """`size` counts, revolutions or metres, per second or per second squared."""
+    """Unit of `size` counts, revolutions or metres, per second or per second squared."""
 
     base: UnitBase
     size: float
     name: str
 
     def per_metre(self, counts_per_metre: float, revolutions_per_metre: float | None) -> float | None:
-        """Return its number per metre of the slider; None if the revolutions per metre are unknown but needed."""
+        """Return the number of units per metre of slider travel; None if the revolutions per metre are needed but
+        unknown.
+        """
         per_metre = {UnitBase.COUNTS: counts_per_metre, UnitBase.TURNS: revolutions_per_metre, UnitBase.METRES: 1.0}
         whole = per_metre[self.base]
         return None if whole is None else whole / self.size
 
     def is_same(self, other: Unit) -> bool:
-        """Whether it is the same unit, under any name."""
+        """Whether the other unit is the same, whatever its name."""
         return self.base is other.base and math.isclose(self.size, other.size, rel_tol=1e-9)
 
 
-# CiA 303-2, SI units and common others; B4h and B5h from CiA 402, ACh and C0h as used by makers.
+# CiA 303-2: SI units and other common units; B4h and B5h are from CiA 402, manufacturers use ACh and C0h.
 _NUMERATORS: Final = {
     0x01: (UnitBase.METRES, 1.0, "m"),
     0xC1: (UnitBase.METRES, 0.0254, "in"),
@@ -66,25 +69,25 @@ _NUMERATORS: Final = {
     0xAC: (UnitBase.COUNTS, 1.0, "counts"),
 }
 _RPM: Final = 0xC0
-"""Maxon's numerator of accelerations, revolutions per minute: its 00C00300h is rpm/s."""
+"""Numerator that Maxon uses for accelerations, revolutions per minute: its 00C00300h is rpm/s."""
 _TIMES: Final = {0x03: (1.0, "s"), 0x47: (60.0, "min"), 0x48: (3600.0, "h")}
 _SECOND_SQUARED: Final = 0x57
 
 
 def position_unit(code: int) -> Unit | None:
-    """Return the unit of positions in 60A8h; None if it is unknown."""
+    """Return the position unit encoded in 60A8h; None if it is unknown."""
     return _decoded(code, 0)
 
 
 def velocity_unit(code: int) -> Unit | None:
-    """Return the unit of velocities in 60A9h; None if it is unknown."""
+    """Return the velocity unit encoded in 60A9h; None if it is unknown."""
     return _decoded(code, 1)
 
 
 def acceleration_unit(code: int) -> Unit | None:
-    """Return the unit of accelerations in 60AAh; None if it is unknown.
+    """Return the acceleration unit encoded in 60AAh; None if it is unknown.
 
-    With a numerator of position, a denominator of seconds means seconds squared.
+    If the numerator is a position, a denominator of seconds means seconds squared.
     """
     return _decoded(code, 2)
 
@@ -124,12 +127,12 @@ _WORDS: Final = {
 }
 _WRITTEN: Final = re.compile(r"(?:(\d+(?:\.\d+)?(?:e-?\d+)?) +)?(rpm|[a-zµ]+/(?:s|min|h))((?:/(?:s|min|h))?|2)")
 FACTORS: Final = 1e-9, 1e9
-"""Bounds of the factor before a unit: far beyond those of drives, far from the limits of floats."""
+"""Bounds of the factor before a unit, far beyond those of drives and far from the limits of floats."""
 _SECONDS: Final = {symbol: seconds for seconds, symbol in _TIMES.values()}
 
 
 def parse_unit(key: str, text: str, power: int) -> Unit:
-    """Parse a configured unit of velocities (power 1) or accelerations (2); DriveError with the key."""
+    """Parse a configured unit of velocity (power 1) or acceleration (2). Raises DriveError with the key."""
     match = _WRITTEN.fullmatch(text.strip())
     if match is not None:
         number, rate, per = match.groups()
@@ -162,44 +165,44 @@ class Units:
     scale: Scale
     """Scale of positions."""
     velocity_per_metre: float
-    """Velocity units per m/s: negative where counts fall as the slider position rises; nan if unknown."""
+    """Velocity units per m/s; negative if the counts decrease as the slider position increases, NaN if unknown."""
     acceleration_per_metre: float
-    """Acceleration units per m/s², positive; nan if unknown."""
+    """Acceleration units per m/s², positive; NaN if unknown."""
     velocity_name: str = "counts/s"
     acceleration_name: str = "counts/s2"
 
     def velocity(self, velocity: float) -> int:
-        """Return a slider velocity [m/s] in drive units; ValueError or OverflowError if it is not finite."""
+        """Convert a slider velocity [m/s] to drive units. Raises ValueError or OverflowError if it is not finite."""
         return round(self.velocity_per_metre * velocity)
 
     def check_velocity(self, name: str, fastest: float | None = None) -> None:
-        """Raise DriveError if the unit of the velocity offset is unknown, or `fastest` [m/s] does not fit it."""
+        """Raise DriveError if the unit of the velocity offset is unknown, or if `fastest` [m/s] does not fit it."""
         _check_known(name, "velocity", self.velocity_per_metre)
         if fastest is not None and (why := velocity_misfit(fastest, abs(self.velocity_per_metre))):
             raise DriveError(f"drive {name}: its unit of velocity (60A9, or 6096) is {self.velocity_name}: {why}")
 
     def length(self, name: str, key: str, value: float) -> int:
-        """Return a length [m] of configuration key `key` as UNSIGNED32, such as a following error."""
+        """Convert a length [m], such as a following error, to UNSIGNED32; `key` is its configuration key."""
         return _unsigned(name, key, value, abs(self.scale.counts_per_metre), "counts")
 
     def speed(self, name: str, key: str, value: float) -> int:
-        """Return a speed [m/s] of configuration key `key` as UNSIGNED32."""
+        """Convert a speed [m/s] to UNSIGNED32; `key` is its configuration key."""
         _check_known(name, "velocity", self.velocity_per_metre)
         return _unsigned(name, key, value, abs(self.velocity_per_metre), self.velocity_name)
 
     def acceleration(self, name: str, key: str, value: float) -> int:
-        """Return an acceleration [m/s²] of configuration key `key` as UNSIGNED32."""
+        """Convert an acceleration [m/s²] to UNSIGNED32; `key` is its configuration key."""
         _check_known(name, "acceleration", self.acceleration_per_metre)
         return _unsigned(name, key, value, self.acceleration_per_metre, self.acceleration_name)
 
 
 def velocity_misfit(fastest: float, per_metre: float) -> str:
-    """Return the reason for which a unit, `per_metre` per m/s, does not fit a velocity limit [m/s], or ""."""
+    """Return the reason why a unit, with `per_metre` units per m/s, does not fit a velocity limit [m/s], or ""."""
     limit = fastest * per_metre
     text = f"limits.slider.velocity = {fastest:g} is {limit:g} of it"
     if limit < 1.0:
         return f"{text}, below the smallest velocity of 1; use a finer unit"
-    if 2.0 * limit >= INT32_MAX:  # a velocity may exceed its limit a little
+    if 2.0 * limit >= INT32_MAX:  # a velocity may slightly exceed its limit
         return f"{text}, more than half of {INT32_MAX}; use a coarser unit"
     return ""
 
@@ -214,7 +217,7 @@ def _check_known(name: str, quantity: str, per_metre: float) -> None:
 
 
 def _unsigned(name: str, key: str, value: float, per_si: float, unit: str) -> int:
-    """Convert to UNSIGNED32 without 0 and FFFFFFFFh: to a drive these mean no window or ramp, and no supervision."""
+    """Convert to UNSIGNED32, excluding 0 and FFFFFFFFh, which to a drive mean no window or ramp, and no supervision."""
     exact = per_si * value
     if not 0.5 < exact < UINT32_MAX - 0.5:
         raise DriveError(f"drive {name}: {key} {value:g} is {exact:g} {unit}; a drive takes 1 to {UINT32_MAX - 1}")

@@ -1,1 +1,1 @@
-"""Drives on a bus, from a configuration, and checks of its settings."""
+"""Connection to the drives that a configuration describes, and checks of its settings."""

@@ -24,7 +24,7 @@ from trirail_drivers.simulated import SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.carriages import DriveMounting
 from trirail_drivers.simulated.faults import Faults
 
-# The BusError has python-can's reason; standard error shows only that one line.
+# The BusError contains python-can's reason; standard error shows only that line.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 NETWORK_INTERFACES = Path("/sys/class/net")
@@ -33,7 +33,7 @@ IFF_UP = 0x1
 
 
 def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> can.BusABC:
-    """Return the bus that section [can] names; BusError with the remedy if it cannot be opened.
+    """Open the bus that section [can] names. Raises BusError with the remedy if it cannot be opened.
 
     `drives` and `clock` are used for the simulated drives of a "simulated" bus.
     """
@@ -46,7 +46,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
         raise BusError(f'can.interface "{section.interface}" is unknown; known are {known}')
     options: dict[str, Any] = dict(section.options)
     try:
-        # Only our configuration counts, not python-can's own files and environment variables.
+        # Only our configuration applies, not python-can's own files and environment variables.
         bus = can.Bus(
             interface=section.interface,
             channel=section.channel,
@@ -54,7 +54,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
             ignore_config=True,
             **options,
         )
-    except Exception as error:  # makers' libraries raise anything: a missing CANlib of Kvaser's NameError
+    except Exception as error:  # vendor libraries raise any exception: a missing Kvaser CANlib raises NameError
         kind = BusAbsentError if _may_appear(section, error) else BusError
         raise kind(_opening_error(section, error)) from error
     if section.interface == "socketcan" and (problem := _problem(section)):
@@ -64,7 +64,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
 
 
 def _may_appear(section: config.Can, error: Exception) -> bool:
-    """Whether a bus that cannot be opened now may be opened later, with the same configuration and packages."""
+    """Whether a bus that cannot be opened now might open later, with the same configuration and packages."""
     of_the_bus = isinstance(error, (can.CanError, OSError)) and not isinstance(
         error, can.CanInterfaceNotImplementedError
     )
@@ -80,11 +80,11 @@ def connect(
     awaits: bool = False,
     io: Sequence[DigitalIo] = NO_IO,
 ) -> DriveGroup:
-    """Return the three drives on their bus, not set up yet, with their digital `io`; `capture` captures every frame.
+    """Return the three drives on their bus, not yet set up, with their digital `io`; `capture` records every frame.
 
     With `awaits`, a lost bus is reopened in the background of the cycle, and a missing bus is opened when it appears.
 
-    Raises DriveError if there is no bus; with `awaits`, only if none can appear.
+    Raises DriveError if there is no bus or, with `awaits`, only if no bus can appear.
     """
     protocol = PROTOCOLS[drives.protocol]
 
@@ -108,13 +108,13 @@ def connect(
 
 
 def simulated_bus(section: config.Can, drives: config.Drives, clock: Clock = time.monotonic) -> SimulatedBus:
-    """Return the three simulated drives of a configuration on a bus of their own, at rest at `can.simulated.start`."""
+    """Return the three simulated drives of a configuration on their own bus, at rest at `can.simulated.start`."""
     devices, faults = simulated_drives(section, drives)
     return SimulatedBus(devices, clock, faults)
 
 
 def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequence[SimulatedDevice], Faults]:
-    """Return the three simulated drives of a configuration, without a bus, and their faults."""
+    """Return the three simulated drives of a configuration without a bus, and their faults."""
     protocol = PROTOCOLS[drives.protocol]
     starts = zip(drives.each, section.simulated.start, strict=True)
     devices = [protocol.simulated_drive(section.simulated, drives, drive, start) for drive, start in starts]
@@ -124,7 +124,7 @@ def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequen
 
 
 def _mounted(built: Sequence[config.SimulatedSlider] | None, index: int, drive: config.Drive) -> DriveMounting:
-    """Return the true axis of a simulated drive, by its node id; without one, the configured axis."""
+    """Return the true axis of a simulated drive by its node id; if there is none, return the configured axis."""
     for slider, each in enumerate(built or ()):
         if each.node == drive.node:
             return DriveMounting(slider, each.direction * each.counts_per_metre)
@@ -132,7 +132,7 @@ def _mounted(built: Sequence[config.SimulatedSlider] | None, index: int, drive: 
 
 
 def _opening_error(section: config.Can, error: Exception) -> str:
-    """Return one line with the reason for which the bus did not open, and the remedy."""
+    """Return one line with the reason why the bus could not be opened, and the remedy."""
     number = canerrors.error_number(error)
     if number == errno.EAFNOSUPPORT:
         return "this kernel has no SocketCAN (address family AF_CAN); load it with: modprobe can_raw"
@@ -151,7 +151,7 @@ def _interface_up_hint(section: config.Can) -> str:
 
 
 def _problem(section: config.Can) -> str:
-    """Return the reason for which Linux' interface cannot send, with the remedy, or ""."""
+    """Return the reason why the Linux interface cannot send, with the remedy; "" if it can."""
     folder = NETWORK_INTERFACES / section.channel
     try:
         flags = int((folder / "flags").read_text(), 16)
@@ -160,7 +160,7 @@ def _problem(section: config.Can) -> str:
         return ""
     if not flags & IFF_UP:
         return f'CAN interface "{section.channel}" is down; {_interface_up_hint(section)}'
-    if not carrier:  # a CAN controller is without it in bus-off alone: drivers/net/can/dev/dev.c, can_bus_off
+    if not carrier:  # a CAN controller lacks its carrier only in bus-off: drivers/net/can/dev/dev.c, can_bus_off
         return (
             f'CAN interface "{section.channel}" is in bus-off; check cable, termination and bitrate, then restart it: '
             f"ip link set {section.channel} down && ip link set {section.channel} up"

@@ -1,6 +1,7 @@
-"""Simulated drives for one master in another process, on a bus between processes: trirail_drivers.bus.unixbus.
+"""Simulated drives served to one master in another process, on a bus between processes: trirail_drivers.bus.unixbus.
 
-A single system call waits for a frame or the timer, without python-can: at 1 kHz seven frames pass per millisecond.
+A single system call waits for a frame or the timer. python-can is not used, since at 1 kHz seven frames pass per
+millisecond.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from trirail_drivers.protocols import PROTOCOLS
 from trirail_drivers.simulated.exchange import SimulatedExchange
 
 POLL_PERIOD_S = 0.01
-"""Period of polling the drives' timers when no frame arrives [s]."""
+"""Period at which the drives' timers are polled while no frame arrives [s]."""
 
 
 def serve(
@@ -30,9 +31,9 @@ def serve(
     ready: Callable[[], None],
     connected: Callable[[], None],
 ) -> None:
-    """Serve the drives of a configuration to the first client of the socket at `path`, until it disconnects.
+    """Serve the drives of a configuration to the first client of the socket at `path`, until the client disconnects.
 
-    The path appears once it accepts connections. `ready` is called just before, `connected` after the connection.
+    The path appears once it accepts connections. `ready` is called just before that, `connected` after a connection.
     """
     devices, faults = simulated_drives(section, drives)
     states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
@@ -51,14 +52,15 @@ def serve(
 
 
 class _Master:
-    """The other end of the bus. The drives' time is that of arriving frames, so a stall of this process is not theirs.
+    """The master's end of the bus. The drives take their time from the arriving frames, so that a stall of this process
+    does not affect them.
 
-    After a stall, waiting frames are handled at their arrival times. Of the state frames that the drives send in
-    answer only the newest is sent, at the end: an old position would look like a current one.
+    After a stall, the waiting frames are handled with their arrival times. Of the state frames that the drives send in
+    answer, only the newest is sent, at the end: an old position would look like a current one.
     """
 
     def __init__(self, connection: socket.socket, states: Collection[int]) -> None:
-        """`states` are the identifiers of frames that a newer frame of the same identifier replaces."""
+        """`states` contains the identifiers of frames that a newer frame with the same identifier replaces."""
         self._socket = connection
         self._states = states
         self._held: dict[int, bytes] = {}
@@ -70,7 +72,7 @@ class _Master:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, TIMESPEC.pack(int(seconds), round(rest * 1e6)))
 
     def clock(self) -> float:
-        """Return the drives' time [s]: arrival of the frame being handled, by the monotonic clock."""
+        """Return the drives' time [s], which is the arrival time of the frame being handled, on the monotonic clock."""
         return self._now
 
     def emit(self, identifier: int, data: bytes) -> None:
@@ -89,7 +91,7 @@ class _Master:
         while True:
             try:
                 size, stamped, _, _ = receive(buffers, TIMESPEC_SPACE, socket.MSG_DONTWAIT if self._held else 0)
-            except BlockingIOError:  # no frame is left, or none came within the time-out
+            except BlockingIOError:  # no frame is left, or none arrived within the time-out
                 self._send_held()
                 now = time.monotonic()
             else:

@@ -1,4 +1,4 @@
-"""Checks of the settings of bus and drives, before any drive is contacted."""
+"""Checks of the bus and drive settings, made before any drive is contacted."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
 _OWN_INTERFACES = ("simulated", "unix")
-"""Interfaces that are not python-can's."""
+"""Interfaces that do not belong to python-can."""
 _RESERVED_OPTIONS = ("interface", "channel", "bitrate", "ignore_config", "config_context")
 """Arguments of `can.Bus` that are set from other keys or must not be set."""
 MAX_CLASSICAL_BITRATE = 1_000_000
-"""The highest bitrate of classical CAN (ISO 11898-2) [bit/s]."""
+"""Highest bit rate of classical CAN (ISO 11898-2) [bit/s]."""
 
 
 def bus_rules(section: Can) -> Iterator[Rule]:
-    """Yield checks for a bitrate beyond classical CAN, and for options that python-can does not take."""
+    """Yield checks for a bit rate beyond classical CAN, and for options that python-can does not accept."""
     yield Rule("can.bitrate", ("can.interface",), partial(_check_bitrate, section))
     for name in section.options:
         yield Rule(f"can.options.{name}", ("can.interface",), partial(_check_option, section, name))
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield checks for settings that a drive does not have, or whose values it cannot take or resolve."""
+    """Yield checks for settings that a drive does not have, or whose values it cannot accept or resolve."""
     yield Rule("drives.heartbeat", ("loop.rate_hz",), partial(_check_heartbeat, drives, required))
     for name, drive in zip(NAMES, drives.each, strict=True):
         for protection in drive.accept_without:
@@ -38,13 +38,13 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
 
 
 def io_rules(protocol: str, keys: Iterable[str]) -> Iterator[Rule]:
-    """Yield checks for digital outputs and inputs, at these keys, of drives whose protocol has none."""
+    """Yield checks that reject digital outputs and inputs, at these keys, if the protocol of the drives has none."""
     for key in keys:
         yield Rule(key, ("drives.protocol",), partial(_check_io, key, protocol))
 
 
 def files(drives: Drives) -> Iterator[Rule]:
-    """Yield checks that read the files that the settings name."""
+    """Yield checks that read the files named in the settings."""
     return PROTOCOLS[drives.protocol].files(drives)
 
 

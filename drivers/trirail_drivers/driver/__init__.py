@@ -1,1 +1,1 @@
-"""Common parts of the drivers of all protocols."""
+"""Common code of the drivers for all protocols."""

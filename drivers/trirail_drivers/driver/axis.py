@@ -1,4 +1,4 @@
-"""State of a drive of any protocol: the SYNC that its newest position answers, its feedback and its fault."""
+"""State of one drive of any protocol: the SYNC that its newest position answers, its feedback, its fault."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from trirail_drivers.interface import Counts, DriveFault
 class Answers(AxisRow):
     """Counts of SYNCs, and of the positions that answer them.
 
-    An answer takes less than a cycle, so a position received before the next SYNC is sent answers the last one. A
-    position received just after a SYNC answers that SYNC if the previous one is answered, or if the drive's last
-    answer was as prompt; otherwise it is the late answer to the previous one.
+    A drive answers a SYNC within one cycle, so a position received before the next SYNC is sent answers the current
+    SYNC. A position received just after a SYNC answers the current SYNC if the previous SYNC has been answered, or if
+    the drive's last answer also arrived this early; otherwise it is a late answer to the previous SYNC.
     """
 
     @property
     def age(self) -> int:
-        """Number of SYNCs sent since the one at which the position was sampled."""
+        """Number of SYNCs sent since the SYNC at which the position was sampled."""
         return self.syncs - self.sampled
 
     @property
     def missed(self) -> int:
-        """Number of SYNCs without an answer, except one whose answer is not due yet."""
+        """Number of unanswered SYNCs, without the newest one while its answer is not yet due."""
         return self.syncs - self.sampled - (not self.prompt)
 
     def sync_sent(self) -> None:
@@ -40,7 +40,7 @@ class Answers(AxisRow):
         self.between = False
 
     def read_over(self) -> None:
-        """Note that this cycle's frames have been read: later positions answer its SYNC late."""
+        """Record that this cycle's frames have been read: later positions are late answers to its SYNC."""
         self.between, self.came = True, False
 
     def answer(self) -> None:
@@ -51,21 +51,21 @@ class Answers(AxisRow):
         sampled = syncs - answers_previous
         if sampled - before > 1:
             self.lost += sampled - before - 1
-        # Late only compared with the drive's last answer: one that always answers after the read is not late.
+        # Late means later than the drive's last answer: a drive that always answers after the read is not late.
         if prompt and between and sampled > before:
             self.late += 1
         self.sampled = sampled
         self.prompt = not between and not answers_previous
 
     def clear_missed(self) -> None:
-        """Forget SYNCs without an answer."""
+        """Forget the unanswered SYNCs."""
         self.sampled = self.syncs
 
 
 MISSED_HEARTBEATS = 3
-"""Number of missed heartbeats that are the loss of a drive."""
+"""Number of missed heartbeats after which a drive counts as lost."""
 SILENT_AFTER: Final = 0.15
-"""Silence [s] after which a drive may have lost its supply, so that its set-up is checked again."""
+"""Silence [s] after which a drive may have lost its supply, so that its set-up must be checked again."""
 
 
 class Axis(Answers):
@@ -80,19 +80,19 @@ class Axis(Answers):
         self.setpoints_late = self.setpoints_lost = 0
         """Setpoints written after the next cycle was due, and setpoints that the bus refused."""
         self.left_out = False
-        """Whether it stays without power while others are enabled."""
+        """Whether the drive stays without power while others are enabled."""
         self.powered_up = False
-        """Whether it has followed setpoints since it was enabled."""
+        """Whether the drive has followed setpoints since it was enabled."""
         self.event: DriveFault | None = None
-        """Fault that a frame reported, as opposed to a lasting state."""
+        """Fault that was reported by a single frame, as opposed to a state that persists."""
         self.restarted = self.silent = False
-        """Whether it has restarted, or was silent for long, since it was configured."""
+        """Whether the drive has restarted, or has been silent for long, since it was configured."""
         self.boots = 0
         """Number of observed restarts."""
         self.setup_listener: Callable[[int, bytes | bytearray], None] | None = None
-        """Receiver of the identifier and data of its answers during a set-up in the background."""
+        """Callback for the identifier and data of the drive's answers during a set-up in the background."""
         self.homed = True
-        """Whether its position is counted from a known place."""
+        """Whether the drive's position is relative to a known place."""
         self.heard = math.inf
         self.heard_within = MISSED_HEARTBEATS * drives.heartbeat
         self.status_within = self.follows_within = math.inf
@@ -102,19 +102,19 @@ class Axis(Answers):
         """Digital outputs and inputs that the robot uses."""
 
     def assign_io(self, io: DigitalIo) -> None:
-        """Set the digital outputs and inputs that the robot uses; the outputs have their safe values."""
+        """Set the digital outputs and inputs that the robot uses; the outputs get their safe values."""
         self.io = io
         self.has_outputs, self.outputs, self.outputs_sent = bool(io.outputs), io.safe, NOTHING_SENT
 
     @property
     def outputs_pending(self) -> bool:
-        """Whether its wanted outputs were not sent yet, or differ from those sent last."""
+        """Whether the wanted outputs have not been sent yet, or differ from those sent last."""
         return self.has_outputs and self.outputs != self.outputs_sent
 
     @classmethod
     def in_row(cls, rows: NDArray[np.void], number: int, name: str, node: int, scale: Scale, drives: Drives) -> Self:
-        """Return a drive whose numbers are in row `number` of an array of AXIS."""
-        # The array's memory becomes the object's own, so that Python and compiled code share one copy.
+        """Return a drive whose numbers are stored in row `number` of an array of AXIS."""
+        # The array's memory becomes the memory of the object, so that Python and compiled code share one copy.
         axis = cls.from_buffer(rows.data, number * AXIS.itemsize)
         axis.__init__(name, node, scale, drives)  # type: ignore[misc]
         return axis
@@ -126,27 +126,27 @@ class Axis(Answers):
 
     @property
     def configured(self) -> bool:
-        """Whether its set-up is still valid; only then it gets setpoints."""
+        """Whether the drive's set-up is still valid; setpoints are sent to it only then."""
         return not (self.restarted or self.silent)
 
     @property
     def last_heard(self) -> float:
-        """Time of its last sign of life other than a position [s]."""
+        """Time of the last sign of life other than a position [s]."""
         return -math.inf if self.heard == math.inf else self.heard
 
     def watch_silence(self, now: float, period: float) -> None:
-        """Mark the drive as silent after SILENT_AFTER; `period` is that of the cycle [s]."""
+        """Mark the drive as silent after SILENT_AFTER. `period` is the cycle period [s]."""
         within = max(SILENT_AFTER, self._missed_positions * period)
-        # Both, since a drive that is not operational sends heartbeats but no positions.
+        # Both must be old: a drive that is not operational sends heartbeats but no positions.
         if self.missed * period > within and now - self.last_heard > within:
             self.silent = True
 
     def forget_power_state(self) -> None:
-        """Forget the last reported power state; the set-up requests it."""
+        """Forget the power state reported last; the set-up requests it again."""
         raise NotImplementedError
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
-        """Latch a fault as the drive's event, unless one is latched since the last reset."""
+        """Latch a fault as the drive's event, unless one has been latched since the last reset."""
         if self.event is None:
             self.event = self.make_fault(cause, code, text)
 
@@ -155,11 +155,13 @@ class Axis(Answers):
         return DriveFault(self.name, cause, code, shortened(f"drive {self.name}: {text}"))
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return the fault of a drive that still has power `seconds` [s] after `wanted`, as "quick stop"."""
+        """Return the fault of a drive that still has power `seconds` [s] after the command `wanted`, such as "quick
+        stop".
+        """
         raise NotImplementedError
 
     def silence_fault(self, now: float) -> DriveFault | None:
-        """Return a fault if positions or heartbeats are missing at time `now` [s]."""
+        """Return a fault if positions or heartbeats are overdue at time `now` [s]."""
         if (missed := self.missed) >= self._missed_positions:
             return self.make_fault("silent", 0, f"no position for {missed} cycles in a row")
         if now - self.heard > self.heard_within:

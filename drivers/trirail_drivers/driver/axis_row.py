@@ -1,4 +1,4 @@
-"""State of one drive in memory shared with compiled code: a row of trirail_drivers.driver.cyclic.Cyclic.axes."""
+"""State of one drive in memory shared with compiled code: one row of trirail_drivers.driver.cyclic.Cyclic.axes."""
 
 from __future__ import annotations
 
@@ -9,104 +9,104 @@ from typing import Any, Final
 import numpy as np
 
 NO_OFFSET: Final = -1
-"""Offset of a number that a frame does not have."""
+"""Offset that stands for a value that a frame does not contain."""
 NOTHING_SENT: Final = -1
 """Value of `outputs_sent` before any outputs were sent."""
 
 
 class AxisRow(ctypes.Structure):
-    """State of one drive; the Python attributes are the memory of the array."""
+    """State of one drive; the Python attributes are views of the array's memory."""
 
     position: float
     """Newest position [m]."""
     actual: int
     """Newest position [counts]."""
     heard: float
-    """Time of its last sign of life [s]."""
+    """Time of the last sign of life [s]."""
     status_heard: float
-    """Time of its last statusword [s]."""
+    """Time of the last statusword [s]."""
     statusword: int
     """Newest statusword."""
     seen_clear: int
-    """Bits of the statusword that have been 0 since the driver cleared this."""
+    """Bits of the statusword that have been 0 since the driver cleared this field."""
     syncs: int
     """Number of SYNCs sent."""
     sampled: int
     """Number of the SYNC at which the position was sampled."""
     late: int
-    """Answers that came a cycle later than the previous one did: a constant delay is not late."""
+    """Number of answers that arrived one cycle later than the answer before. A constant delay is not late."""
     lost: int
-    """SYNCs that were never answered, as far as later answers show."""
+    """Number of SYNCs that were never answered, as far as later answers show."""
     between: bool
-    """Whether this cycle's frames have been read, and the next SYNC was not sent."""
+    """Whether this cycle's frames have been read and the next SYNC has not been sent."""
     prompt: bool
-    """Whether the last position came before the frames of its SYNC's cycle were read."""
+    """Whether the last position arrived before the frames of its SYNC's cycle were read."""
     came: bool
-    """Whether a position has come in this cycle."""
+    """Whether a position has arrived in this cycle."""
     newest: int
     """Position received last [counts]."""
     step: int
-    """Last difference between consecutive positions that was not 0 [counts]."""
+    """Last non-zero difference between consecutive positions [counts]."""
     stands_at: int
-    """Position at which the slider stands [counts]."""
+    """Position at which the slider is at rest [counts]."""
     stands_since: float
-    """Time since which it stands there [s]."""
+    """Time since which the slider has been at rest there [s]."""
     command_age: int
-    """SYNCs since its last command."""
+    """Number of SYNCs since the last command to the drive."""
     target: int
-    """Position sent last, in the drive's units, if these are integers."""
+    """Position sent last, in drive units, if the drive uses integers."""
     offset: int
-    """Velocity sent last, in the drive's units, if these are integers."""
+    """Velocity sent last, in drive units, if the drive uses integers."""
     wanted: float
-    """Position written last [m]; NaN if none waits to be sent."""
+    """Position written last [m]; NaN if none is waiting to be sent."""
     wanted_rate: float
     """Velocity written last [m/s]."""
     sent: float
-    """Position sent by the last SYNC, if setpoints wait for one [m]; NaN if none was sent."""
+    """Position sent with the last SYNC, if setpoints are sent with the SYNC [m]; NaN if none was sent."""
     sent_rate: float
-    """Velocity sent by the last SYNC, if setpoints wait for one [m/s]."""
+    """Velocity sent with the last SYNC, if setpoints are sent with the SYNC [m/s]."""
     in_force: float
-    """Position that the bus took last [m]; NaN if it took none."""
+    """Position that the bus accepted last [m]; NaN if it has accepted none."""
     outputs: int
-    """Wanted digital outputs: bits of 60FEh:01, within the mask."""
+    """Wanted digital outputs: bits of 60FEh:01, limited to the mask."""
     outputs_sent: int
-    """Digital outputs that the bus took last; NOTHING_SENT if it took none since the set-up."""
+    """Digital outputs that the bus accepted last; NOTHING_SENT if it has accepted none since the set-up."""
     inputs: int
-    """Newest digital inputs: bits of 60FDh, within the mask."""
+    """Newest digital inputs: bits of 60FDh, limited to the mask."""
 
     # Constant while cycles are quiet.
     floats: bool
-    """Whether positions are 32-bit floats; otherwise integers."""
+    """Whether positions are 32-bit floats; otherwise they are integers."""
     waits: bool
     """Whether setpoints are sent with the next SYNC; otherwise immediately."""
     follows_within: float
-    """Window of the following error that the driver monitors [m]; infinite if it does not."""
+    """Window of the following error that the driver monitors [m]; infinite if the driver does not monitor it."""
     counts_per_metre: float
-    """Negative where counts fall as the slider position rises."""
+    """Resolution of the encoder; negative if the counts decrease as the slider position increases."""
     zero: float
     """Slider position at zero counts [m]."""
     velocity_per_metre: float
     """Drive units of velocity per m/s, before the division by `velocity_step`."""
     velocity_step: float
-    """Resolution of velocities in those units."""
+    """Resolution of velocities, in these units."""
     velocity_bytes: int
-    """Size of a velocity in the setpoint's frame [bytes]."""
+    """Size of a velocity in the setpoint frame [bytes]."""
     still: float
-    """Largest movement of a slider that counts as standing [counts]."""
+    """Largest movement at which the slider still counts as at rest [counts]."""
     heard_within: float
     """Largest age of `heard` [s]."""
     status_within: float
     """Largest age of `status_heard` [s]."""
     position_at: int
-    """Offset of the position in the setpoint's frame [bytes]."""
+    """Offset of the position in the setpoint frame [bytes]."""
     velocity_at: int
-    """Offset of the velocity in the setpoint's frame [bytes]; NO_OFFSET for none."""
+    """Offset of the velocity in the setpoint frame [bytes]; NO_OFFSET if the frame has no velocity."""
     has_outputs: bool
-    """Whether it has digital outputs."""
+    """Whether the drive has digital outputs."""
     maps_outputs: bool
-    """Whether a frame of its own carries them; otherwise an SDO does, which only Python sends."""
+    """Whether the outputs have a frame of their own; otherwise an SDO carries them, which only Python sends."""
     outputs_kept: int
-    """Other bits of 60FEh:01, which are sent as they were at set-up: those of a drive without a mask 60FEh:02."""
+    """Bits of 60FEh:01 outside the mask, sent unchanged since set-up; used for a drive without a mask 60FEh:02."""
 
 
 _KINDS: Final[dict[str, Any]] = {"float": ctypes.c_double, "int": ctypes.c_int64, "bool": ctypes.c_bool}

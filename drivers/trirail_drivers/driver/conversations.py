@@ -1,4 +1,4 @@
-"""Concurrent conversations with several nodes in one thread: each is a coroutine that awaits frames, or time."""
+"""Concurrent conversations with several nodes in one thread; each is a coroutine that awaits frames or time."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ LOG: Final = logging.getLogger("trirail.drives")
 PROGRESS_PERIOD: Final = 1.0
 """Period of the progress log [s]."""
 _FIRST_PAUSE, _MAX_PAUSE = 0.001, 0.02
-"""Bounds of the pause between two readings of a value [s]; within them it equals the time waited already."""
+"""Bounds of the pause between two readings of a value [s]. Between them, the pause equals the time already waited."""
 
 MAX_QUEUED_FRAMES: Final = 8
-"""Frames that a conversation in the background queues; it awaits one at a time."""
+"""Maximum number of frames that a background conversation queues; it awaits one at a time."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Awaitable of the first frame that `accepts` accepts; its result is None after `deadline` [s]."""
+    """Awaitable for the first frame that `accepts` accepts; its result is None once `deadline` [s] has passed."""
 
     accepts: Callable[[can.Message], bool]
-    """Predicate, called with every frame received meanwhile."""
+    """Predicate, called with every frame received while waiting."""
     deadline: float
 
     def __await__(self) -> Generator[Wait, can.Message | None, can.Message | None]:
@@ -43,7 +43,7 @@ def run_concurrently(
 ) -> list[T | DriveError]:
     """Run conversations concurrently; return the result of each, or its DriveError.
 
-    `progress` is logged every second. Raises BusError, since it concerns all of them.
+    The text from `progress` is logged every second. A BusError affects all conversations, so it is raised.
     """
     ends: dict[int, T | DriveError] = {}
     waits: dict[int, Wait] = {}
@@ -82,7 +82,7 @@ def run_concurrently(
 
 
 class BackgroundConversation(Generic[T]):
-    """A conversation that the cycle runs one step at a time, without waiting or receiving."""
+    """Conversation that the cycle advances one step at a time, without waiting or receiving."""
 
     def __init__(self, conversation: Coroutine[Any, Any, T]) -> None:
         self._conversation = conversation
@@ -94,7 +94,10 @@ class BackgroundConversation(Generic[T]):
         self._heard.append(frame)
 
     def step(self, now: float) -> T | DriveError | None:
-        """Continue if the awaited frame has come or its time is over [s]; return the result once there is one."""
+        """Continue if the awaited frame has arrived or its deadline has passed; return the result once there is one.
+
+        `now` is the present time [s].
+        """
         frame = None
         if self._wait is not None:
             while self._heard and frame is None:
@@ -129,7 +132,7 @@ async def read_until(
     clock: Clock,
     seconds: float,
 ) -> tuple[T, float]:
-    """Read until a value is accepted, for up to `seconds`; return the last value and the time waited [s]."""
+    """Read repeatedly until a value is accepted, for up to `seconds`; return the last value and the time waited [s]."""
     begun = clock()
     while True:
         value = await read()

@@ -1,7 +1,7 @@
-"""Frames of one cycle with three drives as tables: the compiled cycle knows these tables, and no protocol.
+"""Tables of the frames that one cycle exchanges with three drives. The compiled cycle knows only these tables.
 
-A driver lends them while a cycle only handles expected frames and sends setpoints. The state of each drive is always in
-them; `Lender.take_back` returns the frames that the compiled cycle has not handled.
+A driver lends the tables while cycles only handle expected frames and send setpoints. They always hold the state of
+each drive. `Lender.take_back` passes the frames that the compiled cycle has not handled back to the driver.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from trirail_drivers.driver.axis_row import AXIS, NO_OFFSET
 from trirail_drivers.interface import Feedback
 
 MOST_FRAMES: Final = 32
-"""Frames received in one call; a quiet cycle has fewer."""
+"""Maximum number of frames received in one call; a quiet cycle has fewer."""
 
 EXPECTED = np.dtype(
     [
         ("identifier", "<u4"),
         ("length", "u1"),
         ("axis", "u1"),
-        ("mask", "u1", 8),  # bits of its data that decide something
+        ("mask", "u1", 8),  # bits of the data that are compared
         ("data", "u1", 8),  # required values of those bits
-        ("position_at", "i1"),  # offset of a 32-bit position in it [bytes], NO_OFFSET for none
-        ("status_at", "i1"),  # offset of a statusword in it [bytes], NO_OFFSET for none
+        ("position_at", "i1"),  # offset of a 32-bit position in the data [bytes], NO_OFFSET for none
+        ("status_at", "i1"),  # offset of a statusword in the data [bytes], NO_OFFSET for none
         ("lives", "u1"),  # whether it is a sign of life
     ],
     align=True,
 )
-"""A frame that may come in any cycle, and changes nothing but the values read from it."""
+"""Frame that may arrive in any cycle and that changes only the values read from it."""
 
 TIMES = np.dtype(
     [
-        ("due", "<f8"),  # time at which the driver itself has something else to do [s]
+        ("due", "<f8"),  # time at which the driver itself has another task [s]
         ("beat_due", "<f8"),  # time at which the service's next periodic frames (heartbeats, requests) are due [s]
-        ("beat_period", "<f8"),  # period of these [s]
-        ("beats", "<i8"),  # number of these sent together
-        ("next_beat", "<i8"),  # index of the next one
-        ("begun", "<i8"),  # frames sent at the newest cycle's beginning before one was refused; NO_OFFSET for none
+        ("beat_period", "<f8"),  # period of these frames [s]
+        ("beats", "<i8"),  # number of these frames sent together
+        ("next_beat", "<i8"),  # index of the next of these frames
+        ("begun", "<i8"),  # frames sent at the start of the newest cycle before one was refused; NO_OFFSET if none
         ("traffic", "<i8"),  # bits on the bus in quiet cycles since the start
     ],
     align=True,
 )
-"""Deadlines of quiet cycles, and their progress."""
+"""Deadlines and progress of quiet cycles."""
 
 
 def expected_row(
@@ -59,14 +59,17 @@ def expected_row(
     status_at: int = NO_OFFSET,
     lives: bool = False,
 ) -> tuple[Any, ...]:
-    """Return a row of EXPECTED, from the data received last."""
+    """Return a row of EXPECTED made from the data received last."""
     wanted = bytes(byte & bits for byte, bits in zip(data, mask, strict=True))
     padded = [tuple(part.ljust(8, b"\0")) for part in (mask, wanted)]
     return identifier, len(data), axis, *padded, position_at, status_at, lives
 
 
 class Cyclic:
-    """Tables of three drives. The drives' state is always in them; the frames are filled in when they are lent."""
+    """Tables of three drives.
+
+    They always hold the state of the drives; the frames are filled in when the tables are lent.
+    """
 
     def __init__(self, bus: BusAccess, history: int) -> None:
         """`history`: number of sent setpoints to keep."""
@@ -76,44 +79,47 @@ class Cyclic:
         self.times: NDArray[np.void] = np.zeros(1, TIMES)
         self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
         self.begin = self.beats = self.setpoints = self.outputs = PackedFrames(0)
-        """Frames at the beginning of a cycle; periodic frames, sent after those; setpoints, one for each drive; digital
-        outputs, one for each drive or none, sent after the setpoints where they change."""
+        """Tables of frames: those at the start of a cycle; periodic frames, sent after those; setpoints, one for each
+        drive; digital outputs, at most one for each drive, sent after the setpoints when they change.
+        """
         self.end = self.setpoints.headers
-        """Frames at the end of a cycle: the setpoints, or none if they are sent at the beginning of the next."""
+        """Frames at the end of a cycle: the setpoints, or none if the setpoints are sent at the start of the next
+        cycle.
+        """
         self.history = np.full((history, 3), np.nan)
-        """Commanded positions at SYNC n in row n % history [m]; NaN for none."""
+        """Commanded positions at SYNC n in row n % history [m]; NaN if there were none."""
         self.arrived = PackedFrames(MOST_FRAMES)
 
     def expect(self, rows: Sequence[tuple[Any, ...]]) -> None:
-        """Replace the expected frames by these rows of EXPECTED."""
+        """Replace the expected frames with the given rows of EXPECTED."""
         self.expected = np.array(rows, EXPECTED)
 
 
 @runtime_checkable
 class Lender(Protocol):
-    """A DriveGroup whose cycles compiled code may run by tables."""
+    """DriveGroup whose cycles can be run by compiled code, using tables."""
 
     def lend(self) -> Cyclic | None:
-        """Return the tables between two cycles, or None if the next cycle needs more than them.
+        """Return the tables between two cycles, or None if the next cycle needs more than the tables.
 
-        While they are lent, only commands such as `disable` or `quick_stop` are called, and then `take_back` before
-        the next cycle.
+        While they are lent, the caller may only call commands such as `disable` or `quick_stop`; it then calls
+        `take_back` before the next cycle.
         """
 
     def take_back(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
-        """Continue from the tables; return the feedback.
+        """Continue from the tables, and return the feedback.
 
         Parameters
         ----------
         handled
-            Number of handled frames among the `arrived` ones in the tables.
+            Number of handled frames among the `arrived` frames in the tables.
         arrived
             Number of received frames in the tables.
         synced
-            Time at which the SYNC of an unfinished cycle was sent [s]; None if no cycle is unfinished.
+            Time at which the SYNC of an unfinished cycle was sent [s]; None if every cycle is finished.
         error
-            Number of errno.h with which receiving has failed, or 0.
+            Error number (errno.h) with which receiving failed, or 0.
         """
 
     def send_on(self, first: int) -> None:
-        """Send the setpoints in the tables from drive `first` on, which the bus has refused, and changed outputs."""
+        """Send the setpoints in the tables from drive `first` on, which the bus refused, then changed outputs."""

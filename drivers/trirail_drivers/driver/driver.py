@@ -1,4 +1,4 @@
-"""Base of the drivers of all protocols: bus, axes, bus load, time limit of a stop, closing."""
+"""Base class of the drivers for all protocols: bus, axes, bus load, time limit of a stop, closing."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ class Driver(ABC, Generic[AnyAxis]):
         reopening: Reopening | None = None,
         io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
-        """`history`: number of sent setpoints to keep. `reopening` reopens a lost bus. `io`: that of each drive."""
+        """`history` is the number of sent setpoints to keep, `reopening` reopens a lost bus, and `io` is that of each
+        drive.
+        """
         self.bus_load = 0.0
         self._wire = Wire(bus, self._stop, reopening)
         self._bitrate = bitrate
@@ -62,13 +64,13 @@ class Driver(ABC, Generic[AnyAxis]):
         self._synced = 0.0
         """Start of the cycle [s]."""
         self._off_deadline = math.inf
-        """Time by which the drives must have lost their power [s]; inf if none is pending."""
+        """Time by which the drives must be without power [s]; inf if no such deadline is set."""
         self._stop_reason = ""
         """Command that set `_off_deadline`."""
         self._closed = False
 
     def _warn_of_setup(self, made: Sequence[SetUpDrive]) -> None:
-        """Warn of everything in which the set-ups deviate."""
+        """Emit a warning for every deviation that the set-ups report."""
         for line in merge_notes((each.name, each.notes) for each in made):
             self._wire.warn(line)
 
@@ -87,7 +89,7 @@ class Driver(ABC, Generic[AnyAxis]):
     ) -> tuple[Sequence[Result | None], str]:
         """Configure the drives at the start.
 
-        Return their set-ups, None for an absent drive, and the reason for which the bus is lost, or "".
+        Return the set-up of each drive, or None for an absent drive, and the reason why the bus is lost, or "".
         """
         if isinstance(self._wire.bus, AbsentBus):
             return (None, None, None), self._wire.bus.reason
@@ -99,7 +101,9 @@ class Driver(ABC, Generic[AnyAxis]):
             return (None, None, None), str(error)
 
     def _report_absent(self, lost: str) -> None:
-        """Latch a fault with the reason for a `lost` bus, or with the drives that did not answer at the start."""
+        """Latch a fault with the reason `lost` why the bus is lost, or with the drives that did not answer at the
+        start.
+        """
         if lost:
             self._wire.lose(lost)
         elif away := [axis.name for axis in self._axes if axis.silent]:
@@ -108,7 +112,10 @@ class Driver(ABC, Generic[AnyAxis]):
             self._wire.fail(DriveFault("" if more else one, "silent", 0, f"{text}; switch the supply on"))
 
     def _recover(self) -> None:
-        """Continue the recovery of drives; on a bus on trial too, since some drives only answer requests."""
+        """Continue the recovery of drives.
+
+        This includes a reopened bus on trial, since some drives only answer requests.
+        """
         if self._recovery is None:
             return
         if self._wire.carries:
@@ -118,29 +125,31 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @property
     def path_outputs(self) -> tuple[bool, bool, bool]:
-        """Whether each drive adopts its outputs with a setpoint; otherwise they may not switch on a path."""
+        """Whether each drive applies its outputs together with a setpoint; otherwise its outputs cannot be switched on
+        a path.
+        """
         a, b, c = self._axes
         return bool(a.maps_outputs), bool(b.maps_outputs), bool(c.maps_outputs)
 
     def set_outputs(self, words: Sequence[int]) -> None:
-        """Set the wanted outputs, as bits of 60FEh; the next `write` sends those that differ."""
+        """Set the wanted outputs as bits of 60FEh; the next `write` sends those that changed."""
         for axis, word in zip(self._axes, words, strict=True):
             axis.outputs = word & axis.io.outputs
 
     @property
     def traffic(self) -> int:
-        """Bits of all frames sent and received since the start, each with worst-case stuffing."""
+        """Number of bits of all frames sent and received since the start, each with worst-case stuffing."""
         return self._wire.traffic + int(self._tables.times[0]["traffic"])
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
-        """First fault that each drive itself has reported since the last reset, or None."""
+        """For each drive, the first fault that it has reported itself since the last reset, or None."""
         return tuple(axis.event for axis in self._axes)
 
     def close(self) -> None:
-        """Take the drives' power off, and close the bus.
+        """Remove power from the drives, and close the bus.
 
-        Drives that have power first stop by their ramps.
+        Drives that have power first stop with their quick-stop ramps.
         """
         if self._closed:
             return
@@ -164,7 +173,7 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @abstractmethod
     def _powered(self) -> bool:
-        """Whether a drive has power, as far as it is known."""
+        """Whether any drive has power, as far as is known."""
 
     @abstractmethod
     def _wants_power(self) -> bool:
@@ -172,21 +181,24 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @abstractmethod
     def _wait_for_standstill(self, deadline: float) -> None:
-        """Run cycles until the stopping drives have lost their power, or until `deadline` [s]."""
+        """Run cycles until the stopping drives have lost power, or until `deadline` [s]."""
 
     def _make_outputs_safe(self) -> None:
         """Set the outputs to their safe values and wait for the answers, if the protocol has outputs."""
 
     @abstractmethod
     def _cut_power(self) -> None:
-        """Send the frames that take the drives' power off, in any state."""
+        """Send the frames that remove power from the drives in any state."""
 
     @abstractmethod
     def _abandon_stop(self) -> None:
-        """End the ramps of drives that are stopping: from now on only take their power off."""
+        """Abandon the ramps of stopping drives; from now on, only remove their power."""
 
     def _set_period(self, period: float, traffic: load.Traffic) -> None:
-        """Set the cycle period [s]; BusError if its frames do not fit on the bus, a warning if they hardly fit."""
+        """Set the cycle period [s].
+
+        Raises BusError if the cycle's frames do not fit on the bus; emits a warning if they leave little room.
+        """
         rate = 1.0 / period
         self.bus_load = traffic.check_bus_load(rate, self._bitrate, self._drives.heartbeat)
         self._period = period
@@ -194,20 +206,20 @@ class Driver(ABC, Generic[AnyAxis]):
             self._wire.warn(warning)
 
     def _begin_cycle(self, now: float) -> None:
-        """Begin a cycle on the bus, even a lost or reopened one."""
+        """Begin a cycle on the bus, even if the bus is lost or has been reopened."""
         self._wire.begin(now, stopping=self._off_deadline != math.inf)
         self._tables.bus[:] = self._wire.access
 
     @property
     def _unready(self) -> UnreadyDrives:
-        """Reason for which each drive cannot be reset yet; the same for all while the bus is lost."""
+        """For each drive, the reason why it cannot be reset yet; the same reason for all while the bus is lost."""
         if self._wire.down:
             lost = Unready(self._wire.down)
             return lost, lost, lost
         return self._recovery.unready if self._recovery is not None else (None, None, None)
 
     def _stop(self) -> None:
-        """Stop the drives on a fault, if they have power or are getting it."""
+        """Stop the drives because of a fault, if they have power or are being powered up."""
         if self._wants_power():
             self.quick_stop()
 
@@ -215,7 +227,7 @@ class Driver(ABC, Generic[AnyAxis]):
         self._off_deadline, self._stop_reason = self._clock() + self._drives.stop_timeout, reason
 
     def _check_stopped(self, now: float) -> None:
-        """Latch a fault, once, for a drive that still has power after `stop_timeout`; only its brake can stop it."""
+        """Latch one fault for a drive that still has power after `stop_timeout`; only its brake can stop it."""
         if now < self._off_deadline:
             return
         self._off_deadline = math.inf
@@ -227,6 +239,6 @@ class Driver(ABC, Generic[AnyAxis]):
                 return
 
     def _refuse_setpoint(self, axis: Axis, position: float, velocity: float) -> None:
-        """Latch a fault for a setpoint [m], [m/s] that no frame can hold."""
+        """Latch a fault for a setpoint [m], [m/s] that does not fit into a frame."""
         text = f"drive {axis.name}: cannot take setpoint {position * 1e3:g} mm, {velocity * 1e3:g} mm/s"
         self._wire.fail(DriveFault(axis.name, "setpoint", 0, text))

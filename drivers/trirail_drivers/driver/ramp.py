@@ -1,4 +1,4 @@
-"""A braking ramp."""
+"""Braking ramp."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 
 def brake(position: float, velocity: float, deceleration: float, step: float) -> tuple[float, float]:
-    """Return position and velocity after braking for `step` seconds with `deceleration`, at most to standstill."""
+    """Return position and velocity after braking for `step` seconds with `deceleration`, or until standstill."""
     moving = min(step, abs(velocity) / deceleration)
     lost = math.copysign(deceleration * moving, velocity)
     position += (velocity - 0.5 * lost) * moving

@@ -1,7 +1,7 @@
-"""Set-up of drives in the background of the cycle, after they restarted, fell silent or were absent.
+"""Set-up of drives in the background of the cycle, after they have restarted, fallen silent or been absent.
 
-It is the set-up of the start, run one step at a time so that its traffic is bounded. It sends nothing while a drive
-that answers has power.
+The set-up is the same as at the start, but runs one step at a time to bound its traffic. It sends nothing while any
+drive that answers has power.
 """
 
 from __future__ import annotations
@@ -22,10 +22,13 @@ from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import Clock, Unready, UnreadyDrives
 
 STEP_BITS: Final = 2000
-"""Bit times between two steps, for all drives together: a request and its answer then take 13.5 % of a bus that the
-cycle fills to 75 %, and a drive during set-up leaves 11 % of that unused, since it sends no position."""
+"""Bit times between two set-up steps, counted over all drives.
+
+A request and its answer then use 13.5 % of a bus that the cycle fills to 75 %. A drive that is being set up sends no
+position, which frees 11 % of that bus.
+"""
 RETRY_AFTER: Final = 2.0
-"""Pause before a refused drive is configured again [s]: the cause may have gone without a boot-up."""
+"""Pause before a refused drive is configured again [s]: the cause may disappear without a boot-up message."""
 
 AnyAxis = TypeVar("AnyAxis", bound=Axis)
 Setup = TypeVar("Setup", bound=SetUpDrive)
@@ -33,7 +36,7 @@ StartState = TypeVar("StartState")
 
 
 class SetupClient(Protocol):
-    """Request client of one drive."""
+    """Client that sends the set-up requests to one drive."""
 
     @property
     def answered(self) -> int:
@@ -41,7 +44,7 @@ class SetupClient(Protocol):
 
 
 class CycleSender:
-    """Sender of set-up frames in the cycle: it does not wait, and a failure becomes a fault of the bus."""
+    """Sender of set-up frames in the cycle. It does not wait, and a failure becomes a fault of the bus."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
@@ -57,27 +60,29 @@ class CycleSender:
 
 
 class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
-    """A drive that may have to be set up again: its last complete set-up, and the progress of the current one.
+    """Drive that may have to be set up again: its last complete set-up, and the progress of the current one.
 
-    A set-up has two results: the set-up of the drive, and its state at the start.
+    A set-up returns two results: the set-up of the drive, and its state at the start.
     """
 
     work: ClassVar[str]
     """Name of the set-up, for people."""
     counted: ClassVar[str]
-    """Name of the requested things, for people."""
+    """Name of the requested items, for people."""
 
     def __init__(self, axis: AnyAxis) -> None:
         self.axis = axis
         self.setup: Setup | None = None
-        """Result of its last complete set-up."""
+        """Result of the drive's last complete set-up."""
         self.requests = 0
-        """Number of requests of the longest set-up."""
+        """Number of requests in the longest set-up."""
         self.conversation: BackgroundConversation[tuple[Setup, StartState]] | None = None
         self.client: SetupClient | None = None
-        """Client of that conversation."""
+        """Client of the current conversation."""
         self.is_next = False
-        """Whether the conversation begins as soon as the cycle's last request is answered: it must not make another."""
+        """Whether the conversation starts as soon as the cycle's last request is answered; the cycle must send no
+        other.
+        """
         self.refused = ""
         """Error of the last attempt."""
         self.retry_at = -math.inf
@@ -97,19 +102,19 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
 
     @abstractmethod
     def may_have_power(self, *, stopping: bool) -> bool:
-        """Whether the drive has power by its last message or, while drives are `stopping`, may have it."""
+        """Whether the drive has power according to its last message or, if drives are `stopping`, may have power."""
 
     @property
     def settled(self) -> bool:
-        """Whether a restarted drive is ready for requests."""
+        """Whether a restarted drive is ready to receive requests."""
         return True
 
     def has_answered(self, now: float) -> bool:  # noqa: ARG002
-        """Whether the cycle's last request is answered, or has timed out at time `now` [s]."""
+        """Whether the cycle's last request has been answered, or has timed out at time `now` [s]."""
         return True
 
     def record_setup(self, made: Setup, answered: int) -> None:
-        """Record a complete set-up, and its number of requests."""
+        """Record a complete set-up and its number of requests."""
         self.setup, self.requests, self.refused = made, max(self.requests, answered), ""
 
     def receive(self, identifier: int, data: bytes | bytearray) -> None:
@@ -118,7 +123,7 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
             self.conversation.receive(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
 
     def refuse(self, error: DriveError, now: float) -> None:
-        """Record the reason for which the drive cannot take part; it is configured again later."""
+        """Record why the drive cannot take part; it is configured again later."""
         self.refused, self.retry_at = str(error), now + RETRY_AFTER
 
     def end(self) -> None:
@@ -129,7 +134,7 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
             self.conversation = self.client = None
 
     def unready(self, *, blocked: bool) -> Unready | None:
-        """Return the reason for which the drive cannot be reset yet; `blocked`: it waits until no drive has power."""
+        """Return the reason why the drive cannot be reset yet. If `blocked`, it waits until no drive has power."""
         axis, name = self.axis, f"drive {self.axis.name}"
         if axis.configured:
             return None
@@ -145,10 +150,10 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
 
 
 class Recovery(Generic[AnyAxis, Setup, StartState]):
-    """Recovery of all drives. `step` belongs after the setpoints of each cycle."""
+    """Recovery of all drives. Call `step` after the setpoints of each cycle."""
 
     def __init__(self, wire: Wire, bits: float, each: Sequence[ReturningDrive[AnyAxis, Setup, StartState]]) -> None:
-        """`bits`: bit times in a cycle."""
+        """`bits` is the number of bit times in a cycle."""
         self._wire = wire
         self._sender = CycleSender(wire)
         self._each = each
@@ -160,7 +165,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
 
     @property
     def setups(self) -> list[Setup]:
-        """Last complete set-ups, of those drives that have had one."""
+        """Last complete set-ups of the drives that have had one."""
         return [each.setup for each in self._each if each.setup is not None]
 
     @property
@@ -170,7 +175,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
 
     @property
     def unready(self) -> UnreadyDrives:
-        """Reason for which each drive cannot be reset yet."""
+        """For each drive, the reason why it cannot be reset yet."""
         if self.idle:
             return None, None, None
         a, b, c = (each.unready(blocked=self._blocked) for each in self._each)
@@ -178,15 +183,15 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
 
     @property
     def _blocked(self) -> bool:
-        """Whether a drive may have power."""
+        """Whether any drive may have power."""
         return any(each.may_have_power(stopping=self._stopping) for each in self._each)
 
     def is_configuring(self, axis: Axis) -> bool:
-        """Whether a drive is being configured, or will be next."""
+        """Whether a drive is being configured or is next to be configured."""
         return any(each.axis is axis and (each.is_next or each.conversation is not None) for each in self._each)
 
     def step(self, now: float, *, stopping: bool) -> None:
-        """Continue with the drives whose turn it is; `stopping`: drives may still be on their ramp."""
+        """Continue with the drives whose turn it is. `stopping` means that drives may still be on their ramp."""
         for each in self._each:
             _restart_after_boot(each)
         if self.idle:
@@ -196,7 +201,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
             for each in self._each:
                 each.end()
             return
-        # Bounded, so that steps that no drive could use are not saved up for a burst.
+        # Bounded, so that steps that no drive could use do not accumulate and lead to a burst.
         self._steps_due = min(self._steps_due + self._steps_per_cycle, max(1.0, self._steps_per_cycle))
         for _ in self._each:
             if self._steps_due < 1.0:
@@ -208,7 +213,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
                 self._steps_due -= 1.0
 
     def abandon(self) -> None:
-        """Abandon every conversation: a restart while the bus is lost is not received."""
+        """Abandon every conversation, because no boot-up message can be received while the bus is lost."""
         for each in self._each:
             each.refused, each.retry_at = "", -math.inf
             each.end()
@@ -227,7 +232,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
             return
         answered = each.client.answered if each.client is not None else 0
         each.end()
-        if isinstance(end, DriveTimeout):  # it has disappeared again, or never came
+        if isinstance(end, DriveTimeout):  # it has disappeared again, or never appeared
             each.refused, each.axis.silent = "", True
             each.axis.restarted = each.axis.restarted and not isinstance(end, DriveAbsentError)
         elif isinstance(end, DriveError):
@@ -240,7 +245,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
                 return
             if warning:
                 self._wire.warn(warning)
-            # Only new notes: those of the previous set-up have been warned of.
+            # Warn only of new notes; those of the previous set-up have already been reported.
             known = each.setup.notes if each.setup is not None else ()
             for line in merge_notes([(each.axis.name, [note for note in end[0].notes if note not in known])]):
                 self._wire.warn(line)
@@ -248,7 +253,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
 
 
 def _restart_after_boot(each: ReturningDrive[Any, Any, Any]) -> None:
-    """Start again with a drive that has booted since, and end the conversation of a configured one."""
+    """Start over with a drive that has booted since, and end the conversation of a configured drive."""
     if each.boots != each.axis.boots:
         each.boots, each.refused, each.retry_at = each.axis.boots, "", -math.inf
         each.booted_at = each.axis.syncs

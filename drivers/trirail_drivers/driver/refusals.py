@@ -1,4 +1,4 @@
-"""Refusals of drives: for missing protections, for a replaced drive, and of all three drives combined."""
+"""Refusals of drives: for missing protections, for a replaced drive, and the combined refusal of all three drives."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class ProtectionText(Protocol):
 
     @property
     def purpose(self) -> str:
-        """Purpose, for people."""
+        """Purpose of the protection, for people."""
 
     @property
     def without(self) -> str:
-        """Consequence, for people."""
+        """Consequence of lacking the protection, for people."""
 
 
 class SetUpDrive(Protocol):
@@ -32,7 +32,7 @@ class SetUpDrive(Protocol):
 
     @property
     def notes(self) -> Sequence[str]:
-        """Notes for people, a line each."""
+        """Notes for people, one line each."""
 
     @property
     def missing_protections(self) -> Sequence[str]:
@@ -46,9 +46,10 @@ def review_protections(
     protections: Mapping[str, ProtectionText],
     remedy: str = "",
 ) -> tuple[str, list[str]]:
-    """Return the refusal of a drive that lacks protections, or "", and notes on those it may lack.
+    """Return the refusal of a drive that lacks protections, or "", and notes on those it is allowed to lack.
 
-    `missing_protections` has the reason for each, `accepted` is its `accept_without`, `remedy` a way to set them.
+    `missing_protections` maps each missing protection to the reason, `accepted` is the drive's `accept_without`, and
+    `remedy` is a way to set the protections.
     """
     refused = [name for name in missing_protections if name not in accepted]
     notes = []
@@ -69,9 +70,9 @@ def review_protections(
 def replacement_refusal(
     drive: str, numbers: Mapping[str, tuple[object, object]], may_differ: Collection[str], *, allowed: bool
 ) -> str:
-    """Return the refusal of a drive that is not the one before; "" if it is, or is an allowed replacement.
+    """Return the refusal of a drive that differs from the previous one; "" if it is the same or an allowed replacement.
 
-    `numbers` has the identity of the drive, before and now, by the names of its parts. If a replacement is `allowed`,
+    `numbers` maps each part of the drive's identity to its previous and present value. If a replacement is `allowed`,
     the parts in `may_differ` may differ.
     """
     differing = [
@@ -89,7 +90,7 @@ def replacement_refusal(
 
 
 def raise_combined(errors: Sequence[DriveError]) -> None:
-    """Raise the errors of all drives as one; the same error of several drives appears once."""
+    """Raise the errors of all drives as one error; an error that several drives share appears once."""
     if len(errors) == 1:
         raise errors[0]
     alike: dict[str, list[str]] = {}
@@ -101,7 +102,7 @@ def raise_combined(errors: Sequence[DriveError]) -> None:
 
 
 def merge_notes(notes: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """Return notes on drives for people, a line each; the same note on several drives is one line."""
+    """Return notes on drives for people, one line each; a note that several drives share becomes one line."""
     names: dict[str, list[str]] = {}
     for name, lines in notes:
         for line in lines:
@@ -110,6 +111,6 @@ def merge_notes(notes: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
 
 
 def _name(text: str) -> str:
-    """Return the name of the drive in an error, or ""."""
+    """Return the name of the drive that an error names, or ""."""
     match = _NAMED.search(text)
     return match[2] if match else ""

@@ -1,4 +1,4 @@
-"""Requirements of a robot on its drives, and checks that the resolution of their positions meets them."""
+"""Requirements of a robot on its drives, and checks that the drives' position resolution meets them."""
 
 from __future__ import annotations
 
@@ -11,27 +11,30 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import NAMES, Triple
 
 MIN_STEPS_PER_LIMIT: Final = 10
-"""Fewest position steps in a limit of the following error: with fewer, rounding alone could be a fault."""
+"""Minimum number of position steps in a limit of the following error: with fewer, rounding alone could cause a fault.
+"""
 MIN_STEPS_PER_WINDOW: Final = 3
-"""Fewest position steps in a window to either side: with fewer, rounding and encoder flicker could leave it."""
+"""Minimum number of position steps on either side of a window: with fewer, rounding and encoder flicker could exceed
+it.
+"""
 
 
 class Rule(NamedTuple):
-    """One check of the configuration. Each runs by itself, so that no error hides another."""
+    """Check of the configuration. Each check runs separately, so that no error hides another."""
 
     key: str
     """Key that is wrong if the check fails."""
     reads: tuple[str, ...]
-    """Other keys that the result depends on; the name of a table for all its keys."""
+    """Other keys on which the result depends; the name of a table stands for all its keys."""
     check: Callable[[], object]
-    """Function that raises a TrirailError with key, value and a valid value."""
+    """Function that raises a TrirailError with the key, its value and a valid value."""
 
 
 class Window(NamedTuple):
-    """Window of a value that depends on the sliders' positions."""
+    """Tolerance window of a value that depends on the slider positions."""
 
     key: str
-    """Key of the configuration."""
+    """Key in the configuration."""
     width: float
     """Half width [unit]."""
     unit: str
@@ -46,21 +49,21 @@ class Requirements(NamedTuple):
     """Cycle period [s]."""
     low: Sequence[float]
     high: Sequence[float]
-    """Travel of the sliders [m]."""
+    """Lower and upper ends of the travel of the sliders [m]."""
     velocity: Triple
     """Largest velocities of the sliders [m/s]."""
     following_error: float
     """Following error above which the service stops all drives [m]."""
     windows: tuple[Window, ...] = ()
-    """Windows in which the robot must settle."""
+    """Windows within which the robot must settle."""
 
 
 def resolution_rules(
     name: str, drive: Drive, drives: Drives, required: Requirements, step: float, remedy: Callable[[float], str]
 ) -> Iterator[Rule]:
-    """Yield checks that every limit is several position steps of `step` [m] wide, so that rounding is no fault.
+    """Yield checks that every limit is several position steps of `step` [m] wide, so that rounding causes no fault.
 
-    `remedy` returns the remedy for people, from the largest valid step [m].
+    `remedy` returns the remedy for people, given the largest valid step [m].
     """
     scale = f"drives.{name}.offset", "limits.slider.position", "can.simulated.start"
     limits = (

@@ -16,25 +16,25 @@ class Scale:
     """Position scale of one drive: `counts = counts_per_metre * (position - offset)`."""
 
     counts_per_metre: float
-    """Negative where counts fall as the slider position rises."""
+    """Resolution of the encoder; negative if the counts decrease as the slider position increases."""
     offset: float
     """Slider position at zero counts [m]."""
 
     def counts(self, position: float) -> int:
-        """Return a slider position [m] in counts; ValueError or OverflowError if it is not finite."""
+        """Convert a slider position [m] to counts. Raises ValueError or OverflowError if it is not finite."""
         return round(self.exact(position))
 
     def exact(self, position: float) -> float:
-        """Return a slider position [m] in counts, not rounded (an ODrive's turns)."""
+        """Convert a slider position [m] to counts without rounding (turns of an ODrive)."""
         return self.counts_per_metre * (position - self.offset)
 
     def metres(self, counts: float) -> float:
-        """Return the slider position [m] of a drive position."""
+        """Convert a drive position to a slider position [m]."""
         return counts / self.counts_per_metre + self.offset
 
 
 def scale_of(name: str, drive: Drive) -> Scale:
-    """Return the scale of a drive; DriveError if slider position 0 does not fit into a 32-bit drive position."""
+    """Return the scale of a drive. Raises DriveError if slider position 0 does not fit into a 32-bit drive position."""
     scale = Scale(drive.direction * drive.counts_per_metre, drive.offset)
     try:
         zero = scale.counts(0.0)

@@ -1,1 +1,1 @@
-"""ODrives on CANSimple."""
+"""ODrive drives on CANSimple."""

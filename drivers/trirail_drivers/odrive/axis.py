@@ -1,4 +1,4 @@
-"""State of one ODrive from its messages: position, axis state, errors and faults."""
+"""State of one ODrive, taken from its messages: position, axis state, errors and faults."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from trirail_drivers.odrive.cansimple import AxisState, ProcedureResult
 from trirail_drivers.odrive.codes import describe_errors
 
 RESET_TIME = 3 * 3 * cansimple.ERROR_PERIOD
-"""Time after Clear_Errors in which errors are not yet a fault [s]: three error requests to each drive."""
+"""Time after Clear_Errors during which errors do not yet count as a fault [s]: three error requests to each drive."""
 STALE_HEARTBEATS = 1
-"""Heartbeats after a request that may still show the state before it."""
+"""Number of heartbeats after a request that may still show the previous state."""
 
 
 class OdriveAxis(Axis):
-    """Newest feedback of one drive; the `on_` methods take a message's data or raise struct.error."""
+    """Newest feedback of one drive. The `on_` methods take the data of a message; they may raise struct.error."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
@@ -35,19 +35,19 @@ class OdriveAxis(Axis):
         )
         self.position_at, self.velocity_at = 0, 4
         self.state: int = AxisState.UNDEFINED
-        """Axis state of the newest heartbeat."""
+        """Axis state in the newest heartbeat."""
         self.errors = 0
         """Active errors and disarm reason, as bits."""
         self.reported = False
-        """Whether it has answered a Get_Error request."""
+        """Whether the drive has answered a Get_Error request."""
         self.requested: AxisState | None = None
         """Axis state requested last; None makes the driver request the target state again."""
         self.reset_until = -math.inf
         """Time until which cleared errors may persist [s]."""
         self._beats = 0
-        """Heartbeats since the last request."""
+        """Number of heartbeats since the last request."""
         self._started = False
-        """Whether a heartbeat has shown that it is not booting."""
+        """Whether a heartbeat has shown that the drive is no longer booting."""
         self._result: int = ProcedureResult.SUCCESS
 
     def is_steady(self, wanted: AxisState | None) -> bool:
@@ -59,11 +59,13 @@ class OdriveAxis(Axis):
 
     @property
     def heartbeat_state(self) -> tuple[int, int]:
-        """Axis state and procedure result of the newest heartbeat: its only fields that decide anything."""
+        """Axis state and procedure result in the newest heartbeat, the only fields that affect decisions."""
         return self.state, self._result
 
     def expected_rows(self, number: int) -> list[tuple[Any, ...]]:
-        """Return rows of trirail_drivers.driver.cyclic.EXPECTED: frames of drive `number` that carry no news."""
+        """Return rows of trirail_drivers.driver.cyclic.EXPECTED for the frames of drive `number` that carry no new
+        information.
+        """
 
         def identifier(command: int) -> int:
             return cansimple.identifier(self.node, command)
@@ -77,11 +79,11 @@ class OdriveAxis(Axis):
         ]
 
     def input_pos(self, position: float, velocity: float) -> bytes:
-        """Return Set_Input_Pos of a setpoint [m], [m/s]; OverflowError or struct.error if it does not fit."""
+        """Return Set_Input_Pos for a setpoint [m], [m/s]. Raises OverflowError or struct.error if it does not fit."""
         return cansimple.input_pos(self.scale.exact(position), self.scale.counts_per_metre * velocity)
 
     def with_setup_listener(self, number: int, handler: Handler) -> Handler:
-        """Return a handler that passes messages of this number to a running set-up as well."""
+        """Return a handler that also passes messages with this number to a running set-up."""
         identifier = cansimple.identifier(self.node, number)
 
         def handle(data: bytearray, now: float) -> None:
@@ -92,29 +94,29 @@ class OdriveAxis(Axis):
         return handle
 
     def ignore_answer(self, data: bytes | bytearray, now: float) -> None:
-        """Do nothing: only set-up needs this message, and gets it from `with_setup_listener`."""
+        """Ignore the message: only a set-up needs it, and receives it through `with_setup_listener`."""
 
     def set_up(self, turns: float, errors: int, state: int) -> None:
-        """Adopt the state that the drive had at the end of its set-up."""
+        """Take over the state that the drive had at the end of its set-up."""
         self.position = self.scale.metres(turns)
         self.state, self.reported, self._started = state, True, True
         self.note_request(AxisState.IDLE)
         self._update_errors(errors)
 
     def rejoin(self, now: float) -> None:
-        """Take part in the cycle again after a set-up in the background."""
+        """Let the drive take part in the cycle again after a set-up in the background."""
         self.restarted = self.silent = self.powered_up = False
         self.heard = now
         self.clear_missed()
 
     def forget_power_state(self) -> None:
-        """Forget the last reported power state; the set-up requests it."""
+        """Forget the power state reported last; the set-up requests it again."""
         self.state, self.requested = AxisState.UNDEFINED, None
 
     def on_estimates(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Handle Get_Encoder_Estimates: the position at the arrival of the request."""
+        """Handle Get_Encoder_Estimates, which contains the position at the arrival of the request."""
         turns, _ = cansimple.ESTIMATES.unpack(data)
-        if not self.configured:  # one that boots does not know its position yet
+        if not self.configured:  # a drive that is booting does not know its position yet
             return
         self.answer()
         if math.isfinite(turns):
@@ -140,24 +142,27 @@ class OdriveAxis(Axis):
             if self.requested is AxisState.CLOSED_LOOP_CONTROL:
                 self.powered_up = True
             elif self.state_is_current:
-                self.requested = None  # it still has power: request idle again
+                self.requested = None  # the drive still has power: request idle again
         elif self.requested is AxisState.CLOSED_LOOP_CONTROL and self.state_is_current and not self.powered_up:
             self._watch_refusal()
 
     def note_request(self, state: AxisState) -> None:
-        """Record that a state was requested of the drive."""
+        """Record that a state was requested from the drive."""
         self.requested = state
         self._beats = 0
 
     def clear_faults(self, now: float) -> None:
-        """Forget the latched event, not a lasting condition, and allow time for errors to be cleared."""
+        """Forget the latched event, but not a condition that persists, and allow time for errors to be cleared."""
         if self.configured:
             self.event = None
         if self.errors:
             self.reset_until = now + RESET_TIME
 
     def power(self, follows: bool) -> PowerState:
-        """Return the state in terms of CiA 402; `follows`: it should follow setpoints and is not stopping."""
+        """Return the power state in terms of CiA 402.
+
+        `follows` means that the drive should follow setpoints and is not stopping.
+        """
         match self.state:
             case AxisState.UNDEFINED:
                 return PowerState.NOT_READY_TO_SWITCH_ON
@@ -172,11 +177,11 @@ class OdriveAxis(Axis):
 
     @property
     def powered(self) -> bool:
-        """Whether there may be current in its motor."""
+        """Whether current may flow in the drive's motor."""
         return self.state not in (AxisState.UNDEFINED, AxisState.IDLE)
 
     def find_fault(self, now: float, follows: bool) -> DriveFault | None:
-        """Return the drive's fault at time `now` [s]; `follows`: it should follow setpoints."""
+        """Return the drive's fault at time `now` [s]. `follows` means that the drive should follow setpoints."""
         if self.event is not None:
             return self.event
         if self.errors and now >= self.reset_until:
@@ -192,7 +197,10 @@ class OdriveAxis(Axis):
         return None
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return the fault of a drive that still has power `seconds` [s] after `wanted`, as "quick stop"."""
+        """Return the fault of a drive that still has power `seconds` [s] after a command.
+
+        `wanted` names the command, such as "quick stop".
+        """
         if not self.powered:
             return None
         text = f"is in {cansimple.state_name(self.state)} {seconds:g} s after {wanted}; expected idle"
@@ -200,22 +208,22 @@ class OdriveAxis(Axis):
 
     @property
     def state_is_current(self) -> bool:
-        """Whether the newest heartbeat was sent after the drive got the last request."""
+        """Whether the newest heartbeat was sent after the drive received the last request."""
         return self._beats > STALE_HEARTBEATS
 
     def _update_errors(self, errors: int) -> None:
         self.errors = errors
         if not errors:
             self.reset_until = -math.inf
-        # A drive that has started shows INITIALIZING or an undefined state only after another boot.
+        # A drive that has started reports INITIALIZING or an undefined state only after another boot.
         if self._started and cansimple.is_starting(self.state, errors):
             self._note_restart()
 
     def _note_restart(self) -> None:
-        """Note that the drive boots: it may be another one, or have lost its settings and its position."""
+        """Record that the drive is booting: it may be a different drive, or have lost its settings and its position."""
         self._started, self.state = False, AxisState.UNDEFINED
         self.restarted, self.boots = True, self.boots + 1
-        # Replaces an earlier event: a restart explains it.
+        # This replaces an earlier event, which the restart explains.
         self.event = self.make_fault("state", 0, "has restarted: wait until its settings are checked, then send reset")
 
     def _watch_refusal(self) -> None:

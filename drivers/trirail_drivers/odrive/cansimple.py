@@ -1,7 +1,7 @@
 """ODrive's CANSimple messages as bytes: identifiers, layouts, states, errors, bus traffic.
 
-Layouts are those of firmware 0.6, from ODrive's manual, chapter "CAN Protocol": little-endian, floats of 32 bits,
-positions in turns of the encoder that the axis loads.
+The layouts are those of firmware 0.6, from the ODrive manual, chapter "CAN Protocol": values are little-endian, floats
+have 32 bits, and positions are in turns of the encoder that the axis uses for its load.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 from trirail_drivers.bus.frames import Frame, frame_bits
 from trirail_drivers.bus.load import Traffic
 
-# Commands: the lower five bits of an identifier, under the node id.
+# Commands: the lower five bits of an identifier; the node id forms the upper bits.
 GET_VERSION: Final = 0x00
 HEARTBEAT: Final = 0x01
 ESTOP: Final = 0x02
@@ -34,9 +34,12 @@ BEAT: Final = Struct("<IBBBx")
 ERRORS: Final = Struct("<II")
 """Get_Error: active errors, disarm reason."""
 SERIAL_AT: Final = slice(1, 7)
-"""Address: node id, serial number of 48 bits; newer firmware has a connection id behind them."""
+"""Address: node id, serial number of 48 bits; in newer firmware, a connection id follows."""
 SDO: Final = Struct("<BHB")
-"""RxSdo: opcode, endpoint, reserved; TxSdo: reserved, endpoint, reserved. The value follows, in its endpoint's type."""
+"""RxSdo: opcode, endpoint, reserved; TxSdo: reserved, endpoint, reserved.
+
+The value follows, in the type of its endpoint.
+"""
 READ: Final = 0
 WRITE: Final = 1
 """Opcodes of RxSdo."""
@@ -47,7 +50,9 @@ TYPES: Final = {
     "uint32": Struct("<I"), "int32": Struct("<i"),
     "float": Struct("<f"),
 }  # fmt: skip
-"""Types of endpoints as flat_endpoints.json names them; those of eight bytes do not go into a message."""
+"""Types of endpoints by their names in flat_endpoints.json, without the eight-byte types, which do not fit in a
+message.
+"""
 AXIS_STATE: Final = Struct("<I4x")
 """Set_Axis_State: requested state."""
 ESTIMATES: Final = Struct("<ff")
@@ -60,25 +65,25 @@ CLEAR: Final = Struct("<B")
 """Clear_Errors: whether to blink for identification."""
 
 VELOCITY_SCALE: Final = 1000
-"""The drive's input_vel_scale, by default: units of the velocity feed-forward in a turn per second."""
+"""Default of the drive's input_vel_scale: velocity feed-forward units per turn per second."""
 VELOCITY_STEP: Final = 1.0 / VELOCITY_SCALE
 """Unit of the velocity feed-forward [turns/s]."""
 MAX_FEED_FORWARD: Final = 32767 * VELOCITY_STEP
-"""The fastest feed-forward that 16 bits hold [turns/s]."""
+"""Largest velocity feed-forward that fits into 16 bits [turns/s]."""
 
 POSITION_CONTROL: Final = 3
 PASSTHROUGH: Final = 1
-"""Input mode in which a setpoint is followed from its arrival on, without a filter or profile of the drive's."""
+"""Input mode in which the drive follows a setpoint from its arrival on, without its own filter or profile."""
 
 NODES: Final = range(63)
-"""Node ids of six bits, without 3Fh, which is that of all drives together or of one without an id yet."""
+"""Valid node ids of six bits. 3Fh is excluded: it addresses all drives together, or a drive that has no id yet."""
 
 ERROR_PERIOD: Final = 0.01
-"""One of the three drives is asked for its errors this often, each in its turn [s]."""
+"""Interval at which the errors of one of the three drives are requested, in turn [s]."""
 
 
 class AxisState(IntEnum):
-    """States of an ODrive axis that this driver distinguishes; all others are procedures of the drive's own."""
+    """States of an ODrive axis that this driver distinguishes; all others are procedures of the drive itself."""
 
     UNDEFINED = 0
     IDLE = 1
@@ -100,11 +105,11 @@ PROCEDURES: Final = {
     15: "harmonic calibration",
     16: "harmonic calibration of the commutation encoder",
 }
-"""Axis states in which the drive moves or tries its motor by itself."""
+"""Axis states in which the drive moves or tests its motor by itself."""
 
 
 class ProcedureResult(IntEnum):
-    """Result of an axis' last procedure, or of its transition into closed loop control."""
+    """Result of the last procedure of an axis, or of its transition to closed-loop control."""
 
     SUCCESS = 0
     BUSY = 1
@@ -152,7 +157,7 @@ class Error(IntFlag):
 
 
 def identifier(node: int, command: int) -> int:
-    """Return the 11-bit identifier of one node's command."""
+    """Return the 11-bit identifier of a command to or from one node."""
     return node << 5 | command
 
 
@@ -162,32 +167,35 @@ def command(node: int, number: int, data: bytes) -> Frame:
 
 
 def request(node: int, number: int) -> Frame:
-    """Return a remote frame, on which the node sends the message of that number.
+    """Return a remote frame that makes the node send the message of that number.
 
-    ODrives take an empty data frame for a request as well. But that would collide, bit by bit, with a message that
-    the drive sends by itself at this moment; a remote frame lets that one go first (ISO 11898-1).
+    ODrives also accept an empty data frame as a request. However, that frame would collide, bit by bit, with the
+    message if the drive sends it by itself at the same moment. A remote frame gives way to it (ISO 11898-1).
     """
     return Frame(identifier(node, number), remote=True)
 
 
 def input_pos(position: float, velocity: float) -> bytes:
-    """Return Set_Input_Pos of a position [turns], velocity [turns/s]; OverflowError or struct.error if out of range."""
+    """Return Set_Input_Pos for a position [turns] and velocity [turns/s].
+
+    Raises OverflowError or struct.error if a value is out of range.
+    """
     return INPUT_POS.pack(position, round(velocity / VELOCITY_STEP), 0)
 
 
 def serial_number(address: bytes) -> int | None:
-    """Return the serial number in an Address message; None where it is too short for one."""
+    """Return the serial number in an Address message, or None if the message is too short to contain one."""
     data = address[SERIAL_AT]
     return int.from_bytes(data, "little") if len(data) == SERIAL_AT.stop - SERIAL_AT.start else None
 
 
 def is_starting(state: int, errors: int) -> bool:
-    """Whether an axis state, or error bits, are those of a drive that boots."""
+    """Whether an axis state, or error bits, show that the drive is booting."""
     return state == AxisState.UNDEFINED or bool(errors & Error.INITIALIZING)
 
 
 def state_name(state: int) -> str:
-    """Return an axis state in words."""
+    """Return the name of an axis state for people."""
     if state in PROCEDURES:
         return PROCEDURES[state]
     try:
@@ -197,14 +205,14 @@ def state_name(state: int) -> str:
 
 
 def error_names(errors: int) -> str:
-    """Return the names of the errors whose bits are set, as ODrive's own tools write them."""
+    """Return the names of the errors whose bits are set, as ODrive's own tools spell them."""
     names = [error.name or "" for error in Error if errors & error]
     unknown = errors & ~sum(Error)
     return ", ".join([*names, *([f"unknown error {unknown:08X}"] if unknown else [])])
 
 
 def _background(heartbeat: float) -> float:
-    """Return the bits per second of error requests, their answers, and three heartbeats of this period [s]."""
+    """Return the bits per second of error requests, their answers, and three heartbeats with this period [s]."""
     return (frame_bits(0) + frame_bits(ERRORS.size)) / ERROR_PERIOD + 3 * frame_bits(BEAT.size) / heartbeat
 
 
@@ -213,7 +221,8 @@ TRAFFIC: Final = Traffic(
     background=_background,
     most_sent=13,
 )
-"""One cycle: three setpoints, three requests, three encoder estimates.
+"""Traffic of one cycle: three setpoints, three requests, three encoder estimates.
 
-At most the service sends those setpoints and requests, a mode and a state for each drive, and an error request.
+In one cycle, the service sends at most those setpoints and requests, a mode and a state for each drive, and an error
+request.
 """

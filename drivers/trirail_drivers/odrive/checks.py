@@ -16,7 +16,7 @@ from trirail_drivers.odrive import flat_endpoints, setup
 from trirail_drivers.odrive.cansimple import MAX_FEED_FORWARD
 
 _FLOAT_DIGITS: Final = 23
-"""Fraction bits of an ODrive's position, a 32-bit float."""
+"""Number of fraction bits in an ODrive position, which is a 32-bit float."""
 
 _CANOPEN_ONLY: Final = {
     "homing": "homing is CiA 402's, an ODrive must know its position at power-on; leave the table out",
@@ -26,7 +26,7 @@ _CANOPEN_ONLY: Final = {
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield checks for settings that an ODrive does not have, or whose values it cannot take or resolve."""
+    """Yield checks for settings that an ODrive does not have, or whose values it cannot accept or resolve."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         for key in _CANOPEN_ONLY:
             yield Rule(f"drives.{name}.{key}", (), partial(_check_canopen_only, name, drive, key))
@@ -41,7 +41,7 @@ def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
 
 
 def files(drives: Drives) -> Iterator[Rule]:
-    """Yield checks for a flat_endpoints.json that is missing or invalid."""
+    """Yield checks that report a missing or invalid flat_endpoints.json."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         if drive.endpoints is not None:
             yield Rule(f"drives.{name}.endpoints", (), partial(flat_endpoints.read, name, Path(drive.endpoints)))
@@ -59,7 +59,10 @@ def _offset_remedy(widest: float) -> str:
 
 
 def _check_feed_forward(name: str, drive: Drive, velocity: float) -> None:
-    """Check that the velocity fits CANSimple's 16-bit feed-forward; without it an ODrive lags out of its window."""
+    """Check that the velocity fits into CANSimple's 16-bit feed-forward.
+
+    Without feed-forward, an ODrive lags behind by more than its window.
+    """
     turns = velocity * drive.counts_per_metre
     if turns > MAX_FEED_FORWARD:
         raise DriveError(

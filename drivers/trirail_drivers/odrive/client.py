@@ -1,4 +1,4 @@
-"""Request client of one ODrive: one message at a time, each awaited."""
+"""Request client of one ODrive; it sends one request at a time and awaits its answer."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from trirail_drivers.interface import Clock
 from trirail_drivers.odrive import cansimple
 
 ATTEMPTS: Final = 3
-"""Attempts of a request within `sdo_timeout`: a frame may be lost."""
+"""Number of attempts of a request within `sdo_timeout`, since a frame may be lost."""
 
 
 class OdriveClient:
-    """Requests to one drive, whose answers are picked out of all received frames."""
+    """Requests to one drive. The client picks the answers out of all received frames."""
 
     def __init__(self, bus: FrameSender, name: str, node: int, timeout: float, clock: Clock) -> None:
         self.name = name
         self.timeout = timeout
         self.clock = clock
         self.answered = 0
-        """Number of requests that were answered."""
+        """Number of answered requests."""
         self._bus = bus
         self._node = node
         self._beat: bytes | None = None
-        """Data of the newest heartbeat that was not returned yet."""
+        """Data of the newest heartbeat that has not been returned yet."""
 
     def command(self, number: int, data: bytes) -> None:
-        """Send a command, which no drive answers. Raises BusError."""
+        """Send a command, to which the drive sends no answer. Raises BusError."""
         send_in_setup(self._bus, cansimple.command(self._node, number, data))
 
     async def request(self, number: int, message_name: str) -> bytes:
         """Request a message by its command number and return its data.
 
-        Raises BusError, and DriveTimeout if no answer comes: DriveAbsentError if the drive has answered nothing yet.
+        Raises BusError; DriveTimeout if the drive does not answer, or DriveAbsentError if it has never answered.
         """
         data = await self.try_request(number)
         if data is None:
@@ -50,7 +50,10 @@ class OdriveClient:
         return await self._request(cansimple.request(self._node, number), number, lambda _: True)
 
     async def read_setting(self, endpoint: int, path: str) -> bytes:
-        """Return the bytes of the setting at a path, which has this endpoint number; raises as `request` does."""
+        """Return the bytes of the setting `path`, which has this endpoint number.
+
+        Raises the same errors as `request`.
+        """
         question = cansimple.SDO.pack(cansimple.READ, endpoint, 0)
         data = await self._request(
             cansimple.command(self._node, cansimple.RX_SDO, question),
@@ -62,7 +65,7 @@ class OdriveClient:
         return data[cansimple.SDO.size :]
 
     async def heartbeat(self, deadline: float) -> bytes | None:
-        """Return the data of a heartbeat that was not returned yet, or None if none comes before `deadline` [s]."""
+        """Return the data of a heartbeat not returned yet, or None if none arrives before `deadline` [s]."""
         if self._beat is None:
             await self._receive(cansimple.HEARTBEAT, deadline, lambda _: True)
         beat, self._beat = self._beat, None

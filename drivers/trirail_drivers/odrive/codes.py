@@ -1,4 +1,4 @@
-"""ODrive's errors in words, with remedies: from its manual, chapter "Error Codes", firmware 0.6."""
+"""Descriptions of ODrive errors with remedies, from the ODrive manual, chapter "Error Codes", firmware 0.6."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _WORDS: Final = {
 
 
 def describe_errors(errors: int) -> str:
-    """Return error bits [0, FFFFFFFFh] as a hexadecimal number with names, meanings and remedies."""
+    """Describe error bits [0, FFFFFFFFh]: a hexadecimal number with the names, meanings and remedies."""
     known = [error for error in Error if errors & error]
     unknown = errors & ~sum(Error)
     names = [f"{error.name} ({_WORDS[error][0]})" for error in known]

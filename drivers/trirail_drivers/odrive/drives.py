@@ -1,12 +1,12 @@
 """Three ODrives on CANSimple in position control: trirail_drivers.interface.DriveGroup.
 
-CANSimple has no SYNC. The beginning of the cycle, `sync`, takes its place: it sends the setpoints of the previous
-cycle, one after the other, and then requests the positions. A setpoint is in force from the same moment of the cycle
-as with CiA 402, but drive B gets it one frame and drive C two frames after drive A: at 1 Mbit/s 0.14 and 0.27 ms, in
-every cycle. At 0.1 m/s, sliders that should move as one are then up to 27 µm apart.
+CANSimple has no SYNC. `sync`, at the beginning of the cycle, takes its place: it sends the setpoints of the previous
+cycle, one after the other, and then requests the positions. A setpoint takes effect at the same moment of the cycle as
+with CiA 402, but drive B receives it one frame and drive C two frames after drive A: 0.14 and 0.27 ms at 1 Mbit/s, in
+every cycle. At 0.1 m/s, sliders that should move together are then up to 27 µm apart.
 
-Positions are requested, not pushed by the drives (`encoder_msg_rate_ms`): pushed ones follow the drives' own clocks, so
-some cycles get none or two, and their age is unknown.
+Positions are requested instead of pushed by the drives (`encoder_msg_rate_ms`). The drives would push them at the pace
+of their own clocks, so that some cycles would get none or two, and their age would be unknown.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ from trirail_drivers.odrive.setup import OdriveStart
 class Odrive(Driver[OdriveAxis]):
     """Three ODrives on one CAN bus.
 
-    An ODrive has no quick stop of its own. Its Estop and its idle state let the motor coast. Velocity control with a
-    ramp would mean a mode change under power, which ODrive advises against, and a ramp that CANSimple cannot set
-    (`vel_ramp_rate`, by default 1 turn/s²). So the driver ramps the setpoints down with `quick_stop_deceleration`,
-    holds until the servos have settled, and then takes the power off. If the host dies during that, the drives'
-    watchdogs disarm them. An ODrive has no following error window either: the driver monitors `following_error`.
+    An ODrive has no quick stop of its own. Both Estop and the idle state let the motor coast. Velocity control with a
+    ramp would require a mode change under power, which ODrive advises against, and a ramp that CANSimple cannot set
+    (`vel_ramp_rate`, 1 turn/s² by default). Therefore the driver ramps the setpoints down with
+    `quick_stop_deceleration`, holds until the servos have settled, and then removes power. If the host dies during the
+    ramp, the drives' watchdogs disarm the drives. An ODrive has no following error window either, so the driver
+    monitors `following_error`.
     """
 
     def __init__(
@@ -78,14 +79,14 @@ class Odrive(Driver[OdriveAxis]):
         self._table_writer = CycleTableWriter(self._tables, self._axes, self._error_requests, self._requests)
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:  # noqa: ARG002
-        """Find the drives and leave them without power, for a cycle of `period` seconds. `fastest` is not needed.
+        """Find the drives, and leave them without power, ready for a cycle of `period` seconds. `fastest` is not used.
 
         With `awaits`, drives that do not answer latch a fault and are checked when they appear; a missing bus latches
         a fault and is opened when it appears.
 
-        Raises DriveError: BusError if the cycle does not fit on the bus, DriveTimeout for a missing drive, DriveError
-        for a drive that lacks a protection its configuration does not waive. A drive with errors raises nothing: the
-        feedback reports it and `reset` clears it.
+        Raises BusError if the cycle does not fit on the bus, DriveTimeout for a missing drive, and DriveError for a
+        drive that lacks a protection which its configuration does not waive. A drive with errors does not raise: the
+        feedback reports the errors and `reset` clears them.
         """
         self._set_period(period, cansimple.TRAFFIC)
         self._setpoints.period = period
@@ -108,19 +109,20 @@ class Odrive(Driver[OdriveAxis]):
         self._report_absent(lost)
 
     def _rejoin_drive(self, axis: OdriveAxis, start: OdriveStart) -> None:
-        """Let a drive take part in the cycle again after its check in the background."""
+        """Let a drive take part in the cycle again after it has been checked in the background."""
         axis.rejoin(self._clock())
         axis.set_up(*start)
 
     def sync(self) -> None:
-        """Send the setpoints written since the last cycle, in force on arrival, and request the positions.
+        """Send the setpoints written since the last cycle, which take effect on arrival, and request the positions.
 
-        Frames that have arrived are handled first: positions among them answer the previous cycle's requests.
+        Frames that have already arrived are handled first, since positions among them answer the previous cycle's
+        requests.
         """
         now = self._synced = self._clock()
         self._begin_cycle(now)
         if self._errors_due is None:
-            # Time-outs start with the first cycle, however long ago the set-up was.
+            # Time-outs start with the first cycle, no matter how long ago the set-up was.
             self._errors_due = now
             for axis in self._axes:
                 axis.heard = now
@@ -129,7 +131,7 @@ class Odrive(Driver[OdriveAxis]):
         self._send_cycle_start(now, self._errors_due)
 
     def _send_cycle_start(self, now: float, errors_due: float, sent: int = 0) -> None:
-        """Send the frames at the beginning of a cycle, without the first `sent` of them, which are on the bus."""
+        """Send the frames at the beginning of a cycle, except the first `sent` frames, which are already on the bus."""
         history = self._tables.history
         history[(self._axes[0].syncs + 1) % len(history)] = [axis.sent for axis in self._axes]
         sent -= self._setpoints.step(self._enabled, sent)
@@ -144,7 +146,7 @@ class Odrive(Driver[OdriveAxis]):
             self._next_request = (self._next_request + 1) % len(self._error_requests)
 
     def read(self) -> Feedback:
-        """Handle every frame that has arrived; return the feedback."""
+        """Handle every frame that has arrived, and return the feedback."""
         now = self._clock()
         self._wire.receive(now)
         for axis in self._axes:
@@ -173,12 +175,12 @@ class Odrive(Driver[OdriveAxis]):
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Keep setpoints [m] and velocity feed-forward [m/s], which the next `sync` sends to enabled drives.
+        """Store setpoints [m] and velocity feed-forward [m/s]; the next `sync` sends them to enabled drives.
 
-        Setpoints that are not finite or do not fit into a message latch a fault of cause "setpoint" instead. During a
-        quick stop they are ignored.
+        Setpoints that are not finite or do not fit into a message latch a fault with cause "setpoint" instead.
+        Setpoints are ignored during a quick stop.
         """
-        self._recover()  # the setpoints of this cycle are on the bus
+        self._recover()  # the setpoints of this cycle are already on the bus
         if self._setpoints.stopping:
             return
         if (axis := self._setpoints.set_next(position, velocity)) is not None:
@@ -190,7 +192,7 @@ class Odrive(Driver[OdriveAxis]):
                 axis.setpoints_late += 1
 
     def lend(self) -> Cyclic | None:
-        """Return the tables of a cycle; None unless every drive is in its target state and nothing else is pending."""
+        """Return the tables of a cycle, or None unless all drives are in their target states and nothing is pending."""
         due, sender = self._errors_due, self._setpoints
         if due is None or not self._wire.is_healthy or sender.stopping:
             return None
@@ -204,7 +206,7 @@ class Odrive(Driver[OdriveAxis]):
         return self._tables
 
     def take_back(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
-        """Continue from the tables: see trirail_drivers.driver.cyclic.Lender."""
+        """Continue from the tables; see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._errors_due, self._next_request = float(times["beat_due"]), int(times["next_beat"])
         self._wire.return_frames(self._tables.arrived, handled, arrived, error)
@@ -216,12 +218,12 @@ class Odrive(Driver[OdriveAxis]):
         return feedback
 
     def send_on(self, first: int) -> None:
-        """Do nothing: setpoints go with the next SYNC."""
+        """Do nothing, since setpoints are sent by the next `sync`."""
 
     def enable(self, alone: str | None = None) -> None:
-        """Begin to power up all drives, or one `alone`, after the setpoints of the next `sync`.
+        """Begin to power up all drives, or only the drive `alone`, after the setpoints of the next `sync`.
 
-        Does nothing while a fault is latched. The states in the feedback follow the drives' heartbeats.
+        This does nothing while a fault is latched. The states in the feedback follow the heartbeats of the drives.
         """
         if self._wire.fault is not None or self._enabled:
             return
@@ -234,23 +236,26 @@ class Odrive(Driver[OdriveAxis]):
             axis.requested = None
 
     def home(self) -> None:
-        """Do nothing: the configuration refuses homing for ODrives."""
+        """Do nothing, since the configuration refuses homing for ODrives."""
 
     def stop_homing(self) -> None:
-        """Do nothing: there is no homing."""
+        """Do nothing, since ODrives are not homed."""
 
     def disable(self) -> None:
-        """Take the power off, at standstill. A drive that keeps it latches a fault of cause "timeout"."""
+        """Remove power from the drives, which must be at standstill.
+
+        A drive that still has power after `stop_timeout` latches a fault with cause "timeout".
+        """
         self._start_stop_timer("disable")
         self._enabled = False
         self._setpoints.abandon()
         self._request_states()
 
     def quick_stop(self) -> None:
-        """Begin the quick-stop ramp of every drive in this cycle; the power is off at its end.
+        """Begin the quick-stop ramp of every drive in this cycle. Power is removed when the ramp ends.
 
-        A drive that still has power after `stop_timeout` is disarmed immediately; its fault of cause "timeout" replaces
-        the one that caused the stop.
+        A drive that still has power after `stop_timeout` is disarmed immediately, and a fault with cause "timeout"
+        replaces the fault that caused the stop.
         """
         if self._setpoints.stopping:
             return
@@ -263,7 +268,10 @@ class Odrive(Driver[OdriveAxis]):
             self._setpoints.stop()
 
     def reset(self) -> None:
-        """Clear the latched fault and the drives' errors, without powering up. Lasting conditions are found again."""
+        """Clear the latched fault and the errors of the drives, without powering up.
+
+        Conditions that persist latch again.
+        """
         self._wire.reset()
         now = self._clock()
         if not self._enabled:
@@ -294,12 +302,12 @@ class Odrive(Driver[OdriveAxis]):
         self._setpoints.abandon()
 
     def _find_fault(self, now: float) -> DriveFault | None:
-        """Return the first fault of a drive, or a following error beyond its window."""
+        """Return the first fault of a drive, including a following error outside its window."""
         for number, axis in enumerate(self._axes):
             fault = axis.find_fault(now, self._enabled and not axis.left_out)
             if fault is not None:
                 return fault
-            # Compared with the setpoint due at the position's own SYNC: the newest would add the way since then.
+            # The position is compared with the setpoint of its own SYNC: the newest would add the motion since then.
             history = self._tables.history
             due = float(history[(axis.syncs - min(axis.age, len(history) - 1)) % len(history), number])
             if math.isnan(due) or not (self._enabled and axis.powered_up):
@@ -315,12 +323,12 @@ class Odrive(Driver[OdriveAxis]):
         return None
 
     def _request_states(self) -> None:
-        """Request each drive's target state, once, and again if a heartbeat shows another."""
+        """Request each drive's target state once, and again whenever a heartbeat shows a different state."""
         for axis in self._axes:
-            wanted = self._target_state(axis)  # for each drive, since a failed send begins a quick stop
+            wanted = self._target_state(axis)  # evaluated for each drive, since a failed send begins a quick stop
             if wanted is None or axis.requested is wanted:
                 continue
-            if wanted is AxisState.CLOSED_LOOP_CONTROL:  # at every power-up: the drive may have restarted
+            if wanted is AxisState.CLOSED_LOOP_CONTROL:  # sent at every power-up, since the drive may have restarted
                 mode = cansimple.CONTROLLER_MODE.pack(cansimple.POSITION_CONTROL, cansimple.PASSTHROUGH)
                 if not self._wire.send(cansimple.command(axis.node, cansimple.SET_CONTROLLER_MODE, mode)):
                     return
@@ -330,7 +338,7 @@ class Odrive(Driver[OdriveAxis]):
                 axis.note_request(wanted)
 
     def _target_state(self, axis: OdriveAxis) -> AxisState | None:
-        """Return the state that a drive should be in now; None leaves it as it is."""
+        """Return the state in which a drive should be now; None leaves the drive in its present state."""
         if self._enabled and axis.left_out:
             return AxisState.IDLE
         if not self._enabled:

@@ -1,8 +1,8 @@
-"""Endpoint numbers of an ODrive's settings, by firmware: the maker's flat_endpoints.json.
+"""Endpoint numbers of an ODrive's settings, by firmware, from the manufacturer's flat_endpoints.json.
 
-The numbers change with every firmware and hardware. endpoints.json beside this module has those that are used here,
-for known firmwares; for any other, the configuration names the drive's file, `endpoints`. A wrong number reads or
-writes another setting without any error, so the versions must match.
+The numbers change with every firmware and hardware version. endpoints.json beside this module contains the numbers that
+are used here, for known firmware versions; for any other version, `endpoints` in the configuration names the drive's
+file. A wrong number reads or writes a different setting without any error, so the versions must match.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Version(NamedTuple):
 
     @classmethod
     def from_fields(cls, protocol: int, *numbers: int) -> Self:  # noqa: ARG003  it has been 2 with every firmware since 0.6
-        """Return the version from the fields of Get_Version, `cansimple.VERSION`."""
+        """Return the version given the fields of Get_Version, `cansimple.VERSION`."""
         line, number, variant, major, minor, revision, unreleased = numbers
         return cls((line, number, variant), (major, minor, revision), bool(unreleased))
 
     @property
     def dotted(self) -> tuple[str, str]:
-        """Firmware and hardware version, as 0.6.10 and 5.2.0."""
+        """Firmware and hardware version, such as 0.6.10 and 5.2.0."""
         development = "-dev" if self.unreleased else ""
         return _dotted(self.firmware) + development, _dotted(self.hardware)
 
@@ -56,14 +56,14 @@ class Endpoint(Struct, frozen=True):
 
 
 class Table(Struct, frozen=True):
-    """Used part of a flat_endpoints.json."""
+    """The part of a flat_endpoints.json that is used here."""
 
     fw_version: str
     hw_version: str
     endpoints: dict[str, Endpoint]
 
     def matches(self, version: Version) -> bool:
-        """Whether the table is for a drive of this version, compared as in the maker's own examples."""
+        """Whether the table is for a drive of this version, compared as in the manufacturer's own examples."""
         same = self.fw_version.partition("-")[0] == _dotted(version.firmware)
         return same and self.hw_version == _dotted(version.hardware)
 
@@ -76,12 +76,12 @@ _DECODER: Final = msgspec.json.Decoder(Table)
 KNOWN_TABLES: Final[tuple[Table, ...]] = msgspec.json.decode(
     Path(__file__).with_name("endpoints.json").read_bytes(), type=_KnownTables
 ).tables
-"""Tables of the known firmwares."""
-_DECODER.decode(b'{"fw_version": "", "hw_version": "", "endpoints": {}}')  # before there are threads
+"""Tables of the known firmware versions."""
+_DECODER.decode(b'{"fw_version": "", "hw_version": "", "endpoints": {}}')  # loaded before any thread exists
 
 
 def read(name: str, path: Path) -> Table:
-    """Read the flat_endpoints.json of the drive called `name`. Raises DriveError with key and file."""
+    """Read the flat_endpoints.json of the drive called `name`. Raises DriveError, which states the key and the file."""
     key = f"drives.{name}.endpoints"
     try:
         return _DECODER.decode(files.text(path))
@@ -94,9 +94,9 @@ def read(name: str, path: Path) -> Table:
 
 
 def endpoints_of(name: str, version: Version, own: str | None) -> Mapping[str, Endpoint] | None:
-    """Return the endpoints of a drive's settings by path; None for an unknown firmware.
+    """Return the endpoints of a drive's settings by path; None for unknown firmware.
 
-    `own` is the file that the configuration names. Raises DriveError if it is invalid or for another version.
+    `own` is the file named in the configuration. Raises DriveError if that file is invalid or is for another version.
     """
     if own is None:
         known = (table.endpoints for table in KNOWN_TABLES if table.matches(version) and not version.unreleased)

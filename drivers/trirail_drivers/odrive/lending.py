@@ -1,7 +1,7 @@
-"""Tables of a quiet cycle with three ODrives, see trirail_drivers.driver.cyclic.
+"""Tables of a quiet cycle with three ODrives; see trirail_drivers.driver.cyclic.
 
-A cycle begins with the setpoints of the one before, if the drives follow any, and the position requests; every
-ERROR_PERIOD it requests the errors of one drive. Nothing is sent at its end.
+A cycle begins with the setpoints of the previous cycle, if the drives follow setpoints, and with the position requests.
+Every ERROR_PERIOD it also requests the errors of one drive. Nothing is sent at the end of a cycle.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class CycleTableWriter:
     def __init__(
         self, tables: Cyclic, axes: Sequence[OdriveAxis], errors: Sequence[Frame], requests: Sequence[Frame]
     ) -> None:
-        """`errors` and `requests` are the frames that request each drive's errors and position."""
+        """`errors` and `requests` are the frames that request the errors and the position of each drive."""
         self._tables = tables
         self._axes = axes
         setpoint = cansimple.input_pos(0.0, 0.0)
@@ -36,7 +36,10 @@ class CycleTableWriter:
         """Axis states and procedure results that the tables expect."""
 
     def fill(self, *, follow: bool, within: float) -> None:
-        """Fill the tables for the next cycle; `follow`: drives follow setpoints, to within `within` [m]."""
+        """Fill the tables for the next cycle.
+
+        If `follow`, drives follow setpoints with an error of at most `within` [m].
+        """
         self._tables.begin = self._all if follow else self._requests
         for axis, data in zip(self._axes, self._data, strict=True):
             axis.waits, axis.follows_within = follow, within if follow and axis.powered_up else math.inf

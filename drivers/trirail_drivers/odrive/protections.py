@@ -1,4 +1,4 @@
-"""Settings that an ODrive must have, checked by RxSdo, and the consequences if it lacks them."""
+"""Settings that an ODrive must have, checked by RxSdo, and the consequences of lacking them."""
 
 from __future__ import annotations
 
@@ -20,25 +20,28 @@ CYCLIC: Final = tuple(
 )
 POSITION_STATUS: Final = "axis0.pos_vel_mapper.status"
 RELATIVE_MODE: Final = 9
-"""Value of POSITION_STATUS if positions count from the place at which the drive was switched on."""
+"""Value of POSITION_STATUS if positions are counted from the place at which the drive was switched on."""
 RELATIVE: Final = (
     f"{POSITION_STATUS} is {RELATIVE_MODE}, relative: its position is lost with its supply; use an absolute encoder, "
     "or home it by odrivetool before each start of the service"
 )
-"""Note on a drive with RELATIVE_MODE."""
+"""Note about a drive in RELATIVE_MODE."""
 SETTINGS: Final = (WATCHDOG, WATCHDOG_TIMEOUT, SCALE, HEARTBEAT, *CYCLIC, POSITION_STATUS)
 REQUIRED: Final = frozenset((WATCHDOG, WATCHDOG_TIMEOUT, HEARTBEAT))
-"""Settings that every firmware since 0.6 has; early ones lack some of the others, which then are off or default."""
+"""Settings that exist in every firmware since 0.6.
+
+Early versions lack some of the others, which are then off or default.
+"""
 MIN_WATCHDOG_CYCLES: Final = 3
-"""Shortest watchdog [cycles]: a shorter one disarms the drive when a single cycle is late."""
+"""Minimum watchdog time-out [cycles]; a shorter one disarms the drive when a single cycle is late."""
 _FLOAT32_TOLERANCE: Final = 1e-6
 """Relative error of times, which are 32-bit floats."""
 Settings = Mapping[str, float]
-"""Settings of a drive by path, in the drive's units; 1 for true."""
+"""Settings of a drive by path, in drive units; 1 stands for true."""
 
 
 class Protection(NamedTuple):
-    """Purpose of a required setting, and the consequence if it is missing, for people."""
+    """Purpose of a required setting, and the consequence of lacking it, for people."""
 
     purpose: str
     without: str
@@ -61,7 +64,7 @@ def describe_protection(protection: str) -> str:
 
 
 def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, str]:
-    """Return the protections that a drive lacks, each with the reason; `settings` is None for an unknown firmware."""
+    """Return the protections that a drive lacks, each with the reason. `settings` is None for unknown firmware."""
     if settings is None:
         return {"endpoints": "its firmware is unknown; set endpoints to its flat_endpoints.json"}
     reasons = {}
@@ -84,12 +87,15 @@ def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, 
 
 
 def is_relative(settings: Settings | None) -> bool:
-    """Whether a drive reports that it loses its position with its supply; without a report it is taken to keep it."""
+    """Whether a drive reports that it loses its position with its supply.
+
+    Without a report, it is assumed to keep it.
+    """
     return settings is not None and settings.get(POSITION_STATUS) == RELATIVE_MODE
 
 
 def check_watchdog(name: str, settings: Settings | None, period: float) -> None:
-    """Raise DriveError for a watchdog that a single late cycle of `period` [s] would trigger."""
+    """Raise DriveError if the watchdog is so short that a single late cycle of `period` [s] would trigger it."""
     least = MIN_WATCHDOG_CYCLES * period
     if settings is None or not settings[WATCHDOG]:
         return

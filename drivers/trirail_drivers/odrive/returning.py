@@ -1,4 +1,4 @@
-"""Check of a returning ODrive in the background: see trirail_drivers.driver.recovery."""
+"""Check of a returning ODrive in the background; see trirail_drivers.driver.recovery."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trirail_drivers.odrive.setup import OdriveIdentity, OdriveSetup, OdriveSetu
 
 
 class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
-    """One ODrive; its set-up is `setup.configure_one`."""
+    """One ODrive; `setup.configure_one` sets it up."""
 
     work, counted = "checking its settings", "answers"
 
@@ -29,25 +29,25 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
     def start_setup(
         self, sender: FrameSender, clock: Clock
     ) -> tuple[Coroutine[Any, Any, tuple[OdriveSetup, OdriveStart]], OdriveClient]:
-        """Return a new set-up and its client."""
+        """Return a new set-up of the drive, and its client."""
         one = self.one
         client = OdriveClient(sender, self.axis.name, self.axis.node, one.drives.sdo_timeout, clock)
         return configure_one(one._replace(client=client), self._check), client
 
     def accept(self, made: OdriveSetup, begun: OdriveStart) -> str:
-        """Let the drive take part in the cycle; one with a relative position is not homed."""
+        """Let the drive take part in the cycle; a drive with a relative position is marked as not homed."""
         self._configured(begun)
         self.axis.homed = not made.relative
         return ""
 
     def may_have_power(self, *, stopping: bool) -> bool:
-        """Whether its heartbeat shows power; while drives stop, a silent one may have it too."""
+        """Whether the drive's heartbeat shows power; while drives are stopping, a silent drive may have power too."""
         if self.axis.silent:
             return stopping
         return self.axis.powered
 
     def _check(self, identity: OdriveIdentity) -> None:
-        """Raise DriveError for another drive than the one before."""
+        """Raise DriveError if the drive is not the same as before."""
         if self.setup is None:
             return
         before = self.setup.identity

@@ -1,4 +1,4 @@
-"""Setpoints of three ODrives, and their ramp in a quick stop."""
+"""Setpoints of three ODrives, and the ramp of these setpoints in a quick stop."""
 
 from __future__ import annotations
 
@@ -14,45 +14,53 @@ from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
 SETTLE_TIME_S: Final = 0.05
-"""Time for which a drive holds at the end of a quick stop before its power is off, so that its servo catches up."""
+"""Time for which a drive holds its position at the end of a quick stop, before power is removed, so that its servo
+catches up.
+"""
 
 
 class SetpointSender:
-    """Sender of the written setpoints. The axes hold them, those sent last, and the positions in force."""
+    """Sender of the written setpoints.
+
+    The axes store the written setpoints, those sent last, and the positions in force.
+    """
 
     def __init__(self, axes: Sequence[OdriveAxis], wire: Wire, deceleration: float) -> None:
-        """`deceleration` is that of the quick-stop ramp [m/s²]."""
+        """`deceleration` is the deceleration of the quick-stop ramp [m/s²]."""
         self.period = 0.0
         """Cycle period [s]."""
         self._axes = axes
         self._wire = wire
         self._deceleration = deceleration
         self._standstill_time: float | None = None
-        """Time since the setpoints of a quick stop came to rest [s]; None if no quick stop is under way."""
+        """Time for which the setpoints of a quick stop have been at rest [s]; None if no quick stop is in progress."""
 
     @property
     def stopping(self) -> bool:
-        """Whether a quick stop is under way."""
+        """Whether a quick stop is in progress."""
         return self._standstill_time is not None
 
     @property
     def written(self) -> bool:
-        """Whether setpoints wait for the next SYNC."""
+        """Whether setpoints are waiting for the next SYNC."""
         return not math.isnan(self._axes[0].wanted)
 
     @property
     def sent(self) -> bool:
-        """Whether the drives have got setpoints since they were enabled."""
+        """Whether the drives have received setpoints since they were enabled."""
         return not math.isnan(self._axes[0].sent)
 
     def begin(self) -> None:
-        """Forget earlier setpoints, before the drives get power."""
+        """Forget earlier setpoints before the drives are powered up."""
         self._standstill_time = None
         for axis in self._axes:
             axis.sent = axis.sent_rate = axis.in_force = math.nan
 
     def set_next(self, position: Triple, velocity: Triple) -> OdriveAxis | None:
-        """Keep setpoints for the next SYNC; return the first axis whose message cannot hold its setpoint, or None."""
+        """Store setpoints for the next SYNC.
+
+        Return the first axis whose setpoint does not fit into a message, or None.
+        """
         for axis, metres, rate in zip(self._axes, position, velocity, strict=True):
             if not _is_sendable(axis, metres, rate):
                 return axis
@@ -61,31 +69,34 @@ class SetpointSender:
         return None
 
     def step(self, enabled: bool, sent: int = 0) -> int:
-        """Send the setpoints due at a SYNC, without the first `sent`, which are on the bus; return how many are due."""
+        """Send the setpoints that are due at a SYNC; return their number.
+
+        The first `sent` setpoints are already on the bus and are not sent again.
+        """
         if self._standstill_time is not None:
             self._brake()
-        # Nothing is sent once disabled: a drive that missed the command must stay where the ramp has ended.
+        # Nothing is sent once disabled: a drive that missed the command must stay where the ramp ended.
         if self.written and (enabled or self.stopping):
             self._send([(axis.wanted, axis.wanted_rate) for axis in self._axes], sent)
             return len(self._axes)
         return 0
 
     def stop(self) -> None:
-        """Begin the ramp now, if the drives have got setpoints."""
+        """Begin the ramp now, if the drives have received setpoints."""
         if not self.sent:
             return
         self._standstill_time = 0.0
-        # The position in force stays; the velocity feed-forward falls from this moment on.
+        # The position in force does not change; the velocity feed-forward decreases from now on.
         self._send([(axis.in_force, self._braked_setpoint(axis)[1]) for axis in self._axes])
         for axis in self._axes:
             axis.wanted = math.nan
 
     def abandon(self) -> None:
-        """End the ramp."""
+        """Abandon the ramp."""
         self._standstill_time = None
 
     def _send(self, setpoints: Sequence[tuple[float, float]], sent: int = 0) -> None:
-        """Send setpoints, without the first `sent` ones, which are on the bus; each is in force on arrival."""
+        """Send setpoints, which take effect on arrival, except the first `sent`, which are already on the bus."""
         for axis, (metres, rate) in zip(self._axes, setpoints, strict=True):
             axis.sent, axis.sent_rate = metres, rate
             if math.isnan(axis.in_force):
@@ -101,10 +112,10 @@ class SetpointSender:
                 return  # a failed send has begun a quick stop, whose setpoints are newer
 
     def _brake(self) -> None:
-        """Advance the ramp by one period; at its end, end the quick stop, which takes the power off.
+        """Advance the ramp by one period. When it ends, end the quick stop, which removes power.
 
-        While the bus takes no setpoint, the ramp loses velocity but keeps its position: a drive without setpoints
-        soon stands, and must not catch up with the ramp when the bus is back.
+        While the bus accepts no setpoint, the ramp loses velocity but keeps its position: a drive without setpoints
+        soon comes to rest, and must not catch up with the ramp when the bus works again.
         """
         if not self.sent or self._standstill_time is None:
             return
@@ -118,7 +129,7 @@ class SetpointSender:
             self._standstill_time = None
 
     def _braked_setpoint(self, axis: OdriveAxis) -> tuple[float, float]:
-        """Return the setpoint one period down the ramp from the position in force, at the velocity sent last."""
+        """Return the ramp's next setpoint, one period after the position in force, from the velocity sent last."""
         return brake(axis.in_force, axis.sent_rate, self._deceleration, self.period)
 
 
@@ -127,4 +138,4 @@ def _is_sendable(axis: OdriveAxis, metres: float, rate: float) -> bool:
         axis.input_pos(metres, rate)
     except (ValueError, OverflowError, struct.error):
         return False
-    return math.isfinite(metres)  # a float that is not a number is packed like any other
+    return math.isfinite(metres)  # NaN is packed like any other float

@@ -1,4 +1,4 @@
-"""Reading of an ODrive's settings by RxSdo and TxSdo, one request in flight."""
+"""Reading of an ODrive's settings by RxSdo and TxSdo, with one request in flight."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from trirail_drivers.odrive.protections import REQUIRED, SETTINGS, Settings
 
 
 async def read(client: OdriveClient, version: Version, own: str | None) -> Settings | None:
-    """Return those settings that a drive's firmware has; None for an unknown firmware.
+    """Return those settings that the drive's firmware has; None for unknown firmware.
 
-    `own` is the file that the configuration names. Raises DriveError; DriveTimeout for a drive that does not answer.
+    `own` is the file named in the configuration. Raises DriveError; DriveTimeout if the drive does not answer.
     """
     table = flat_endpoints.endpoints_of(client.name, version, own)
     if table is None:
@@ -38,7 +38,7 @@ def _value(name: str, endpoint: Endpoint, path: str, data: bytes) -> float:
 
 
 def _check_table(name: str, table: Mapping[str, Endpoint]) -> None:
-    """Raise DriveError for a user's table without a required setting, or with a type that no message holds."""
+    """Raise DriveError if a user's table lacks a required setting or has a type that does not fit in a message."""
     for path in SETTINGS:
         endpoint = table.get(path)
         if endpoint is None and path in REQUIRED:

@@ -1,15 +1,15 @@
-"""Set-up of ODrives, before the cycle or in its background: find them, take their power off, check their settings.
+"""Set-up of ODrives before or during the cycle: find them, remove their power, check their settings.
 
-Nothing is written. These must have been set with ODrive's own tools, and saved:
+The set-up writes no settings. The following must have been set with ODrive's own tools, and saved:
 
-- `axis0.config.can.node_id`, `heartbeat_msg_rate_ms` as in [drives], `encoder_msg_rate_ms = 0` and the other cyclic
-  messages off: the driver requests what it needs, and nothing else loads the bus;
+- `axis0.config.can.node_id`; `heartbeat_msg_rate_ms` as in [drives]; `encoder_msg_rate_ms = 0` and the other cyclic
+  messages off, since the driver requests what it needs, and nothing else should load the bus;
 - `axis0.config.can.input_vel_scale = 1000`, the default;
-- `axis0.config.enable_watchdog = True` with a `watchdog_timeout` that bridges a few cycles. Only the watchdog disarms
-  a drive whose host is gone; every setpoint feeds it;
+- `axis0.config.enable_watchdog = True`, with a `watchdog_timeout` of several cycles. Only the watchdog disarms a drive
+  whose host has died; every setpoint feeds it;
 - gains, velocity and current limits, and a calibrated encoder that keeps its position without power.
 
-All but the last are read by RxSdo and TxSdo, and count as protections: see trirail_drivers.odrive.protections.
+All except the last are read by RxSdo and TxSdo, and count as protections; see trirail_drivers.odrive.protections.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from trirail_drivers.odrive.flat_endpoints import Version
 from trirail_drivers.odrive.protections import PROTECTIONS, RELATIVE, check_watchdog, is_relative, missing_protections
 
 MIN_FIRMWARE: Final = (0, 6, 0)
-"""First firmware whose errors and heartbeats have the layout that this driver reads."""
+"""First firmware version whose errors and heartbeats have the layout that this driver reads."""
 BOOT_TIMEOUTS: Final = 10
-"""Longest boot of a drive, as a multiple of `sdo_timeout`."""
+"""Longest boot time of a drive, as a multiple of `sdo_timeout`."""
 
 
 def check_nodes(drives: Drives) -> None:
-    """Raise DriveError for node ids that CANSimple does not have, or that two drives share."""
+    """Raise DriveError for node ids that are not valid in CANSimple, or that two drives share."""
     nodes = {f"drives.{name}.node": drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
     for key, node in nodes.items():
         if node not in cansimple.NODES:
@@ -60,11 +60,11 @@ class OdriveSetupTask(NamedTuple):
 
 
 class OdriveIdentity(NamedTuple):
-    """Identity of a drive, from its own messages."""
+    """Identity of a drive, as reported in its own messages."""
 
     version: Version
     serial: int | None
-    """Serial number; None if its firmware has no Address message."""
+    """Serial number; None if the firmware has no Address message."""
 
 
 class OdriveSetup(NamedTuple):
@@ -73,11 +73,11 @@ class OdriveSetup(NamedTuple):
     name: str
     identity: OdriveIdentity
     relative: bool
-    """Whether its position is lost with its supply."""
+    """Whether the drive loses its position with its supply."""
     missing_protections: tuple[str, ...]
-    """Protections that it lacks, as `accept_without` names them."""
+    """Protections that the drive lacks, by their names in `accept_without`."""
     notes: tuple[str, ...]
-    """Lines for people."""
+    """Notes for people, one line each."""
 
 
 class OdriveStart(NamedTuple):
@@ -102,9 +102,10 @@ def setup_tasks(bus: can.BusABC, drives: Drives, period: float, clock: Clock) ->
 def configure(
     bus: can.BusABC, each: Sequence[OdriveSetupTask], clock: Clock, *, awaits: bool = False
 ) -> tuple[tuple[OdriveSetup, OdriveStart] | None, ...]:
-    """Set three drives up concurrently; with `awaits`, the result of one that does not answer is None.
+    """Set up three drives concurrently. With `awaits`, the result of a drive that does not answer is None.
 
-    Raises DriveError for all drives together, DriveTimeout among them for a drive that does not answer.
+    Raises DriveError with the errors of all drives. A single error is raised as it is, such as DriveTimeout for a
+    drive that does not answer.
     """
 
     def progress() -> str:
@@ -120,10 +121,10 @@ def configure(
 async def configure_one(
     one: OdriveSetupTask, check: Callable[[OdriveIdentity], None]
 ) -> tuple[OdriveSetup, OdriveStart]:
-    """Take a drive's power off; check that it answers, has the required settings and knows its position.
+    """Remove power from a drive; check that it answers, has the required settings and knows its position.
 
-    `check` raises for the wrong drive. Raises DriveError; DriveTimeout for a drive that does not answer,
-    DriveAbsentError for one that has answered nothing. A drive's own errors raise nothing here.
+    `check` raises if this is the wrong drive. Raises DriveError; DriveTimeout if the drive does not answer, and
+    DriveAbsentError if it has not answered any request. Errors that the drive itself reports do not raise.
     """
     client, name = one.client, one.client.name
     _command_idle(client)
@@ -158,7 +159,7 @@ def _command_idle(client: OdriveClient) -> None:
 
 
 async def _wait_until_idle(one: OdriveSetupTask) -> int:
-    """Wait until a heartbeat shows no power, for as long as a boot may take; return the axis state."""
+    """Wait until a heartbeat shows no power, for at most the duration of a boot; return the axis state."""
     client = one.client
     begun, within = client.clock(), MISSED_HEARTBEATS * one.drives.heartbeat
     state: int | None = None
@@ -174,7 +175,7 @@ async def _wait_until_idle(one: OdriveSetupTask) -> int:
             within = max(within, BOOT_TIMEOUTS * client.timeout)
         elif state == AxisState.IDLE:
             return state
-        else:  # again with every heartbeat, since the command may be lost
+        else:  # requested again with every heartbeat, since the command may be lost
             _command_idle(client)
 
 

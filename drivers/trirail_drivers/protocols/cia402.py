@@ -1,4 +1,4 @@
-"""The protocol CiA 402 on CANopen."""
+"""CiA 402 on CANopen as a protocol."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ def _simulated_drive(
     drive: config.Drive,
     start: float,
 ) -> SimulatedDevice:
-    """Return a simulated drive; one with homing counts from 0 at power-on, its switch at zero counts of [drives].
+    """Return a simulated drive. A drive with homing counts from 0 at power-on; its switch is at zero counts of
+    [drives].
 
-    Without its maker's EDS it has the objects that the configuration writes, without any function.
+    Without the manufacturer's EDS, it has the objects that the configuration writes, but they have no function.
     """
     counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
     switch = None if drive.homing is None else -counts
@@ -36,7 +37,7 @@ def _simulated_drive(
 
 
 def mechanics_of(drive: config.Drive) -> Mechanics:
-    """Return the configured axis: those units of the drive that its dictionary does not report."""
+    """Return the mechanics of the configured axis, as far as the drive's dictionary does not report its units."""
     counts, revolutions = drive.counts_per_metre, drive.revolutions_per_metre
 
     def fixed(key: str, text: str | None, power: int) -> float:
@@ -49,7 +50,7 @@ def mechanics_of(drive: config.Drive) -> Mechanics:
         counts_per_revolution=math.nan if revolutions is None else counts / revolutions,
         velocity=fixed("velocity_unit", drive.velocity_unit, 1),
         acceleration=fixed("acceleration_unit", drive.acceleration_unit, 2),
-        # Without its maker's EDS it simulates a drive that does not report the configured units.
+        # Without the manufacturer's EDS, this simulates a drive that does not report the configured units.
         untold=tuple(index for index, unit in configured if unit is not None and drive.eds is None),
     )
 

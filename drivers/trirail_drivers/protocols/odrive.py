@@ -1,4 +1,4 @@
-"""The protocol of ODrives, CANSimple."""
+"""CANSimple of ODrive as a protocol."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from trirail_drivers.protocols.protocol import Protocol
 from trirail_drivers.simulated import Frames, Servo, SimulatedDevice, SimulatedOdrive
 
 FRICTION: Final = 2.0
-"""Deceleration of a simulated ODrive's slider that coasts [m/s²]."""
+"""Deceleration of a simulated ODrive's slider while it coasts [m/s²]."""
 _NODE: Final = cansimple.identifier(1, 0)
-"""Difference between the identifiers of consecutive node ids."""
+"""Difference between the CAN identifiers of consecutive node ids."""
 
 
 def _simulated_drive(
@@ -27,7 +27,7 @@ def _simulated_drive(
         Servo.configured(simulated, drive, turns),
         heartbeat=drives.heartbeat,
         friction=FRICTION * drive.counts_per_metre,
-        # The same time as a CiA 402 drive waits for its master: CANSimple has no message that sets it.
+        # The same time for which a CiA 402 drive waits for its master: CANSimple has no message that sets it.
         watchdog=MISSED_HEARTBEATS * drives.heartbeat,
     )
 
@@ -63,4 +63,4 @@ ODRIVE = Protocol(
         "heartbeat": Frames(False, cansimple.HEARTBEAT, _NODE),
     },
 )
-"""ODrive's CANSimple, in position control."""
+"""CANSimple of ODrive, in position control."""

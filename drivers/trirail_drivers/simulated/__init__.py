@@ -1,4 +1,4 @@
-"""Simulated CiA 402 servos and ODrives as devices on a CAN bus, for tests and work without hardware."""
+"""Simulated CiA 402 servos and ODrives as devices on a CAN bus, for tests and for work without hardware."""
 
 from trirail_drivers.simulated.bus import SimulatedBus
 from trirail_drivers.simulated.carriages import Carriages

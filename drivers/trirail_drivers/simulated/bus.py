@@ -1,4 +1,4 @@
-"""A CAN bus inside the process, with simulated drives on it and without threads."""
+"""CAN bus inside the process, with simulated drives and without threads."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class SimulatedBus(can.BusABC):
         clock: Clock,
         faults: Faults,
     ) -> None:
-        """Put the drives on the bus; `faults` act on these drives."""
+        """Connect the drives to the bus; `faults` act on these drives."""
         self.drives = tuple(drives)
         self.faults = faults
         self.channel_info = "simulated drives"
@@ -39,7 +39,10 @@ class SimulatedBus(can.BusABC):
         self._exchange = SimulatedExchange(self.drives, clock, faults, self._emit)
 
     def press(self, index: int, switches: int) -> None:
-        """Press these switches of a slider and release the others: bits of its drive's digital inputs (60FDh)."""
+        """Press these switches of a slider and release its others.
+
+        Switches are bits of the drive's digital inputs (60FDh).
+        """
         self.drives[index].press(switches)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits

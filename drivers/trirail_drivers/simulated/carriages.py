@@ -1,4 +1,4 @@
-"""True positions of the simulated sliders, as a scale beside each rail would read, independent of the encoders."""
+"""True positions of the simulated sliders, as a scale along each rail would show them, independent of the encoders."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from trirail_drivers.simulated.servo import Servo
 
 
 class DriveMounting(NamedTuple):
-    """Slider that a drive actually moves, whatever its configuration says."""
+    """Slider that a drive actually moves, whatever the configuration says."""
 
     slider: int
     """Index of the slider."""
     counts_per_metre: float
-    """Scale of that slider; negative if counts fall as its position rises."""
+    """Scale of that slider; negative if the counts decrease as its position increases."""
 
 
 class Carriages:
     """The three sliders and their drives: each drive moves one slider, unless wiring or mechanics are wrong."""
 
     def __init__(self, servos: Sequence[Servo], counts_per_metre: Sequence[float]) -> None:
-        """`counts_per_metre`: negative if counts fall as the slider's position rises."""
+        """`counts_per_metre` is negative if the counts decrease as the slider position increases."""
         self._servos = tuple(servos)
         self._scales = tuple(counts_per_metre)
         self._moves = [(index, 1.0) for index in range(len(self._servos))]
@@ -29,12 +29,12 @@ class Carriages:
         self._places = [0.0] * len(self._servos)
 
     def couple(self, index: int, slider: int, ratio: float) -> None:
-        """Couple a drive to a slider, which moves `ratio` times the counted distance; a negative ratio reverses it."""
+        """Couple a drive to a slider that moves `ratio` times the counted distance; a negative ratio reverses it."""
         self.read()
         self._moves[index] = slider, ratio
 
     def read(self) -> tuple[float, ...]:
-        """Return the slider positions since power-on, as scales zeroed at power-on would read [m]."""
+        """Return the slider positions since power-on, as shown by scales that were zeroed at power-on [m]."""
         for index, (servo, scale, (slider, ratio)) in enumerate(
             zip(self._servos, self._scales, self._moves, strict=True)
         ):
@@ -43,7 +43,7 @@ class Carriages:
         return tuple(self._places)
 
     def push(self, slider: int, by: float) -> None:
-        """Push a slider by hand [m]: the motors coupled to it turn, and their encoders count."""
+        """Push a slider by hand [m]; the motors coupled to it turn, and their encoders count."""
         for servo, scale, (moved, ratio) in zip(self._servos, self._scales, self._moves, strict=True):
             if moved == slider:
                 servo.push(by * scale / ratio)

@@ -43,11 +43,11 @@ _ON_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
 
 
 def _discard(can_id: int, data: bytes) -> None:
-    """Drop a frame of a device that is on no bus."""
+    """Drop a frame from a device that is not on a bus."""
 
 
 class Device:
-    """A node on a CAN bus. Its owner passes it frames and the time with `receive` and `poll`."""
+    """Node on a CAN bus. Its owner passes frames and the time to it with `receive` and `poll`."""
 
     def __init__(self, node: int, eds: Path) -> None:
         self.node = node
@@ -56,7 +56,7 @@ class Device:
         self.fault = 0
         """Code of the error that the device profile latches until a fault reset; 0 for none."""
         self.silent = False
-        """Whether its wire is cut: it receives and sends nothing, but keeps running."""
+        """Whether the wire is cut: the device receives and sends nothing, but keeps running."""
         self._now = 0.0
         self._up_to_date = False
         """Whether everything due at this time has been done and nothing has changed since."""
@@ -85,11 +85,11 @@ class Device:
 
     @property
     def emergencies(self) -> Emergencies:
-        """Errors that it reports by EMCY."""
+        """Errors that the device reports by EMCY."""
         return self.errors
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Put the device on a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
+        """Connect the device to a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
         self._transmit = transmit
         self._now = now
         self._reset(_ALL)
@@ -112,7 +112,7 @@ class Device:
             self._send_events()
 
     def receive_remote(self, can_id: int, now: float) -> None:
-        """Receive a remote frame at time `now` [s], which requests a TPDO or guards the node."""
+        """Receive a remote frame at time `now` [s]; it requests a TPDO or guards the node."""
         if self.silent:
             return
         self.poll(now)
@@ -146,25 +146,28 @@ class Device:
         """Update the values that TPDOs are about to sample, because a SYNC has arrived."""
 
     def time_passed(self, now: float) -> None:
-        """Advance to time `now` [s]; called with or without frames."""
+        """Advance to time `now` [s]; called whether or not frames have arrived."""
 
     def sync_timeout(self) -> float:
-        """Return the time-out for the next SYNC [s]; inf for none."""
+        """Return the time-out for the next SYNC [s]; inf if there is none."""
         return math.inf
 
     def sync_lost(self, at: float) -> None:
         """Handle the absence of SYNC for `sync_timeout` seconds, detected at time `at`."""
 
     def connection_lost(self, code: int) -> None:
-        """Handle a lost heartbeat of the master, or the imminent exit from OPERATIONAL: EMCY `code`."""
+        """Handle the loss of the master's heartbeat, or the device being about to leave OPERATIONAL.
+
+        `code` is the EMCY error code.
+        """
 
     def restarted(self) -> None:
-        """Start from the beginning: the objects have their power-on values."""
+        """Start over with the power-on values of the objects."""
 
     # NMT and heartbeat.
 
     def _reset(self, indices: range) -> None:
-        """Reset node (all objects) or communication (1000h to 1FFFh), boot up, enter PRE-OPERATIONAL."""
+        """Reset the node (all objects) or the communication (1000h to 1FFFh), boot up, and enter PRE-OPERATIONAL."""
         if self.nmt is Nmt.OPERATIONAL:
             self.connection_lost(CONNECTION_LOST)
         self.nmt, self._up_to_date = Nmt.INITIALISING, False

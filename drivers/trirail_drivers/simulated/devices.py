@@ -1,4 +1,4 @@
-"""Interface of a simulated drive, of any protocol, to the bus and its faults."""
+"""Interface between a simulated drive of any protocol and its bus and faults."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from trirail_drivers.simulated.servo import Servo
 
 
 class SimulatedDevice(Protocol):
-    """Drive on the bus, of any protocol."""
+    """Simulated drive of any protocol on a bus."""
 
     node: int
     servo: Servo
     silent: bool
-    """Whether its wire is cut: it receives and sends nothing."""
+    """Whether the wire is cut: the drive receives and sends nothing."""
 
     @property
     def state(self) -> object:
-        """State of the drive; `str` gives it in words."""
+        """State of the drive; `str` returns its description."""
 
     @property
     def power(self) -> PowerState:
-        """State of the drive in terms of CiA 402."""
+        """Power state of the drive in terms of CiA 402."""
 
     @property
     def emergencies(self) -> Emergencies | None:
-        """Errors that it reports by EMCY; None if its protocol has no such message."""
+        """Errors that the drive reports by EMCY; None if its protocol has no such message."""
 
     @property
     def pins(self) -> DigitalPins | None:
-        """Its digital outputs and inputs; None if its protocol has none."""
+        """Digital outputs and inputs of the drive; None if its protocol has none."""
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Put it on a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
+        """Connect the drive to a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
         """Receive a data frame."""
@@ -48,10 +48,10 @@ class SimulatedDevice(Protocol):
         """Do the work due at time `now` [s]."""
 
     def press(self, switches: int) -> None:
-        """Press these switches of its slider: bits of the digital inputs (CiA 402)."""
+        """Press these switches of the slider; they are bits of the digital inputs (CiA 402)."""
 
     def fail(self, code: int) -> None:
-        """Enter the fault state with an error code of its protocol."""
+        """Enter the fault state with an error code of the drive's protocol."""
 
     def restart(self, now: float) -> None:
         """Cycle the power supply."""

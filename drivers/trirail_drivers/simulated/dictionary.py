@@ -47,15 +47,18 @@ MAX_DOMAIN_SIZE = 1 << 16
 _UNSIGNED = {0x01: 1, 0x05: 1, 0x06: 2, 0x16: 3, 0x07: 4, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
 _SIGNED = {0x02: 1, 0x03: 2, 0x10: 3, 0x04: 4, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8}
 _OCTETS = {0x08: 4, 0x11: 8, 0x0C: 6, 0x0D: 6}
-"""CiA 301 data types and their sizes in bytes: BOOLEAN and UNSIGNED8 to 64; INTEGER8 to 64; REAL32, REAL64, TIME_OF_DAY
-and TIME_DIFFERENCE, which no code here computes with. Any other type is text or a domain, of any length."""
+"""Sizes of CiA 301 data types [bytes]: BOOLEAN and UNSIGNED8 to 64; INTEGER8 to 64; REAL32, REAL64, TIME_OF_DAY and
+TIME_DIFFERENCE.
+
+No code here computes with the last four. Any other type is text or a domain, of any length.
+"""
 _BOOLEAN = 0x01
 _FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h", (4, False): "I", (4, True): "i",
             (8, False): "Q", (8, True): "q"}  # fmt: skip
 
 
 class ObjectEntry:
-    """One object or sub-object: an integer or, for other data types, bytes.
+    """Object or sub-object: an integer or, for other data types, bytes.
 
     `value` is the integer; the device's own code sets it directly.
     """
@@ -94,7 +97,7 @@ class ObjectEntry:
         self.default = self.value = self._wrapped(eds_value) if self.integer and isinstance(eds_value, int) else 0
         self._default_content = self.content = b"" if self.integer else _octets(variable, eds_value, self.size)
         low, high = variable.min, variable.max
-        if low is not None and high is not None and low > high:  # some EDS files write "no limit" like this
+        if low is not None and high is not None and low > high:  # some EDS files write "no limit" this way
             low = high = None
         if kind == _BOOLEAN:
             low, high = 0, 1
@@ -102,17 +105,17 @@ class ObjectEntry:
 
     @property
     def writable(self) -> bool:
-        """Whether the bus may write it."""
+        """Whether the object may be written over the bus."""
         return self._limits is not None
 
     @property
     def format(self) -> str:
-        """Format for `struct`, if the size is fixed."""
+        """Format string for `struct`, if the size is fixed."""
         return _FORMATS.get((self.size or 0, self._signed), f"{self.size}s") if self.integer else f"{self.size}s"
 
     @property
     def plain(self) -> bool:
-        """Whether a struct packs its `value`; otherwise it packs the result of `encode`."""
+        """Whether a struct packs `value` itself; otherwise it packs the result of `encode`."""
         return not self.format.endswith("s")
 
     def encode(self) -> bytes:
@@ -138,7 +141,7 @@ class ObjectEntry:
             self.content = data
 
     def write(self, value: int) -> None:
-        """Write an integer from an SDO or PDO. Raises SdoAbortedError, and keeps the old one, if it is refused."""
+        """Write an integer from an SDO or PDO. Raises SdoAbortedError, and keeps the old value, if it is refused."""
         if self._limits is None:
             raise SdoAbortedError(READ_ONLY)
         low, high = self._limits
@@ -160,7 +163,7 @@ class ObjectEntry:
         self.value = max(-(1 << bits) if self._signed else 0, min(round(number), (1 << bits) - 1))
 
     def _wrapped(self, eds_value: int) -> int:
-        """Return a value of the EDS, which may contain a negative number as its two's complement."""
+        """Return a value from the EDS, which may represent a negative number by its two's complement."""
         bits = 8 * (self.size or 0)
         value = eds_value % (1 << bits)
         return value - (1 << bits) if self._signed and value >> (bits - 1) else value
@@ -171,7 +174,7 @@ class ObjectEntry:
 
 
 def _octets(variable: ODVariable, eds_value: object, size: int | None) -> bytes:
-    """Return the EDS value of an object that is not an integer, as transmitted."""
+    """Return the EDS value of a non-integer object, as transmitted."""
     if isinstance(eds_value, int) and size is not None:  # EDS files write times as integers
         return (eds_value % (1 << 8 * size)).to_bytes(size, "little")
     if isinstance(eds_value, str | float):
@@ -183,7 +186,7 @@ def _octets(variable: ODVariable, eds_value: object, size: int | None) -> bytes:
 
 
 class Dictionary:
-    """The object dictionary of one node."""
+    """Object dictionary of one node."""
 
     def __init__(self, eds: Path, node: int) -> None:
         self._entries: dict[tuple[int, int], ObjectEntry] = {}
@@ -202,7 +205,7 @@ class Dictionary:
                 self._entries[index, 0].default = self._entries[index, 0].value = compact[index]
 
     def add(self, index: int, subindex: int, bits: int, *, signed: bool) -> None:
-        """Add an integer that the bus may write, unless the object exists already."""
+        """Add an integer that may be written over the bus, unless the object already exists."""
         variable = ODVariable(f"Object {index:04X}", index, subindex)
         sizes = _SIGNED if signed else _UNSIGNED
         variable.data_type = next(kind for kind, size in sizes.items() if size * 8 == bits and kind != _BOOLEAN)
@@ -222,9 +225,9 @@ class Dictionary:
         return key in self._entries
 
     def internal(self, index: int, subindex: int, initial: int = 0) -> ObjectEntry:
-        """Return the entry at (index, subindex), or one hidden from the bus if the device has none.
+        """Return the entry at (index, subindex), or an entry hidden from the bus if the device has none.
 
-        `initial` is its power-on value if the EDS has none.
+        `initial` is the power-on value if the EDS has none.
         """
         entry = self._entries.get((index, subindex)) or self._hidden.get((index, subindex))
         if entry is None:

@@ -9,21 +9,21 @@ from typing import Final, NamedTuple
 from trirail_drivers.simulated.dictionary import Dictionary, ObjectEntry
 
 MAX_CHANGES: Final = 100_000
-"""Changes of outputs that are kept."""
+"""Maximum number of output changes that are kept."""
 BOUNCE_TIME_S: Final = 0.005
-"""Time for which a bouncing input bounces after an edge."""
+"""Time for which a bouncing input bounces after an edge [s]."""
 BOUNCE_PERIOD_S: Final = 0.0007
-"""Time after which it changes meanwhile."""
+"""Interval between the changes of a bouncing input [s]."""
 _ALL_BITS: Final = 0xFFFF_FFFF
 
 
 class OutputChange(NamedTuple):
-    """A change of a drive's outputs."""
+    """Change of a drive's outputs."""
 
     time: float
     """Time of the change [s]."""
     sync: int
-    """Number of SYNCs received since power-on, including the one at which it happened."""
+    """Number of SYNCs received since power-on, including the SYNC at which the change happened."""
     bits: int
     """New state of all outputs, as bits of 60FEh."""
     position: float
@@ -31,7 +31,7 @@ class OutputChange(NamedTuple):
 
 
 class AxisSample(NamedTuple):
-    """Present state of the drive, for a change of its outputs."""
+    """Present state of the drive, stored with a change of its outputs."""
 
     time: float
     sync: int
@@ -41,8 +41,8 @@ class AxisSample(NamedTuple):
 class DigitalPins:
     """Outputs and inputs of a drive.
 
-    An output has the value of its bit in 60FEh:01 where the mask 60FEh:02 allows it, else 0; a drive without the mask
-    allows every bit. Values come by SDO or by an RPDO, which takes effect at the SYNC.
+    An output has the value of its bit in 60FEh:01 if the mask 60FEh:02 allows it, otherwise 0; a drive without the mask
+    allows every bit. Values arrive by SDO, or by an RPDO that takes effect at the SYNC.
     """
 
     def __init__(self, objects: Dictionary, sample: Callable[[], AxisSample]) -> None:
@@ -61,7 +61,7 @@ class DigitalPins:
         objects.on_write(0x60FE, self._written)
 
     def restarted(self) -> None:
-        """Switch the outputs as after power-on. The inputs are what is wired to them."""
+        """Switch the outputs as after power-on. The inputs keep the levels of their wiring."""
         self._update()
         self._inputs.value = self._pressed
 
@@ -79,7 +79,7 @@ class DigitalPins:
         self._inputs.value = value
 
     def apply_faults(self, *, stuck: int, bouncing: int, reserved: int) -> None:
-        """Set the faults in force, as bits: outputs that stick, inputs that bounce, outputs that the maker reserves."""
+        """Set the active faults as bits: stuck outputs, bouncing inputs, outputs reserved by the manufacturer."""
         self._stuck, self._bouncing, self._reserved = stuck, bouncing, reserved
         self._update()
 

@@ -1,4 +1,4 @@
-"""A CiA 402 servo drive with a simulated axis: cyclic synchronous position, interpolated position and homing modes."""
+"""CiA 402 servo drive with a simulated axis: cyclic synchronous position, interpolated position and homing modes."""
 
 from __future__ import annotations
 
@@ -42,11 +42,12 @@ _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
 class SimulatedDrive(Device):
-    """A CANopen servo drive with its axis.
+    """CANopen servo drive with its axis.
 
-    The axis moves one interpolation period (60C2h) per SYNC. Each SYNC first completes the motion since the last one,
-    then lets TPDOs sample it, then applies the latched setpoints. Without SYNC the axis moves with time; until the loss
-    of SYNC is detected, it keeps its velocity. Without power its brake holds it, but a push by hand still moves it.
+    The axis moves by one interpolation period (60C2h) per SYNC. Each SYNC first completes the motion since the previous
+    SYNC, then lets the TPDOs sample it, and then applies the latched setpoints. Without SYNC, the axis moves with time;
+    until the loss of SYNC is detected, it keeps its velocity. Without power, its brake holds it, but a push by hand
+    still moves it.
     """
 
     def __init__(
@@ -58,7 +59,7 @@ class SimulatedDrive(Device):
         eds: Path = EDS,
         mechanics: Mechanics = MECHANICS,
     ) -> None:
-        """`eds` defines the objects and their units; the drive works without those missing."""
+        """`eds` defines the objects and their units; the drive also works if objects are missing."""
         super().__init__(node, eds)
         self._missed_syncs = missed_syncs
         self.servo = servo
@@ -67,7 +68,7 @@ class SimulatedDrive(Device):
         self._synchronised = False
         self._moved_at = 0.0
         self._heard_period = 0.0
-        """Time between the last two SYNCs [s]."""
+        """Measured time between the last two SYNCs [s]."""
         self._setpoint_given = False
         self._beyond_window: float | None = None
         self._profile = Profile(self.objects, mechanics, self._mode_changed)
@@ -84,7 +85,7 @@ class SimulatedDrive(Device):
         return self.state
 
     def press(self, switches: int) -> None:
-        """Press these switches of its slider: bits of the digital inputs 60FDh, if it has that object."""
+        """Press these switches of the slider; bits of the digital inputs 60FDh, if the drive has that object."""
         self.pins.press(switches, self._now)
         self._up_to_date = False
 
@@ -112,7 +113,10 @@ class SimulatedDrive(Device):
         self._change(PowerState.SWITCH_ON_DISABLED)
 
     def before_sync(self) -> None:
-        """Move from one setpoint to the next, except at the first SYNC: the axis has already moved with time."""
+        """Move from one setpoint to the next.
+
+        This is skipped at the first SYNC, before which the axis moved with time.
+        """
         self.syncs += 1
         if self._synchronised:
             self._heard_period = self._now - self._moved_at
@@ -121,23 +125,25 @@ class SimulatedDrive(Device):
         self._moved_at = self._now
 
     def time_passed(self, now: float) -> None:
-        """Move with time if no SYNC sets the pace; a velocity offset has no meaning then. Inputs bounce."""
+        """Move with time, ignoring the velocity offset, unless SYNC sets the pace; let inputs bounce."""
         self.pins.poll(now)
         if not self._synchronised and now > self._moved_at:
             self._move(now - self._moved_at, 0.0)
             self._moved_at = now
 
     def sync_timeout(self) -> float:
-        """Return `missed_syncs` periods of SYNC (1006h) if set, else of interpolation; inf before the second SYNC."""
+        """Return `missed_syncs` SYNC periods (1006h) if set, otherwise interpolation periods; inf before the second
+        SYNC.
+        """
         return self._missed_syncs * (self._sync_period.value * 1e-6 or self._step) or math.inf
 
     @property
     def _step(self) -> float:
-        """Time from one setpoint to the next [s]: 60C2h or 1006h if set, else the measured SYNC period."""
+        """Time from one setpoint to the next [s]: 60C2h or 1006h if set, otherwise the measured SYNC period."""
         return self._profile.interpolation_period or self._sync_period.value * 1e-6 or self._heard_period
 
     def sync_lost(self, at: float) -> None:
-        """Continue with time; enter the fault state if enabled and configured to expect SYNC (1006h)."""
+        """Continue with time; enter the fault state if the drive is enabled and configured to expect SYNC (1006h)."""
         self._synchronised = False
         self.servo.coast(at - self._moved_at)
         self._moved_at = at
@@ -146,7 +152,7 @@ class SimulatedDrive(Device):
             self.fail(SYNC_LOST)
 
     def connection_lost(self, code: int) -> None:
-        """React as the abort connection option code demands (CiA 402-2, 6007h)."""
+        """React as specified by the abort connection option code (CiA 402-2, 6007h)."""
         if self.state is not PowerState.OPERATION_ENABLED:
             return
         match self._profile.abort_option.value:
@@ -220,7 +226,7 @@ class SimulatedDrive(Device):
         self._publish()
 
     def _standstill(self) -> None:
-        """Perform transition 14, or 12 if the quick stop does not stay active."""
+        """Perform transition 14, or transition 12 if the drive does not stay in QUICK STOP ACTIVE."""
         if self.state is PowerState.FAULT_REACTION_ACTIVE:
             self._change(PowerState.FAULT)
         elif self.state is PowerState.QUICK_STOP_ACTIVE and not self._profile.stays_stopped:
@@ -251,7 +257,7 @@ class SimulatedDrive(Device):
         self._profile.statusword.value = status
 
     def _homing_bits(self) -> int:
-        """Return the bits error, attained and target reached (axis at rest) (CiA 402-2, homing mode)."""
+        """Return the bits "error", "attained" and "target reached" (axis at rest) (CiA 402-2, homing mode)."""
         homing = self.homing
         meant_to_stand = not homing.under_way or bool(self._profile.controlword.value & _HALT)
         return (

@@ -35,7 +35,7 @@ class Emergencies:
         return bool(self._active)
 
     def report(self, code: int, detail: int = 0) -> None:
-        """Report a new error once while it lasts; EMCY and history contain `detail` as well."""
+        """Report a new error once while it persists; EMCY and history also contain `detail`."""
         if (code, detail) in self._active:
             return
         self._active.add((code, detail))
@@ -53,7 +53,7 @@ class Emergencies:
         self._history[0].value = error
 
     def clear(self, code: int, detail: int = 0) -> None:
-        """Clear an error; the last one to end sends "error reset" (code 0)."""
+        """Clear an error; once no error is left, "error reset" (code 0) is sent."""
         if (code, detail) not in self._active:
             return
         self._active.remove((code, detail))
@@ -62,13 +62,13 @@ class Emergencies:
             self._emit(0, 0)
 
     def forget(self, but: int) -> None:
-        """Drop all errors except those with code `but`, without an EMCY, after a reset."""
+        """After a reset, drop all errors except those with code `but`, without sending an EMCY."""
         self._active = {key for key in self._active if key[0] == but}
         self._update_register()
         self._held_back = None
 
     def suppress(self, muted: bool) -> None:
-        """Suppress EMCY in STOPPED, and send the newest one on leaving that state (CiA 301)."""
+        """Suppress EMCY in STOPPED, and send the newest one when leaving that state (CiA 301)."""
         self._muted = muted
         if not muted and self._held_back is not None:
             emergency, self._held_back = self._held_back, None

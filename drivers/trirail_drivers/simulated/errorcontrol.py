@@ -1,4 +1,4 @@
-"""Error control (CiA 301): heartbeats produced and consumed, or node guarding and life guarding without them."""
+"""Error control (CiA 301): produced and consumed heartbeats or, without them, node guarding and life guarding."""
 
 from __future__ import annotations
 
@@ -27,23 +27,28 @@ class ErrorControl:
         objects.on_write(0x1017, self._producer_written)
 
     def restart(self, now: float) -> None:
-        """Stop sending and watching after a reset, until either starts again."""
+        """Stop sending and watching after a reset, until each is started again."""
         self._now = now
         self._heartbeat_due = self._consumer_due = self._guarding_due = math.inf
         self._toggle = 0
 
     @property
     def watched(self) -> int | None:
-        """Node whose heartbeat is watched; None for none."""
+        """Node whose heartbeat is watched, or None."""
         node, milliseconds = divmod(self._consumer.value, 1 << 16)
         return node if node and milliseconds else None
 
     def on_heartbeat(self, now: float) -> None:
-        """Handle a heartbeat of the watched node: the first one, or the next after a loss, starts the time-out."""
+        """Handle a heartbeat of the watched node.
+
+        The first heartbeat, or the first after a loss, starts the time-out.
+        """
         self._consumer_due = now + (self._consumer.value & 0xFFFF) * 1e-3
 
     def guarded(self, state: int, now: float) -> bytes | None:
-        """Return the answer to the master's guarding; None if heartbeats replace it (CiA 301: never both)."""
+        """Return the answer to the master's guarding request, or None if heartbeats replace guarding (CiA 301: never
+        both).
+        """
         if self._producer.value:
             return None
         life_time = self._guard_time.value * self._life_factor.value * 1e-3
@@ -53,7 +58,7 @@ class ErrorControl:
         return answer
 
     def poll(self, now: float) -> bool:
-        """Report a master lost at time `now` [s]; return whether a heartbeat is due."""
+        """Report the loss of the master if it is due at time `now` [s]; return whether a heartbeat is due."""
         self._now = now
         if now >= self._consumer_due or now >= self._guarding_due:
             self._consumer_due = self._guarding_due = math.inf

@@ -15,7 +15,7 @@ _FLAGS: Final = EXTENDED | REMOTE | ERROR
 
 
 class SimulatedExchange:
-    """Drives without a bus: the owner passes in the master's frames and the time, and receives the drives' frames.
+    """Drives without a bus. The owner passes in the master's frames and the time, and receives the drives' frames.
 
     Identifiers include the flags of `struct can_frame`.
     """
@@ -23,7 +23,7 @@ class SimulatedExchange:
     def __init__(
         self, drives: Sequence[SimulatedDevice], clock: Clock, faults: Faults, emit: Callable[[int, bytes], None]
     ) -> None:
-        """Switch the drives on; `faults` act on these drives, `emit` receives the frames for the master."""
+        """Switch the drives on; `faults` act on these drives, and `emit` receives the frames for the master."""
         self._drives = tuple(drives)
         self._faults = faults
         self._clock = clock
@@ -37,7 +37,9 @@ class SimulatedExchange:
             drive.connect(partial(self._from_drive, index, others), now)
 
     def receive(self, identifier: int, data: bytes, now: float) -> bool:
-        """Deliver a frame of the master to every drive at time `now` [s]; False while its controller is bus-off."""
+        """Deliver a frame from the master to every drive at time `now` [s]; return False while the controller is
+        bus-off.
+        """
         if not self._faults.idle:
             self._faults.poll(now)
             if self._faults.bus_off:

@@ -1,8 +1,9 @@
-"""Units of a drive's objects as its own dictionary defines them (CiA 402-2, factor group), in counts and seconds.
+"""Units of a drive's objects, as defined by its own dictionary (CiA 402-2, factor group), in counts and seconds.
 
-A count is the drive's unit of position at power-on. The objects define the others: 60A8h, 60A9h and 60AAh by CiA 303-2
-(power of ten, numerator, denominator), else 6096h, which divides units of position per second, and 6097h, which divides
-those of velocity; positions scale with 608Fh, 6091h and 6092h. The manufacturer fixes any unit that no object gives.
+A count is the drive's unit of position at power-on. The objects define the other units. 60A8h, 60A9h and 60AAh define
+them by CiA 303-2 (power of ten, numerator, denominator). Without these, 6096h divides position units per second, and
+6097h divides velocity units per second. Positions scale with 608Fh, 6091h and 6092h. The manufacturer fixes any unit
+that no object defines.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ _METRES: Final = {0x01: 1.0, 0xC1: 0.0254, 0xC2: 0.3048}
 _PER_REVOLUTION: Final = {0x10: math.tau, 0x40: 400.0, 0x41: 360.0, 0x42: 21_600.0, 0x43: 1_296_000.0, 0xB4: 1.0}
 _COUNTS: Final = (0xB5, 0xAC)
 _RPM: Final = 0xC0
-"""Numerator of accelerations in the EPOS4: its 00C00300h is rpm/s."""
+"""Numerator that the EPOS4 uses for accelerations: its 00C00300h is rpm/s."""
 _SECONDS: Final = {0x03: 1.0, 0x47: 60.0, 0x48: 3600.0}
 _SECOND_SQUARED: Final = 0x57
 
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """Properties that no object gives: the axis of the drive, and units fixed by the manufacturer."""
+    """Properties that no object reports: the drive's axis, and units fixed by the manufacturer."""
 
     counts_per_metre: float = math.nan
     counts_per_revolution: float = math.nan
@@ -34,11 +35,11 @@ class Mechanics:
     acceleration: float = 1.0
     """Fixed unit of acceleration [counts/s²]."""
     untold: tuple[int, ...] = ()
-    """Those of 60A9h and 60AAh that are 0, whatever the EDS contains: their units are those fixed here."""
+    """Which of 60A9h and 60AAh are 0, whatever the EDS contains: their units are those fixed here."""
 
 
 class FactorGroup:
-    """Current units of the drive, as its objects define them."""
+    """Present units of the drive, as its objects define them."""
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics) -> None:
         self.position = 1.0
@@ -85,12 +86,12 @@ class FactorGroup:
         return resolution * gear / feed
 
     def _ratio(self, index: int) -> float | None:
-        """Return sub-index 1 divided by sub-index 2; None if the drive has no such objects or leaves them unset."""
+        """Return sub-index 1 divided by sub-index 2; None if the drive lacks these objects or has not set them."""
         numerator, divisor = (entry.value for entry in self._ratios[index])
         return numerator / divisor if numerator > 0 and divisor > 0 else None
 
     def _unit(self, code: int, power: int) -> float | None:
-        """The size of a unit by CiA 303-2 [counts, per second to a power]; None where it tells none known here."""
+        """Return the size of a unit by CiA 303-2 [counts, per second to a power]; None if the code is unknown."""
         size = self._decoded(code, power)
         return size if size is not None and math.isfinite(size) else None
 

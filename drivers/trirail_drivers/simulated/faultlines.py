@@ -61,22 +61,22 @@ class Frames(NamedTuple):
     to_drive: bool | None
     """Direction; None for both."""
     identifier: int | None
-    """Identifier for node 0; None for all."""
+    """Identifier for node 0; None for all identifiers."""
     per_node: int = 0
-    """Increment of the identifier per node id; 0 if it is the same for all."""
+    """Increment of the identifier per node id; 0 if all nodes have the same identifier."""
 
     def match(self, to_drive: bool, identifier: int, node: int) -> bool:
-        """Whether a frame to or from the drive `node` is one of them."""
+        """Whether a frame to or from the drive `node` belongs to the selection."""
         if self.to_drive is not None and self.to_drive is not to_drive:
             return False
         return self.identifier is None or identifier == self.identifier + self.per_node * node
 
 
 class Condition(NamedTuple):
-    """State that a drive must be in for a fault to begin."""
+    """State in which a drive must be for a fault to begin."""
 
     drive: int | None
-    """Index of the drive; None for any."""
+    """Index of the drive; None for any drive."""
     state: str
 
 
@@ -89,7 +89,7 @@ class Fault:
     drives: tuple[int, ...] = ()
     """Indices of the affected drives; empty for the bus."""
     value: float = 0.0
-    """Its VALUE; codes and identifiers are whole numbers."""
+    """VALUE of the fault; codes and identifiers are whole numbers."""
     frames: tuple[Frames, ...] = ()
     delay: float = 0.0
     """Time from the line to the fault [s]."""
@@ -98,7 +98,7 @@ class Fault:
     duration: float = math.inf
     """Duration of the fault [s]."""
     number: int | None = None
-    """Number of frames affected; None for all."""
+    """Number of affected frames; None for all."""
 
 
 EITHER: Final = {"to": Frames(True, None), "from": Frames(False, None)}
@@ -108,7 +108,7 @@ _DRIVES: Final = {name: (index,) for index, name in enumerate(NAMES)} | {"all": 
 
 
 def _number(fits: Callable[[float], bool] = math.isfinite) -> Callable[[str], float]:
-    """Return a parser of finite numbers that fit; it raises ValueError for others."""
+    """Return a parser of finite numbers for which `fits` is true; it raises ValueError for others."""
 
     def read(word: str) -> float:
         value = float(word)
@@ -140,7 +140,7 @@ class _Kind(NamedTuple):
     """Syntax of the words after a fault's name."""
 
     wants: str = ""
-    """Description of its VALUE; empty if it has none."""
+    """Description of the fault's VALUE; empty if it has none."""
     read: Callable[[str], float] | None = None
     example: str = ""
     momentary: bool = False
@@ -179,7 +179,7 @@ _OF_DRIVES: Final = {
 OF_PINS: Final = ("output-stuck", "input-bounces", "reserves")
 """Faults of digital outputs and inputs."""
 OF_SLIDERS: Final = ("node", "counts")
-"""Faults whose DRIVE is a slider, and that override its configuration."""
+"""Faults whose DRIVE is a slider, and which override its configuration."""
 _OF_BUS: Final = {
     "bus-off": _Kind(),
     "error-passive": _Kind(),

@@ -26,7 +26,7 @@ MOVING: Final = 1e-3
 BABBLED: Final = 7000.0
 """Frame rate of a node that saturates a bus of 1 Mbit/s [1/s]."""
 MOST_BABBLED: Final = 100
-"""Maximum number of its frames per poll, for a receiver that has not polled for a long time."""
+"""Maximum number of babbled frames per poll, for a receiver that has not polled for a long time."""
 
 _STOPPING = (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
@@ -36,11 +36,11 @@ Deliver = Callable[[bytes], None]
 
 
 def _to_nobody(*_said: object) -> None:
-    """Discard announcements of faults, or frames, that have no receiver."""
+    """Discard an announcement of a fault, or a frame, that has no receiver."""
 
 
 class _ActiveFault:
-    """A pending or active fault."""
+    """Pending or active fault."""
 
     def __init__(self, fault: Fault, since: float) -> None:
         self.fault = fault
@@ -59,7 +59,7 @@ class _ActiveFault:
 
 
 class Faults:
-    """The faults of one bus. Random numbers are seeded: the same calls produce the same faults."""
+    """Faults of one bus. Random numbers are seeded, so the same calls produce the same faults."""
 
     def __init__(
         self,
@@ -70,10 +70,11 @@ class Faults:
         announce: Callable[[str], None] = _to_nobody,
         mounted: Sequence[DriveMounting] | None = None,
     ) -> None:
-        """`counts_per_metre`: negative if counts fall as the slider's position rises. `frames`: those with names.
+        """`counts_per_metre` is negative if the counts decrease as the slider position increases.
 
-        `announce`: called when a fault begins or ends. `mounted`: the slider and counts of each drive, if they differ
-        from its own slider and `counts_per_metre`; a line names a drive by that slider.
+        `frames` contains the frames that have names. `announce` is called when a fault begins or ends. `mounted`
+        contains the slider and counts of each drive, if they differ from its own slider and `counts_per_metre`; a line
+        names a drive by that slider.
         """
         self.announce = announce
         self._mounted = (
@@ -108,7 +109,7 @@ class Faults:
 
     @property
     def bus_off(self) -> bool:
-        """Whether the master's controller can neither send nor receive."""
+        """Whether the master's controller is bus-off and can neither send nor receive."""
         return any(active.begun and active.fault.name == "bus-off" for active in self._active)
 
     def seed(self, value: int) -> None:
@@ -116,7 +117,7 @@ class Faults:
         self._random.seed(value)
 
     def add(self, line: str) -> None:
-        """Add the fault of a line. Raises FaultSyntaxError."""
+        """Add the fault described by a line. Raises FaultSyntaxError."""
         fault = self._with_drive_indices(parse(line, self._frames))
         if fault.name == "emcy":
             for index in fault.drives:
@@ -131,7 +132,7 @@ class Faults:
         self._active.append(_ActiveFault(fault, self._now))
 
     def _with_drive_indices(self, fault: Fault) -> Fault:
-        """Return the fault with configured indices of drives in place of the sliders that the drives are mounted on."""
+        """Return the fault with the indices of drives instead of those of the sliders on which they are mounted."""
         condition, drives = fault.condition, fault.drives
         if fault.name not in OF_SLIDERS:
             drives = tuple(self._drive_of.get(index, index) for index in drives)
@@ -140,7 +141,10 @@ class Faults:
         return dataclasses.replace(fault, drives=drives, condition=condition)
 
     def load(self, path: Path) -> None:
-        """Load a file with one fault per line; # begins a comment. Raises DriveError with file and line."""
+        """Load a file with one fault per line; # begins a comment.
+
+        Raises DriveError, which names the file and the line.
+        """
         try:
             text = files.text(path)
         except FileError as error:
@@ -186,7 +190,10 @@ class Faults:
             deliver(data)
 
     def carry(self, index: int, to_drive: bool, can_id: int, data: bytes, deliver: Deliver) -> None:
-        """Carry a frame to or from a drive: faults determine how often, when and with which data to `deliver` it."""
+        """Carry a frame to or from a drive.
+
+        Faults determine how often, when and with which data `deliver` is called.
+        """
         if self.bus_off or self._is_talked_down(can_id):
             return
         copies, wait = 1, 0.0
@@ -218,7 +225,7 @@ class Faults:
         fault = active.fault
         if self._now - active.since < fault.delay or (fault.condition and not self._holds(fault.condition)):
             return False
-        # A chance applies to each frame for faults of frames, and otherwise to each second, of which this is a part.
+        # For faults of frames, a chance applies to each frame; otherwise to each second, of which this is a part.
         return bool(fault.chance == 1.0 or self._strikes_frames(fault)) or (
             self._random.random() < 1.0 - (1.0 - fault.chance) ** elapsed
         )
@@ -287,7 +294,7 @@ class Faults:
     # Effects of faults.
 
     def _break_drives(self) -> None:
-        """Apply the active faults to every drive, and restore drives without any."""
+        """Apply the active faults to every drive, and restore drives without faults."""
         begun = [active.fault for active in self._active if active.begun]
         wired = {round(each.value): slider for each in begun if each.name == "node" for slider in each.drives}
         counted = {slider: each.value for each in begun if each.name == "counts" for slider in each.drives}
@@ -316,9 +323,10 @@ class Faults:
 
     @staticmethod
     def _encoder(fault: Mapping[str, Fault], rising: float) -> tuple[float, float]:
-        """Return the shares of the travel that a drive's encoder counts, as its counts rise and as they fall.
+        """Return the fractions of the travel that a drive's encoder counts while its counts increase and while they
+        decrease.
 
-        `rising` is negative if counts fall as the slider's position rises.
+        `rising` is negative if the counts decrease as the slider position increases.
         """
         if "loose" in fault:
             return 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Homing by the drive itself (CiA 402-2, homing mode): to the edge of a switch or at the current position."""
+"""Homing by the drive itself (CiA 402-2, homing mode), to the edge of a switch or at the current position."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 from trirail_drivers.simulated.servo import Servo
 
 EDGES: Final = {17: 1, 18: -1, 19: -1, 20: 1, 21: 1, 22: -1}
-"""Methods 6098h without index pulse, and the direction in which each finally crosses the edge of its switch."""
+"""Methods 6098h without index pulse, and the direction in which each one finally crosses the edge of its switch."""
 STANDING: Final = (35, 37)
 """Methods that take the current position as home."""
 
@@ -18,24 +18,24 @@ class Phase(Enum):
 
     IDLE = auto()
     SEARCH = auto()
-    """Towards the edge, fast, until it is crossed."""
+    """Fast motion towards the edge until it is crossed."""
     RETREAT = auto()
-    """Back across the edge, fast."""
+    """Fast motion back across the edge."""
     APPROACH = auto()
-    """Across the edge, slowly; home is where it is crossed."""
+    """Slow motion across the edge; home is where the axis crosses it."""
     HALT = auto()
-    """Braking behind the edge."""
+    """Braking beyond the edge."""
 
 
 class HomingMode:
-    """Homing mode of one servo; velocities in counts/s, accelerations in counts/s²."""
+    """Homing mode of one servo; velocities are in counts/s, accelerations in counts/s²."""
 
     def __init__(self, servo: Servo, switch: float | None) -> None:
         self.switch = switch
-        """Position of the edge of the switch [counts]; None without a switch."""
+        """Position of the edge of the switch [counts]; None if there is no switch."""
         self.attained = False
         self.failed = False
-        """Whether there is a homing error; the next start clears it."""
+        """Whether a homing error has occurred; the next start clears it."""
         self.phase = Phase.IDLE
         self._servo = servo
         self._direction = 1
@@ -44,11 +44,11 @@ class HomingMode:
 
     @property
     def under_way(self) -> bool:
-        """Whether homing has started and has neither finished nor been interrupted."""
+        """Whether homing has started and has been neither finished nor interrupted."""
         return self.phase is not Phase.IDLE
 
     def forget(self) -> None:
-        """Reset phase and result, as on entering the mode."""
+        """Reset phase and result, as when entering the mode."""
         self.attained = self.failed = False
         self.phase = Phase.IDLE
 
@@ -69,7 +69,7 @@ class HomingMode:
         self.phase = Phase.IDLE
 
     def move(self, step: float, halted: bool) -> None:
-        """Move for `step` seconds; `halted` only brakes, and homing continues afterwards."""
+        """Move for `step` seconds. If `halted`, the axis only brakes, and homing continues afterwards."""
         servo = self._servo
         before = self._beyond()
         speed = 0.0 if halted else self._speed()
@@ -92,7 +92,7 @@ class HomingMode:
                 return 0.0
 
     def _beyond(self) -> bool:
-        """Return whether the axis is on the side of the edge that it reaches in the final direction."""
+        """Whether the axis is on the side of the edge that it reaches in the final direction."""
         return self.switch is not None and self._direction * (self._servo.position - self.switch) >= 0.0
 
     def _refer(self, home: float) -> None:

@@ -1,4 +1,4 @@
-"""A simulated ODrive on CANSimple with its axis, without a thread of its own."""
+"""Simulated ODrive on CANSimple with its axis, without a thread of its own."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _SENT_CYCLIC: Final = tuple(
     (name, f"{CAN}.{name}_msg_rate_ms", command)
     for name, command in (("heartbeat", cansimple.HEARTBEAT), *_CYCLIC.items())
 )
-"""Cyclic messages: name, setting with the period [ms], and command."""
+"""Cyclic messages: name, setting that contains the period [ms], and command."""
 _UNSENT_CYCLIC: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
-"""Further cyclic messages that no client reads: their settings are stored and reported, but nothing is sent."""
+"""Other cyclic messages, which no client reads: their settings are stored and reported, but nothing is sent."""
 _REQUESTS: Final = (
     cansimple.GET_VERSION,
     cansimple.GET_ERROR,
@@ -43,15 +43,15 @@ _REQUESTS: Final = (
 
 
 def _discard(can_id: int, data: bytes) -> None:
-    """Drop a frame of a device that is on no bus."""
+    """Drop a frame from a device that is not on a bus."""
 
 
 class SimulatedOdrive:
-    """An ODrive axis. Its owner passes it frames and the time with `receive` and `poll`.
+    """ODrive axis. Its owner passes frames and the time to it with `receive` and `poll`.
 
-    It moves with time and follows each setpoint from its arrival. Disarmed, it coasts: no brake holds it, and
-    `friction` [turns/s²] brings it to rest. Its watchdog disarms it after `watchdog` seconds without a message.
-    It sends heartbeats and the cyclic messages that its settings enable.
+    The axis moves with time and follows each setpoint from its arrival. When disarmed, it coasts: no brake holds it,
+    and `friction` [turns/s²] brings it to rest. The watchdog disarms it after `watchdog` seconds without a message. The
+    axis sends heartbeats and the cyclic messages that its settings enable.
     """
 
     def __init__(
@@ -65,11 +65,11 @@ class SimulatedOdrive:
         self.disarm_reason = Error(0)
         self.result = ProcedureResult.SUCCESS
         self.calibrated = True
-        """Whether it is calibrated; otherwise it refuses closed loop control."""
+        """Whether the axis is calibrated; otherwise it refuses closed-loop control."""
         self.silent = False
-        """Whether its wire is cut: it receives and sends nothing, but keeps running."""
+        """Whether the wire is cut: the drive receives and sends nothing, but keeps running."""
         self.modes = (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
-        """Control mode and input mode; initially those that another client has left."""
+        """Control mode and input mode; initially those that another client left behind."""
         self.version = Version(HARDWARE, FIRMWARE)
         self.serial = 0x3664_0000_0000 + node
         self.settings: dict[str, float] = {
@@ -80,7 +80,7 @@ class SimulatedOdrive:
             **{f"{CAN}.{name}_msg_rate_ms": 0 for name in (*_CYCLIC, *_UNSENT_CYCLIC)},
             "axis0.pos_vel_mapper.status": 0,
         }
-        """Settings by path; endpoints as its firmware numbers them."""
+        """Settings by path. Endpoints are numbered as in the drive's firmware."""
         self._input = (servo.position, 0.0)
         self._friction = friction
         self._fed = self._moved_at = 0.0
@@ -99,34 +99,37 @@ class SimulatedOdrive:
 
     @property
     def state(self) -> str:
-        """Axis state in words, and the reason for disarming."""
+        """Axis state, and the reason for disarming, for people."""
         name = cansimple.state_name(self.axis_state)
         return f"{name}, {cansimple.error_names(self.disarm_reason)}" if self.disarm_reason else name
 
     @property
     def power(self) -> PowerState:
-        """State of the drive in terms of CiA 402."""
+        """Power state of the drive in terms of CiA 402."""
         if self._armed:
             return PowerState.OPERATION_ENABLED
         return PowerState.FAULT if self._error_bits else PowerState.SWITCH_ON_DISABLED
 
     @property
     def emergencies(self) -> None:
-        """None: CANSimple has no EMCY."""
+        """None, since CANSimple has no EMCY."""
         return None
 
     def connect(self, transmit: Callable[[int, bytes], None], now: float) -> None:
-        """Put the drive on a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
+        """Connect the drive to a bus, to which it sends with `transmit(can_id, data)`, and switch it on."""
         self._transmit = transmit
         self._moved_at = now
         self._due = dict.fromkeys(("heartbeat", *_CYCLIC), now)
 
     def receive(self, can_id: int, data: bytes, now: float) -> None:
-        """Receive a data frame at time `now` [s]; an empty one is also a request, a wrong length is ignored."""
+        """Receive a data frame at time `now` [s].
+
+        An empty frame is also a request; a frame of the wrong length is ignored.
+        """
         node, command = divmod(can_id, 1 << 5)
         if node != self.node or self.silent:
             return
-        self.poll(now)  # work that was due before the frame
+        self.poll(now)  # work that was due before the frame arrived
         self._fed = now
         if command in _REQUESTS:
             if not data:
@@ -159,11 +162,11 @@ class SimulatedOdrive:
 
     @property
     def pins(self) -> None:
-        """None: CANSimple has no message for its GPIO."""
+        """None, since CANSimple has no message for the GPIO pins."""
         return None
 
     def press(self, switches: int) -> None:
-        """Do nothing: CANSimple does not report switches."""
+        """Do nothing, since CANSimple does not report switches."""
 
     def fail(self, errors: int) -> None:
         """Disarm with these errors."""
@@ -207,7 +210,7 @@ class SimulatedOdrive:
         self._send(command, data)
 
     def _sdo(self, data: bytes) -> None:
-        """Read or write a setting (RxSdo); endpoint numbers of other firmware get no answer."""
+        """Read or write a setting (RxSdo). Endpoint numbers of other firmware versions get no answer."""
         opcode, number, _ = cansimple.SDO.unpack_from(data)
         table = next((table.endpoints for table in KNOWN_TABLES if table.matches(self.version)), {})
         for path, endpoint in table.items():

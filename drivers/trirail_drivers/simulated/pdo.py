@@ -37,7 +37,7 @@ _ON_EVENT = 255
 
 
 class Pdo(ABC):
-    """Common part of both directions: communication parameter, mapping, and the rules for changing them."""
+    """Common part of both directions: communication parameters, mapping, and the rules for changing them."""
 
     def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         self.number = communication % 0x200 + 1
@@ -46,7 +46,7 @@ class Pdo(ABC):
         self._cob_id = objects.internal(communication, 1, _NOT_VALID)
         self._type = objects.internal(communication, 2, _ON_EVENT)
         self._most = 0
-        """Maximum number of objects in its mapping."""
+        """Maximum number of objects in the mapping."""
         while (mapping, self._most + 1) in objects:
             self._most += 1
         defaults = [objects.internal(mapping, n).default for n in range(1, self._most + 1)]
@@ -66,12 +66,12 @@ class Pdo(ABC):
 
     @property
     def can_id(self) -> int:
-        """CAN-ID of its frames."""
+        """CAN-ID of the PDO's frames."""
         return self._cob_id.value & _CAN_ID
 
     @property
     def remote(self) -> bool:
-        """Whether a remote frame may request it (bit 30 of its COB-ID is clear)."""
+        """Whether the PDO may be requested with a remote frame (bit 30 of its COB-ID is clear)."""
         return not self._cob_id.value & _NO_REMOTE
 
     @property
@@ -86,7 +86,7 @@ class Pdo(ABC):
         self._plain = all(entry.plain for entry in self.entries)
 
     def power_on(self) -> None:
-        """Apply the mapping of the EDS; if that mapping could not be written, nothing is mapped."""
+        """Apply the mapping of the EDS. If that mapping is not one that could be written, nothing is mapped."""
         try:
             self.refresh()
         except SdoAbortedError:
@@ -101,12 +101,15 @@ class Pdo(ABC):
         """Discard received or sent data."""
 
     def _values(self) -> list[int]:
-        """Return the mapped values up to the count, which exceeds the mapping at power-on in some drives."""
+        """Return the mapped values up to the count, which at power-on exceeds the mapping in some drives."""
         values = [self._objects[self._mapping, n].value for n in range(1, min(self._count.value, self._most) + 1)]
         return values[: (*values, 0).index(0)]
 
     def _mapped(self, value: int) -> ObjectEntry:
-        """Return the entry of a mapping parameter: index, subindex, length in bits. Raises SdoAbortedError."""
+        """Return the entry that a mapping parameter names by index, subindex and length in bits.
+
+        Raises SdoAbortedError.
+        """
         index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
         if not value:
             raise SdoAbortedError(NO_OBJECT)
@@ -116,7 +119,7 @@ class Pdo(ABC):
         return entry
 
     def _mapping_written(self, entry: ObjectEntry, old: int) -> None:
-        """Check the order of writes: PDO off, count 0, the entries, their count (CiA 301, 1600h and 1A00h)."""
+        """Check the order of writes: PDO off, count 0, the entries, the count (CiA 301, 1600h and 1A00h)."""
         count = old if entry.subindex == 0 else self._count.value
         if self.valid or (entry.subindex and count):
             raise SdoAbortedError(UNSUPPORTED_ACCESS)
@@ -150,12 +153,12 @@ class Pdo(ABC):
 
 
 class ReceivePdo(Pdo):
-    """An RPDO: applied at the SYNC after its arrival (types 0 to 240) or on arrival (254, 255)."""
+    """RPDO, applied at the SYNC after its arrival (types 0 to 240) or on arrival (254, 255)."""
 
     _latched: tuple[int | bytes, ...] | None = None
 
     def permits(self, entry: ObjectEntry) -> bool:
-        """Return whether the bus may write the entry."""
+        """Return whether the entry may be written over the bus."""
         return entry.writable
 
     def reset(self) -> None:
@@ -169,7 +172,7 @@ class ReceivePdo(Pdo):
             self.write_latched()
 
     def write_latched(self) -> None:
-        """Write the latched values; skip a value that its object refuses, as it would refuse an SDO."""
+        """Write the latched values, skipping any value that its object refuses as it would refuse an SDO."""
         values, self._latched = self._latched, None
         if values is None:
             return
@@ -184,7 +187,7 @@ class ReceivePdo(Pdo):
 
 
 class TransmitPdo(Pdo):
-    """A TPDO: sent on every n-th SYNC, on a SYNC after a change (type 0), or on a change (254, 255)."""
+    """TPDO, sent on every n-th SYNC, on a SYNC after a change (type 0), or on a change (254, 255)."""
 
     def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         super().__init__(objects, communication, mapping, changed)
@@ -193,11 +196,11 @@ class TransmitPdo(Pdo):
         self.reset()
 
     def permits(self, entry: ObjectEntry) -> bool:
-        """Return whether the bus may read the entry."""
+        """Return whether the entry may be read over the bus."""
         return entry.readable
 
     def reset(self) -> None:
-        """Reset to nothing sent and no SYNC counted."""
+        """Reset the state: nothing has been sent, and no SYNC has been counted."""
         self._syncs = 0
         self._sent: bytes | None = None
         self._sent_at = 0.0
@@ -223,7 +226,9 @@ class TransmitPdo(Pdo):
         return data
 
     def on_event(self, now: float) -> bytes | None:
-        """Return the data to send at time `now` [s], if any: on a change or by event timer, unless inhibited."""
+        """Return the data to send at time `now` [s], if any: on a change or by event timer, unless the inhibit time
+        blocks it.
+        """
         data = self.pack()
         if self._sent is not None:
             elapsed = now - self._sent_at

@@ -49,7 +49,7 @@ _CODING: Final = (
     (0x8F, 0x07, ControlwordCommand.SWITCH_ON),
     (0x8F, 0x0F, ControlwordCommand.ENABLE_OPERATION),
 )
-"""Mask, value under the mask, command; bits outside the mask do not matter."""
+"""Mask, value under the mask, and command; bits outside the mask are ignored."""
 
 _TRANSITIONS: Final = {
     (SWITCH_ON_DISABLED, ControlwordCommand.SHUTDOWN): READY_TO_SWITCH_ON,  # 2
@@ -68,7 +68,7 @@ _TRANSITIONS: Final = {
     (QUICK_STOP_ACTIVE, ControlwordCommand.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 12
     (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 16
 }
-"""Transitions by command; the drive performs 0, 1, 13 and 14 itself, and 15 is the fault reset."""
+"""Transitions by command. The drive performs 0, 1, 13 and 14 by itself; 15 is the fault reset."""
 
 
 def command(controlword: int) -> ControlwordCommand | None:
@@ -80,7 +80,7 @@ def command(controlword: int) -> ControlwordCommand | None:
 
 
 def commanded(state: PowerState, controlword: int, resumes: bool) -> PowerState:
-    """Return the state after `controlword`; 605Ah determines whether a quick stop `resumes` (transition 16)."""
+    """Return the state after `controlword`. 605Ah determines whether a quick stop `resumes` (transition 16)."""
     order = command(controlword)
     if order is None or (state, order, resumes) == (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION, False):
         return state

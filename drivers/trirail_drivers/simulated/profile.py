@@ -21,7 +21,7 @@ _MILLISECONDS: Final = -3
 
 
 class MakersRules:
-    """Deviations of a manufacturer from CiA 402; drives of vendors not listed here have none."""
+    """Deviations of a manufacturer from CiA 402; drives of vendors that are not listed here have none."""
 
     def __init__(self, objects: Dictionary) -> None:
         vendor = objects.internal(0x1018, 1).value
@@ -32,11 +32,11 @@ class MakersRules:
 
     @property
     def interpolates_linearly(self) -> bool:
-        """Whether mode 7 follows 60C1h:01 as CiA 402 defines.
+        """Whether mode 7 follows 60C1h:01 as defined in CiA 402.
 
-        Technosoft, iPOS CANopen Programming (P091.063), section 9.2.1, as quoted in issues 198 and 222 of
-        roboticslab-uc3m/yarp-devices: 208Eh bit 8 selects linear interpolation without a buffer; else 60C0h = 0 is PT
-        mode, which buffers points with their time in 60C1h:02, so that a position alone moves nothing.
+        Source: Technosoft, iPOS CANopen Programming (P091.063), section 9.2.1, as quoted in issues 198 and 222 of
+        roboticslab-uc3m/yarp-devices. Bit 8 of 208Eh selects linear interpolation without a buffer. Otherwise, 60C0h =
+        0 selects PT mode, which buffers points with their time in 60C1h:02, so that a position alone moves nothing.
         """
         return not self._technosoft or bool(self._auxiliary.value & LINEAR)
 
@@ -44,7 +44,7 @@ class MakersRules:
     def shows_mode_with_power_alone(self) -> bool:
         """Whether 6061h takes the value of 6060h only in OPERATION ENABLED.
 
-        Technosoft, the same manual of 2019, 6061h, as quoted in issue 215 of yarp-devices.
+        Source: Technosoft, the same manual of 2019, 6061h, as quoted in issue 215 of yarp-devices.
         """
         return self._technosoft
 
@@ -63,20 +63,20 @@ HOMING: Final = 6
 INTERPOLATED_POSITION: Final = 7
 CYCLIC_SYNCHRONOUS_POSITION: Final = 8
 _MODES: Final = (HOMING, INTERPOLATED_POSITION, CYCLIC_SYNCHRONOUS_POSITION)
-"""Modes that 6060h accepts, as far as 6502h lists them."""
+"""Modes that 6060h accepts if 6502h lists them."""
 _INTERPOLATE: Final = 1 << 4
 """Bit 4 of the controlword, as mode 7 defines it."""
 
 _STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
-"""Values of 605Ah: quick-stop ramp into SWITCH ON DISABLED, or remaining in QUICK STOP ACTIVE."""
+"""Values of 605Ah: quick-stop ramp followed by SWITCH ON DISABLED, or by staying in QUICK STOP ACTIVE."""
 _STAY_OPTIONS: Final = (5, 6, 7, 8)
-"""Values of 605Ah with which it remains in QUICK STOP ACTIVE."""
+"""Values of 605Ah with which the drive stays in QUICK STOP ACTIVE."""
 
 _WINDOW_OFF: Final = 0xFFFFFFFF
 
 
 class Profile:
-    """CiA 402 objects, with defaults for those missing: 6007h is 0, 605Ah is 2, 6065h is no window, 60B1h is 0."""
+    """CiA 402 objects, with defaults for missing ones: 6007h is 0, 605Ah is 2, 6065h is no window, 60B1h is 0."""
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics, mode_changed: Callable[[], None]) -> None:
         self._mode_changed = mode_changed
@@ -127,19 +127,21 @@ class Profile:
 
     @property
     def follows_setpoints(self) -> bool:
-        """Whether it follows setpoints, by mode and controlword; mode 7 does while bit 4 is set (CiA 402-2)."""
+        """Whether the drive follows setpoints, given its mode and controlword; mode 7 does while bit 4 is set (CiA
+        402-2).
+        """
         if self.mode.value == INTERPOLATED_POSITION:
             return bool(self.controlword.value & _INTERPOLATE) and self._makers.interpolates_linearly
         return self.mode.value == CYCLIC_SYNCHRONOUS_POSITION
 
     @property
     def setpoint(self) -> float:
-        """Setpoint of the position [counts]: 607Ah, in mode 7 60C1h."""
+        """Position setpoint [counts]: 607Ah, or 60C1h in mode 7."""
         entry = self._data_record if self.mode.value == INTERPOLATED_POSITION else self._target
         return entry.value * self.units.position
 
     def hold(self) -> None:
-        """Make the actual position the setpoint."""
+        """Set the setpoint to the actual position."""
         self._target.value = self._data_record.value = self._position.value
 
     @property
@@ -160,7 +162,7 @@ class Profile:
 
     @property
     def stays_stopped(self) -> bool:
-        """Whether it remains in QUICK STOP ACTIVE (605Ah)."""
+        """Whether the drive stays in QUICK STOP ACTIVE (605Ah)."""
         return self._quick_stop_option.value in _STAY_OPTIONS
 
     @property
@@ -171,7 +173,7 @@ class Profile:
 
     @property
     def homing(self) -> tuple[int, float, float, float, int]:
-        """Homing method, speeds towards switch and zero, acceleration, and the position at home, in counts."""
+        """Homing method, speeds towards the switch and the zero, acceleration, and the position at home, in counts."""
         fast, slow = (speed.value * self.units.velocity for speed in self._homing_speeds)
         acceleration = self._homing_acceleration.value * self.units.acceleration
         return self._homing_method.value, fast, slow, acceleration, round(self._home_offset.value * self.units.position)

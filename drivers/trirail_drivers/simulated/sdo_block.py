@@ -1,4 +1,4 @@
-"""Server side of SDO block transfers: segments without individual answers, a CRC over all (CiA 301, SDO block)."""
+"""Server side of SDO block transfers: segments without individual answers, and one CRC (CiA 301, SDO block)."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _END, _ACKNOWLEDGED, _START = 1, 2, 3
 """Subcommands, in the two lowest bits."""
 _ABORT: Final = 0x80
 CRC_WANTED: Final = 0x04
-"""Bit of a command that begins a transfer: the client (in the answer, the server) supports the CRC."""
+"""Bit of the command that begins a transfer: the client (or, in the answer, the server) supports the CRC."""
 
 
 class BlockUpload:
-    """Read by the client: the server sends blocks of segments, each acknowledged, then the CRC."""
+    """Read by the client: the server sends blocks of segments, each of which is acknowledged, and then the CRC."""
 
     def __init__(self, content: bytes, request: bytes) -> None:
         self.over = False
         self._content = content
         self._with_crc = bool(request[0] & CRC_WANTED)
         self._sent = 0
-        """Number of bytes acknowledged."""
+        """Number of acknowledged bytes."""
         self._size = request[4]
         self._check_size()
 
@@ -83,12 +83,12 @@ class BlockUpload:
 
 
 class BlockDownload:
-    """Write by the client: the server acknowledges each block of segments, then checks the CRC."""
+    """Write by the client: the server acknowledges each block of segments, and then checks the CRC."""
 
     def __init__(self, request: bytes, longest: int) -> None:
         self.over = False
         self.content = b""
-        """Data written, complete when the transfer is over."""
+        """Written data, complete when the transfer has ended."""
         self.size = MOST_SEGMENTS
         """Number of segments in a block."""
         self._with_crc = bool(request[0] & CRC_WANTED)
@@ -98,7 +98,7 @@ class BlockDownload:
         self._last = False
 
     def accepts(self, data: bytes) -> bool:
-        """Return whether a frame belongs to the transfer: until the last segment, every frame but an abort."""
+        """Return whether a frame belongs to the transfer. Until the last segment, every frame except an abort does."""
         if self._last:
             return data[0] >> 5 == _DOWNLOAD and data[0] & 0x03 == _END
         return data[0] != _ABORT

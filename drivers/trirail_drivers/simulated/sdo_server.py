@@ -1,4 +1,4 @@
-"""SDO server of a simulated device: the one of python-canopen plus the block transfers it lacks (CiA 301, SDO)."""
+"""SDO server of a simulated device: that of python-canopen plus the block transfers that it lacks (CiA 301, SDO)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _TOGGLE, _LAST = 0x10, 0x01
 
 
 class SdoServer(CanopenServer):
-    """Server of one dictionary for one client, one transfer at a time."""
+    """SDO server of one dictionary for one client; it handles one transfer at a time."""
 
     _index: Any  # canopen's server has no type hints
     _subindex: Any
@@ -54,7 +54,7 @@ class SdoServer(CanopenServer):
         self._block: BlockUpload | BlockDownload | None = None
 
     def request(self, data: bytes) -> None:
-        """Answer one frame of the client; ignore one that is not eight bytes long (CiA 301)."""
+        """Answer one frame from the client; a frame that is not eight bytes long is ignored (CiA 301)."""
         if len(data) != 8:
             return
         block = self._block
@@ -85,14 +85,15 @@ class SdoServer(CanopenServer):
         self._respond(bytes(response))
 
     def abort(self, abort_code: int = UNKNOWN_COMMAND) -> None:
-        """End the current transfer and send the reason; a segment without a transfer is an unknown command."""
+        """End the current transfer and send the reason. A segment without a transfer is an unknown command."""
         super().abort(abort_code)  # type: ignore[no-untyped-call]
         self.reset()
 
     def init_download(self, request: bytes) -> None:
         """Refuse an impossible write before its first segment, and take the length from the dictionary.
 
-        python-canopen's server refuses only after the last segment, and takes four bytes if a request gives no size.
+        python-canopen's server refuses it only after the last segment, and assumes four bytes if a request states no
+        size.
         """
         entry = self._writable(request)
         command, index, subindex, payload = _HEADER.unpack(request)
@@ -106,7 +107,10 @@ class SdoServer(CanopenServer):
         super().init_download(_HEADER.pack(command, index, subindex, payload))  # type: ignore[no-untyped-call]
 
     def init_upload(self, request: bytes) -> None:
-        """Begin an upload; answer an empty object, which python-canopen's server refuses, by a segment without data."""
+        """Begin an upload.
+
+        An empty object, which python-canopen's server refuses, is answered by a segment without data.
+        """
         self._name(request)
         content = self.get_data(self._index, self._subindex, check_readable=True)
         self._uploads = not 0 < len(content) <= 4
@@ -118,14 +122,14 @@ class SdoServer(CanopenServer):
         self._answer(0x41, bytes(4))
 
     def segmented_upload(self, command: int) -> None:
-        """Send the next segment; refuse one without a transfer."""
+        """Send the next segment; a request without a transfer is refused."""
         if not self._uploads:
             raise SdoAbortedError(UNKNOWN_COMMAND)
         super().segmented_upload(command)  # type: ignore[no-untyped-call]
         self._uploads = bool(self._buffer)
 
     def segmented_download(self, command: int, request: bytes) -> None:
-        """Accept the next segment; refuse one without a transfer, or beyond the length of its object."""
+        """Accept the next segment; it is refused without a transfer, or if it exceeds the length of the object."""
         if not self._longest:
             raise SdoAbortedError(UNKNOWN_COMMAND)
         in_turn = command & _TOGGLE == self._toggle
@@ -136,7 +140,7 @@ class SdoServer(CanopenServer):
             self._longest = 0
 
     def block_upload(self, data: bytes) -> None:
-        """Begin a block upload, which handles the next frames."""
+        """Begin a block upload, which then handles the following frames."""
         if data[0] & 0x03:
             raise SdoAbortedError(UNKNOWN_COMMAND)
         self._name(data)
@@ -145,7 +149,7 @@ class SdoServer(CanopenServer):
         self._answer(0xC2 | data[0] & CRC_WANTED, len(content).to_bytes(4, "little"))
 
     def block_download(self, data: bytes) -> None:
-        """Begin a block download, which handles the next frames."""
+        """Begin a block download, which then handles the following frames."""
         if data[0] & 0x01:
             raise SdoAbortedError(UNKNOWN_COMMAND)
         entry = self._writable(data)
@@ -155,7 +159,7 @@ class SdoServer(CanopenServer):
         self._answer(0xA0 | data[0] & CRC_WANTED, bytes([block.size]))
 
     def _name(self, request: bytes) -> None:
-        """Store the object that a request names: an abort names it too."""
+        """Store the object that a request names, because an abort names it too."""
         _, self._index, self._subindex, _ = _HEADER.unpack(request)
 
     def _writable(self, request: bytes) -> ObjectEntry:

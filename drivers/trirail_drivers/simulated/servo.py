@@ -1,4 +1,4 @@
-"""A servo axis: first-order lag behind its setpoint, within the limits of its motor."""
+"""Servo axis with a first-order lag behind its setpoint, within the limits of its motor."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from trirail_drivers import config
 from trirail_drivers.driver.ramp import brake
 
 INTACT: Final = (1.0, 1.0)
-"""Shares of the travel that a sound encoder counts, forwards and backwards."""
+"""Fractions of the travel that an intact encoder counts, forwards and backwards."""
 
 
 class Servo:
     """One axis in counts and seconds: a position loop with velocity feed-forward and a braking ramp.
 
-    Over a step, the setpoint r changes linearly from the last target to the new one, the feed-forward w from its
-    last value to the new one, and the position x obeys
+    Over a step, the setpoint r changes linearly from the previous target to the new one, the feed-forward w changes
+    linearly from its previous value to the new one, and the position x obeys
 
-        dx/dt = w + (r - x) / time_constant,
+        dx/dt = w + (r - x) / time_constant.
 
-    so that the following error e = r - x obeys de/dt = (dr/dt - w) - e / time_constant: it decays, and only
-    the error of the feed-forward drives it. Exact feed-forward has no lag, none at all lags by
-    dr/dt · time_constant; `feed_forward_gain` is the share of it that this servo uses. With
-    time_constant = 0 the servo is ideal: on the target at the end of each step. The resulting velocity is
-    then limited to one that can still brake in time, to `max_velocity` and to `max_acceleration`.
+    The following error e = r - x therefore obeys de/dt = (dr/dt - w) - e / time_constant: it decays, and only the error
+    of the feed-forward drives it. With exact feed-forward there is no lag; without feed-forward the lag is
+    dr/dt · time_constant. `feed_forward_gain` is the fraction of the feed-forward that this servo uses. With
+    time_constant = 0 the servo is ideal: it is on the target at the end of each step. The resulting velocity is then
+    limited so that the servo can still brake in time, and to `max_velocity` and `max_acceleration`.
     """
 
     def __init__(
@@ -43,21 +43,23 @@ class Servo:
         self.setpoint = position
         """Target of the last step [counts]."""
         self.limited = False
-        """Whether a limit applied in the last step."""
+        """Whether a limit was active in the last step."""
         self.forced_velocity: float | None = None
-        """Defect: velocity of the slider [counts/s] whatever its setpoint, until its brake holds it."""
+        """Defect: velocity that the slider has whatever its setpoint [counts/s], until its brake holds it."""
         self.encoder = INTACT
-        """Defect: shares of the travel that the encoder counts, forwards and backwards; (0, 0) if it is loose."""
+        """Defect: fractions of the travel that the encoder counts, forwards and backwards; (0, 0) if the encoder is
+        loose.
+        """
         self.motor = 1.0
-        """Defect: -1 if the motor turns against its encoder, as with two phases exchanged."""
+        """Defect: -1 if the motor turns against its encoder, as with two swapped phases."""
         self.travelled = 0.0
         """Travel of the motor since power-on, whatever the encoder counts [counts]."""
         self.play = 0.0
-        """Defect: backlash, the travel of a reversing motor before the slider follows [counts]."""
+        """Defect: backlash, the distance that a reversing motor travels before the slider follows [counts]."""
         self.driven = 0.0
-        """Travel of the slider since power-on: that of the motor, apart from the play [counts]."""
+        """Travel of the slider since power-on, which differs from that of the motor by the backlash [counts]."""
         self.lag: float | None = None
-        """Defect: lag behind the setpoint [s]; feed-forward has no effect then."""
+        """Defect: lag behind the setpoint [s]; feed-forward then has no effect."""
         self._feed_forward = 0.0
         self._feed_forward_gain = feed_forward_gain
         self._time_constant = time_constant
@@ -86,7 +88,7 @@ class Servo:
         return self.setpoint - self.position
 
     def hold(self) -> None:
-        """Stop here by the brake."""
+        """Stop immediately by the brake."""
         self.velocity = self._feed_forward = 0.0
         self.setpoint = self.position
         self.limited = False
@@ -114,10 +116,11 @@ class Servo:
         self.setpoint, self._feed_forward = target, feed_forward
 
     def chase(self, target: float, feed_forward: float, step: float) -> None:
-        """Move for `step` seconds towards a `target` [counts] that is constant after a jump, as is the feed-forward.
+        """Move for `step` seconds towards a `target` [counts] that has jumped and is now constant, as is the
+        feed-forward.
 
         A drive that follows each setpoint from its arrival moves like this: dx/dt = w + (r - x) / time_constant with
-        constant r and w, limited to `max_velocity` and to `max_acceleration`.
+        constant r and w, limited to `max_velocity` and `max_acceleration`.
         """
         feed_forward *= self._feed_forward_gain if self.lag is None else 0.0
         time_constant = self._time_constant if self.lag is None else self.lag
@@ -142,7 +145,7 @@ class Servo:
         self._drive(velocity * step)
 
     def brake(self, deceleration: float, step: float) -> None:
-        """Brake for `step` seconds with `deceleration` [counts/s²], at most to standstill."""
+        """Brake for `step` seconds with `deceleration` [counts/s²], or until standstill."""
         if self.forced_velocity is not None:
             self.velocity = self.forced_velocity
             self.coast(step)
@@ -151,7 +154,7 @@ class Servo:
             self.roll(deceleration, step)
 
     def roll(self, deceleration: float, step: float) -> None:
-        """Slow down like `brake`, but without power: a forced velocity has no effect."""
+        """Slow down as in `brake`, but without power: a forced velocity has no effect."""
         way, self.velocity = brake(0.0, self.velocity, deceleration, step)
         self._drive(way)
         self.setpoint, self._feed_forward = self.position, 0.0
@@ -172,20 +175,20 @@ class Servo:
         self.setpoint += by
 
     def coast(self, step: float) -> None:
-        """Keep the velocity for `step` seconds, like a drive that waits for its next setpoint."""
+        """Keep the velocity for `step` seconds, like a drive that is waiting for its next setpoint."""
         self._drive(self.velocity * step)
 
     def push(self, by: float) -> None:
-        """Turn the motor by hand, without power [counts]."""
+        """Turn the motor by hand by `by` [counts], without power."""
         self.turn(by)
         self.setpoint = self.position
 
     def _drive(self, by: float) -> None:
-        """Turn by the motor's own force [counts], against the encoder if that is its defect."""
+        """Turn by the motor's own force by `by` [counts]; the direction is reversed if that is the motor's defect."""
         self.turn(by if self.forced_velocity is not None else self.motor * by)
 
     def turn(self, by: float) -> None:
-        """Turn the motor by `by` [counts]; the encoder counts its share of the travel."""
+        """Turn the motor by `by` [counts]; the encoder counts its fraction of the travel."""
         forwards, backwards = self.encoder
         self.travelled += by
         half = abs(self.play) / 2.0

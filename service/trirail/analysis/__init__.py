@@ -1,1 +1,1 @@
-"""Recordings looked at afterwards: summaries, charts, replays."""
+"""Analysis of recordings: summaries, charts, replays."""

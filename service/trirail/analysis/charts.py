@@ -1,4 +1,4 @@
-"""Charts of a session: modes, goals, pose, sliders, following error and the loop's timing. Needs matplotlib."""
+"""Charts of a session: modes, goals, pose, sliders, following error and the loop's timing. Requires matplotlib."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DASHES = (0, (4, 3))
 MODE_COLOURS = {mode: palette.code(palette.pale(colour)) for mode, colour in palette.MODES.items()}
 OUTCOME_COLOURS = {outcome: palette.code(colour) for outcome, colour in palette.OUTCOMES.items()}
 CURVE_BINS = 1500
-"""Number of bins of a drawn curve; each keeps its least and its greatest value."""
+"""Number of bins of a drawn curve; each bin keeps its minimum and maximum."""
 PANELS = {
     "goals": 1.1,
     "x, y [mm]": 1.3,
@@ -43,26 +43,26 @@ PANELS = {
 """Panels from top to bottom, with their heights [inch]."""
 FIGURE_WIDTH_IN = 13.0
 DRAWN_LIMIT_SHARE = 0.7
-"""Share of a limit that a curve must reach for the limit to be drawn, as a distant limit would flatten the curve."""
+"""Fraction of a limit that a curve must reach for the limit to be drawn, since distant limits flatten the curve."""
 MAX_LISTED_FAULTS = 8
-"""Greatest number of faults listed below the curves."""
+"""Maximum number of faults listed below the curves."""
 LETTER_WIDTH_PT = 4.0
-"""Width of a letter of a goal's name."""
+"""Width of one letter in a goal's name [pt]."""
 RESIDUAL_PANEL = "to go [µm]"
-"""Name of the chart's panel."""
+"""Name of the panel that shows the residuals."""
 MARK_COLOURS = ("#0e7c86", "#7a4fc0", "#b7791f", "#d1495b", "#2e8b57", "#2f6fb3")
 """Colours of marks, in the order of their names."""
 MIN_RESIDUAL_UM = 1e-3
-"""Lowest value of the logarithmic scale, which also stands in for a residual of zero."""
+"""Lowest value on the logarithmic scale [µm]; it also stands for a residual of zero."""
 
 
 def draw(file: Path, recording: Recording, summary: Summary) -> None:
-    """Draw a session to a file, in the format of the file's suffix.
+    """Draw a session to a file, in the format given by the file suffix.
 
     Raises
     ------
     ValueError
-        Matplotlib does not write the format.
+        Matplotlib cannot write the format.
     OSError
         The file cannot be written.
     """
@@ -120,13 +120,13 @@ def _draw_residuals(panel: Axes, alignments: Sequence[RecordedAlignment]) -> dic
 
 
 def _fault_lines(faults: list[Incident]) -> list[str]:
-    """Return a numbered line for each fault, up to MAX_LISTED_FAULTS, and one with the number of the others."""
+    """Return a numbered line for each fault, up to MAX_LISTED_FAULTS, and one with the number of remaining faults."""
     lines = [f"{n}   {each.t:.3f} s   {each.message}" for n, each in enumerate(faults[:MAX_LISTED_FAULTS], start=1)]
     return lines + ([f"and {len(faults) - MAX_LISTED_FAULTS} more"] if len(faults) > MAX_LISTED_FAULTS else [])
 
 
 def _recorded_limits(recording: Recording) -> Limits | None:
-    """Return the limits in force, None if the recording has no configuration that this version can read."""
+    """Return the limits in force, or None if the recording has no configuration that this version can read."""
     try:
         config = provenance.configuration(recording.texts)
     except ConfigError:
@@ -142,7 +142,7 @@ def _draw_motion(
     labels: Labels,
 ) -> None:
     """Draw the motion of platform and sliders in millimetres and degrees, with the limits that it approaches."""
-    # Without power the sliders move freely, so that their distance from the setpoints means nothing.
+    # Without power, the sliders move freely, so their distance from the setpoints is meaningless.
     enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
     error = np.where(enabled, records["following_error"], np.nan)
     _draw_curves(panels["x, y [mm]"], t, records["pose"][:, :2] * 1e3, CENTRE)
@@ -198,7 +198,7 @@ def _draw_modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], 
 
 
 def _draw_goal(panel: Axes, goal: GoalSummary, y: float, begin: float, end: float) -> None:
-    """Draw a goal as a bar with its name, cut to the length of the bar."""
+    """Draw a goal as a bar with its name, which is truncated to the length of the bar."""
     ended = end if goal.ended is None else goal.ended
     colour = OUTCOME_COLOURS[goal.outcome]
     panel.add_patch(Rectangle((goal.given, y), ended - goal.given, 0.65, facecolor=colour, linewidth=0))
@@ -214,7 +214,7 @@ def _draw_goal(panel: Axes, goal: GoalSummary, y: float, begin: float, end: floa
 
 
 def _draw_curves(panel: Axes, t: NDArray[np.float64], values: NDArray[np.float64], colours: Sequence[str]) -> None:
-    """Draw the columns of (N, k) values; even the shortest excursion remains visible."""
+    """Draw the columns of (N, k) values so that even the shortest excursion remains visible."""
     for column, colour in zip(values.T, colours, strict=True):
         panel.plot(*_decimate(t, column), color=colour, linewidth=1.0)
 
@@ -244,13 +244,13 @@ def _draw_timing(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64],
 
 
 def _decimate(t: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the least and the greatest value of each bin, in their order in time."""
+    """Return the minimum and maximum of each bin, in order of time."""
     size = len(values) // CURVE_BINS
     if size < 3:
         return t, values
     length = len(values) // size * size
     rows = values[:length].reshape(-1, size)
-    # argmin and argmax return a NaN; a bin that has one is drawn as a gap.
+    # argmin and argmax return the index of a NaN; a bin that contains one is drawn as a gap.
     empty = np.isnan(rows).any(axis=1)
     filled = np.where(np.isnan(rows), 0.0, rows)
     at = np.sort(np.stack([filled.argmin(axis=1), filled.argmax(axis=1)], axis=1), axis=1)

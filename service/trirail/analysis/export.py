@@ -1,4 +1,4 @@
-"""Export of a recording as a table, with one row per cycle or per switch of an output: CSV, Parquet or numpy."""
+"""Export of a recording as a table with one row per cycle, or per switch of an output: CSV, Parquet or numpy."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ SWITCHES: Final = pa.schema(
         *((f"{kind}_{name}", pa.float64()) for kind in ("commanded", "measured") for name in ("x", "y", "phi")),
     ]
 )
-"""Columns of the table of switches; lengths in m, angles in rad, times in s."""
+"""Columns of the table of switches; lengths are in m, angles in rad, times in s."""
 
 
 def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
-    """Write the table of a recording, as CSV, Parquet or numpy by the file's suffix; return the number of rows.
+    """Write the table of a recording as CSV, Parquet or numpy, depending on the file suffix; return the number of rows.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
     path
         File to write.
     columns
-        Names of columns, as in trirail.telemetry.recording.table; all if empty.
+        Names of columns, as in trirail.telemetry.recording.table; all columns if empty.
 
     Raises
     ------
@@ -52,15 +52,16 @@ def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
 
 
 def write_switches(recording: Recording, path: Path) -> int:
-    """Write the switches of outputs on the paths of goals, one per row; return their number.
+    """Write the output switches on the paths of goals, one per row; return their number.
 
-    `path` and errors as in write. The columns are those of trirail.wire.marks.Switch, with one number in each.
+    `path` and the errors are the same as for `write`. The columns are the fields of trirail.wire.marks.Switch, split so
+    that each column contains one number.
     """
     return _write(path, lambda: pa.Table.from_pylist(switch_rows(switches(recording)), SWITCHES))
 
 
 def switches(recording: Recording) -> tuple[Switch, ...]:
-    """Return the switches of outputs on the paths of goals, in the order in which they happened."""
+    """Return the output switches on the paths of goals, in the order in which they happened."""
     events = (line.event for line in recording.events if line.event is not None)
     return tuple(sorted((switch for event in events for switch in event.marks), key=lambda switch: switch.cycle))
 
@@ -70,7 +71,7 @@ def _write(path: Path, make: Callable[[], pa.Table]) -> int:
         raise ServiceError(f"{path}: its name must end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
     rows = make()
     try:
-        # Mode x: an existing file, say another export, is never overwritten.
+        # Mode x never overwrites an existing file, such as another export.
         with path.open("xb") as file:
             _WRITERS[path.suffix](rows, file)
     except FileExistsError as error:

@@ -1,4 +1,4 @@
-"""Export of a recording as MCAP with messages of ROS 2, for Foxglove, PlotJuggler and `ros2 bag`. Needs rosbags."""
+"""Export of a recording as MCAP with ROS 2 messages, for Foxglove, PlotJuggler and `ros2 bag`. Requires rosbags."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ TOPICS = {
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/events": "std_msgs/msg/String",
 }
-"""Type of the messages of each topic."""
+"""Message type of each topic."""
 BASE, MEASURED, COMMANDED = "base", "platform_measured", "platform_commanded"
-"""Frames; the platform of the URDF is a link of its own, which joints move."""
+"""Names of frames. The platform of the URDF is a separate link, which joints move."""
 JOINTS = tuple(f"{joint}_{leg}" for joint in ("slider", "pivot", "cross") for leg in "abc")
 """Joints of the URDF: sliders, pivots and cross slides of the legs A, B, C."""
 OK, WARN, ERROR = 0, 1, 2
@@ -54,8 +54,8 @@ Message = tuple[int, str, Any]
 def write(recording: Recording, path: Path) -> int:
     """Write a recording as one MCAP file; return the number of messages.
 
-    Each has the wall-clock time of its record. Raises ServiceError where the file exists or cannot be written, or the
-    recording has no configuration.
+    Each message has the wall-clock time of its record. Raises ServiceError if the file exists or cannot be written, or
+    if the recording has no configuration.
     """
     settings = provenance.configuration(recording.texts)
     if settings is None:
@@ -81,7 +81,7 @@ def messages(recording: Recording, geometry: Geometry) -> list[Message]:
 def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return positions and velocities of all JOINTS, (N, 9) [m, rad, m/s, rad/s].
 
-    Those of the sliders are measured; the passive joints follow from them by the kinematics, at the measured pose.
+    The values of the sliders are measured. Those of the passive joints follow from the kinematics at the measured pose.
     """
     sliders, velocity, pose = records["position"] - records["backlash"], records["velocity"], records["pose"]
     J1, J2 = jacobians(geometry, pose)
@@ -95,7 +95,7 @@ def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray
 
 
 def _write_bag(folder: Path, made: list[Message]) -> int:
-    """Write messages as a bag of rosbag2, which is a folder around one file."""
+    """Write messages as a rosbag2 bag, which is a folder with one file."""
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         connections = {topic: bag.add_connection(topic, kind, typestore=STORE) for topic, kind in TOPICS.items()}
         for wall, topic, message in made:
@@ -127,7 +127,7 @@ def _motion(recording: Recording, geometry: Geometry) -> Iterator[Message]:
 
 
 def _log(recording: Recording) -> Iterator[Message]:
-    """Yield the lines of the log: events as JSON, as the service publishes them, and texts of the recorder."""
+    """Yield the log lines: events as JSON, as the service publishes them, and messages from the recorder."""
     string = STORE.types["std_msgs/msg/String"]
     for line in recording.events:
         content = line.event if line.event is not None else {"level": line.level, "message": line.text}
@@ -162,7 +162,7 @@ def _header(wall: int, frame: str) -> Any:
 
 
 def _turn(angle: float) -> Any:
-    """Return the quaternion of a turn about z."""
+    """Return the quaternion of a rotation about z."""
     return Quaternion(0.0, 0.0, float(np.sin(angle / 2.0)), float(np.cos(angle / 2.0)))
 
 

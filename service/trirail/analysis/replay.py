@@ -1,12 +1,12 @@
 """Replay of a recorded session in process, without waiting: the same control with the same inputs, cycle by cycle.
 
-The decisions of the control depend on its configuration, on the feedback of the drives at each SYNC, and on its inputs:
-goals, commands, disturbances and the planner's answers. A recording has all of these, each with its cycle, so that the
-setpoints must be the same to the last bit. The requests to the planner follow from them as well: the replay plans them
-again, and compares the result with the recorded answer.
+The decisions of the control depend on its configuration, on the feedback of the drives at each SYNC, and on its inputs,
+which are goals, commands, disturbances and the planner's answers. A recording contains all of these, each with its
+cycle, so the setpoints must be the same to the last bit. The requests to the planner follow from them as well: the
+replay plans them again, and compares the result with the recorded answer.
 
-With another configuration the recorded answers of drives and planner are no longer valid. Their place is taken by
-simulated drives, on a clock that advances by one period per cycle, and a planner that answers in the next cycle.
+With another configuration, the recorded answers from drives and planner are no longer valid. They are replaced by
+simulated drives, whose clock advances by one period per cycle, and by a planner that answers in the next cycle.
 """
 
 from __future__ import annotations
@@ -44,31 +44,31 @@ from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 from trirail.wire.vocabulary import MODES, Mode
 
 SETPOINT_FIELDS = ("commanded_position", "commanded_velocity")
-"""Fields of a record with the setpoints for the drives."""
+"""Fields of a record that contain the setpoints for the drives."""
 _FLAG_FIELDS = (("age", int), ("follows", bool), ("homed", bool))
 
 
 class Comparison(NamedTuple):
-    """Comparison of a session's setpoints with those of its replay."""
+    """Comparison of the setpoints of a session with those of its replay."""
 
     cycles: int
     """Number of compared cycles."""
     lacking: int
-    """Cycles at the end that were not compared, as the recording has a gap before them."""
+    """Number of cycles at the end that were not compared, because the recording has a gap before them."""
     requests: int
     """Number of goals, commands and disturbances."""
     plans: int
-    """Number of recorded answers of the planner; 0 if all plans are made by the replay."""
+    """Number of recorded answers from the planner; 0 if the replay makes all plans."""
     plans_differing: int
-    """Recorded answers that differ from the replay's in any bit."""
+    """Number of recorded answers that differ in any bit from those of the replay."""
     differing: int
-    """Cycles whose setpoints, mode or outputs differ in any bit."""
+    """Number of cycles whose setpoints, mode or outputs differ in any bit."""
     first: int | None
-    """First of these cycles."""
+    """Number of the first of these cycles."""
     position: Triple
-    """Greatest difference of a setpoint for each slider [m]."""
+    """Largest difference of a setpoint for each slider [m]."""
     velocity: Triple
-    """Greatest difference of the velocity feed-forward for each slider [m/s]."""
+    """Largest difference of the velocity feed-forward for each slider [m/s]."""
 
 
 def replay_session(recording: Recording, config: Config, *, simulated: bool) -> Comparison:
@@ -81,13 +81,13 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
     config
         Configuration of the control.
     simulated
-        Use simulated drives of the configuration in place of the recorded ones.
+        Whether to use simulated drives with this configuration instead of the recorded ones.
 
     Raises
     ------
     ServiceError
         The recording does not begin with a disabled robot, so its earlier state is unknown, or its rate differs from
-        the configured one.
+        the configured rate.
     """
     records, inputs = _replayable_part(recording)
     _check_recording(recording, records, config)
@@ -105,7 +105,7 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
         clock.run()
         drives.close()
     recorded = np.stack([records[name] for name in SETPOINT_FIELDS], axis=1)
-    # Compared as integers: the same bits, including the sign of a zero.
+    # Compared as integers, so that all bits must match, including the sign of a zero.
     differs = (setpoints.view(np.int64) != recorded.view(np.int64)).any(axis=(1, 2)) | (modes != records["mode"])
     differs |= (outputs != records["outputs"]).any(axis=1)
     greatest = np.abs(setpoints - recorded).max(axis=0).tolist()
@@ -130,10 +130,10 @@ def _run(
     records: NDArray[np.void],
     inputs: Sequence[ControlInput],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64]]:
-    """Return what each cycle commands.
+    """Return the commands of each cycle.
 
-    These are the setpoints, position [m] and velocity [m/s], (N, 2, 3), the modes, (N,), and the drives' output words,
-    (N, 3).
+    These are the setpoints, position [m] and velocity [m/s], (N, 2, 3), the modes, (N,), and the output words of the
+    drives, (N, 3).
     """
     clock.step()
     drives.sync()
@@ -157,14 +157,14 @@ def _run(
 def _run_cycle(
     control: Control, drives: DriveGroup, planner: _RecordedPlanner | LocalPlanner, entries: Sequence[ControlInput]
 ) -> None:
-    """Run the steps of the loop's cycle that follow its SYNC."""
+    """Run the steps of a cycle of the loop that follow its SYNC."""
     inputs = [entry for entry in entries if not isinstance(entry.given, DrivesFault)]
     decided = [entry for entry in inputs if not entry.urgent]
     if isinstance(drives, _RecordedDrives):
         for entry in entries:
             if isinstance(entry.given, DrivesFault):
                 drives.set_fault(entry.given)
-    # Inputs that arrived while the loop waited for its tick were decided separately, after the others.
+    # Inputs that arrived while the loop waited for its tick were handled separately, after the others.
     for waiting in (False, True):
         received = [entry for entry in decided if entry.waiting is waiting]
         batch: list[TimedInput] = [(entry.given, entry.now_ns) for entry in received]  # type: ignore[misc]
@@ -195,7 +195,7 @@ def _replayable_part(recording: Recording) -> tuple[NDArray[np.void], list[Contr
     first, last = int(records["cycle"][0]), int(records["cycle"][length - 1])
     known = [entry for index, entry in enumerate(inputs) if entry.seq - inputs[0].seq == index]
     if len(known) < len(inputs):
-        # The missing input may belong to any cycle after that of the last known one.
+        # The missing input may belong to any cycle after that of the last known input.
         last = max(first, min(last, known[-1].cycle))
     return records[: last - first + 1], [entry for entry in known if first <= entry.cycle <= last]
 
@@ -216,16 +216,16 @@ def _check_recording(recording: Recording, records: NDArray[np.void], config: Co
 
 
 def _has_same_plans(recording: Recording, config: Config) -> bool:
-    """Return True if a configuration has the same values as the recorded one in all that plans depend on.
+    """Return whether a configuration has the same values as the recorded one in everything on which plans depend.
 
-    A recording without a configuration counts as one with the same.
+    A recording without a configuration is assumed to have the same values.
     """
     recorded = provenance.configuration(recording.texts)
     return recorded is None or revision(recorded) == revision(config)
 
 
 class _RecordedPlanner:
-    """Planner whose answers come from the recording; it plans each request again to compare the result with them."""
+    """Planner whose answers come from the recording. It plans each request again and compares the results with them."""
 
     def __init__(self, config: Config) -> None:
         self.answers = 0
@@ -238,7 +238,7 @@ class _RecordedPlanner:
         self._planned[request.number] = self._planner.plan(request)
 
     def compare(self, entries: Sequence[ControlInput]) -> None:
-        """Count the answers among the inputs of a cycle, and those that differ from the replanned ones."""
+        """Count the answers among the inputs of a cycle, and the answers that differ from the replanned ones."""
         for entry in entries:
             if isinstance(entry.given, PlanAnswer):
                 self.answers += 1
@@ -246,7 +246,7 @@ class _RecordedPlanner:
 
 
 class _RecordedDrives:
-    """DriveGroup with the recorded feedback, which ignores setpoints and commands."""
+    """DriveGroup that returns the recorded feedback, and ignores setpoints and commands."""
 
     bus_load = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
@@ -270,22 +270,22 @@ class _RecordedDrives:
         self._unready: UnreadyDrives = (None, None, None)
 
     def set_fault(self, fault: DrivesFault) -> None:
-        """Report a fault, and the drives that are not ready, from now on."""
+        """From now on, report a fault and the drives that are not ready."""
         self._fault = DriveFault("", "recorded", 0, fault.message) if fault.message is not None else None
         a, b, c = (Unready(f"drive {name} was not ready") if name in fault.unready else None for name in NAMES)
         self._unready = a, b, c
 
     def sync(self) -> None:
-        """Advance by a cycle."""
+        """Advance by one cycle."""
         self._row += 1
 
     def read(self) -> Feedback:
-        """Return the feedback of the present cycle; before the first cycle, that of the first."""
+        """Return the feedback of the present cycle or, before the first cycle, of the first cycle."""
         return self._feedback[max(0, self._row - 1)]._replace(fault=self._fault, unready=self._unready)
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
-        """None for each drive: `read` reports the faults."""
+        """None for each drive, since `read` reports the faults."""
         return None, None, None
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
@@ -320,7 +320,7 @@ class _RecordedDrives:
 
 
 class _SimulatedClock:
-    """Clock of the simulated drives, which advances by one period per cycle, and by itself after the replay."""
+    """Clock of the simulated drives. It advances by one period per cycle, and runs by itself after the replay."""
 
     def __init__(self, period: float) -> None:
         self._now = 0.0
@@ -331,11 +331,11 @@ class _SimulatedClock:
         return self._now if self._released_at is None else self._now + time.monotonic() - self._released_at
 
     def step(self) -> None:
-        """Advance by a period."""
+        """Advance by one period."""
         self._now += self._period
 
     def run(self) -> None:
-        """Run by itself from now on: drives that close wait until they are at rest."""
+        """Run by itself from now on, since drives that are closed wait until they are at rest."""
         self._released_at = time.monotonic()
 
 

@@ -23,11 +23,11 @@ from trirail.wire.vocabulary import MODES, Mode
 ENABLED_MODES = tuple(MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING))
 """Modes in which the drives follow the setpoints."""
 UNKNOWN_LABEL = "unknown"
-"""Outcome of a goal whose end is not recorded, and other texts that are not recorded."""
+"""Text for values that are not recorded, such as the outcome of a goal whose end is not recorded."""
 
 
 class GoalSummary(msgspec.Struct, frozen=True):
-    """A goal from its acceptance by the control to its end; times are nominal, since the loop's start [s]."""
+    """Goal, from its acceptance by the control to its end. Times are nominal, since the start of the loop [s]."""
 
     id: str
     user: str
@@ -37,24 +37,24 @@ class GoalSummary(msgspec.Struct, frozen=True):
     ended: float | None
     message: str
     settle: float | None = None
-    """Time from the end of the path until the robot was in position [s]; None for a goal that did not settle."""
+    """Time from the end of the path until the robot was in position [s]; None if the goal did not settle."""
 
 
 class AlignmentSummary(msgspec.Struct, frozen=True):
-    """An alignment, a calibration of cameras, or a check."""
+    """Summary of an alignment, a camera calibration, or a check."""
 
     id: str
     """Prefix of the ids of its goals."""
     user: str
     purpose: str
     end: str
-    """Reason of its end, "unknown" if that is not recorded."""
+    """Reason why it ended; "unknown" if that is not recorded."""
     message: str
-    """Error message, for an end by an error."""
+    """Error message, if an error ended it."""
     began: float
-    """Nominal time of its first look, since the loop's start [s]."""
+    """Nominal time of the first look, since the start of the loop [s]."""
     seconds: float
-    """Time from the first look to the end."""
+    """Time from the first look to the end [s]."""
     looks: int
     corrections: int
     residuals: dict[str, list[float | None]]
@@ -62,17 +62,19 @@ class AlignmentSummary(msgspec.Struct, frozen=True):
 
 
 class Incident(msgspec.Struct, frozen=True):
-    """A fault or a warning."""
+    """Fault or warning."""
 
     t: float
-    """Nominal time since the loop's start [s]."""
+    """Nominal time since the start of the loop [s]."""
     wall: str
     level: str
     message: str
 
 
 class Tracking(msgspec.Struct, frozen=True):
-    """Following error of one slider with the drives enabled: greatest, root mean square, the latter in motion [m]."""
+    """Following error of one slider while the drives are enabled [m]: maximum, root mean square, and root mean square
+    in motion.
+    """
 
     slider: str
     max: float
@@ -85,14 +87,14 @@ class Summary(msgspec.Struct, frozen=True):
 
     name: str
     began: str
-    """Wall clock, ISO 8601, UTC."""
+    """Wall clock at the start, ISO 8601, UTC."""
     duration: float
-    """Time from the first record to the last [s]."""
+    """Time from the first to the last record [s]."""
     cycles: int
     lacking: int
-    """Cycles between the first and the last without a record."""
+    """Number of cycles without a record between the first and the last record."""
     missed: int
-    """Ticks missed by the loop."""
+    """Number of ticks that the loop missed."""
     rate_hz: int
     software: str
     labels: Labels
@@ -105,7 +107,7 @@ class Summary(msgspec.Struct, frozen=True):
     lateness_us: Percentiles
     cycle_us: Percentiles
     commands: dict[str, int]
-    """Number of times each command was given."""
+    """Number of times that each command was given."""
     goals: list[GoalSummary]
     alignments: list[AlignmentSummary]
     faults: list[Incident]
@@ -174,7 +176,7 @@ def _commands(recording: Recording) -> dict[str, int]:
 
 
 def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
-    """Yield the goals in the order of their requests; the many velocities of a jog are one goal."""
+    """Yield the goals in the order of their requests. The many velocities of a jog count as one goal."""
     ends: dict[str, Event] = {}
     for line in recording.events:
         if line.event is not None and line.event.kind == "goal" and line.event.id is not None:

@@ -1,7 +1,7 @@
-"""The mechanism as URDF, drawn without meshes, with the joints of exported recordings.
+"""Mechanism as URDF, drawn without meshes, with the joints of exported recordings.
 
-URDF has trees alone: the platform is the end of leg A, and the legs B and C end at cross slides of their own, which
-meet the platform wherever the joints have positions of one pose.
+URDF allows only trees. Therefore the platform is the end of leg A, while the legs B and C end at their own cross
+slides. These meet the platform if the positions of all joints belong to one pose.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Vector = tuple[float, float]
 
 
 def document(name: str, geometry: Geometry, limits: Limits) -> str:
-    """Return the URDF of a robot: its links, its joints and their limits [m, rad]."""
+    """Return the URDF of a robot with its links, its joints and their limits [m, rad]."""
     robot = ET.Element("robot", name=name)
     for colour, rgba in COLOURS.items():
         ET.SubElement(ET.SubElement(robot, "material", name=colour), "color", rgba=rgba)
@@ -40,7 +40,7 @@ def document(name: str, geometry: Geometry, limits: Limits) -> str:
 
 
 def _add_leg(robot: ET.Element, leg: AnyLeg, side: str, travel: Vector, velocity: float, limits: Limits) -> None:
-    """Add the three joints of a leg: slider, then pivot and cross slide in the order of its mechanism."""
+    """Add the three joints of a leg: the slider, then the pivot and the cross slide in the order of its mechanism."""
     cross = leg.crossing
     start = leg.anchor[0] + leg.home * math.cos(leg.rail_angle), leg.anchor[1] + leg.home * math.sin(leg.rail_angle)
     carriage, turned, slid = f"carriage_{side}", f"pivot_link_{side}", f"cross_link_{side}"
@@ -61,7 +61,7 @@ def _add_leg(robot: ET.Element, leg: AnyLeg, side: str, travel: Vector, velocity
     _add_link(robot, turned)
     low, high = limits.slider.passive
     _draw(_add_link(robot, slid), "box", _box(high - low, SLIDE_M, SLIDE_M), (-(low + high) / 2.0, 0.0), 0.0, side)
-    # Each leg ends at the platform's centre: only that of leg A carries the platform.
+    # Each leg ends at the platform's centre, but only leg A carries the platform.
     target = PLATFORM if side == "a" else f"centre_{side}"
     if target != PLATFORM:
         _add_link(robot, target)
@@ -81,7 +81,10 @@ def _add_joint(
     angle: float,
     limit: tuple[float, float, float] | None = None,
 ) -> None:
-    """Add a joint between two links, at a place and direction in the first; `limit` is low, high and velocity."""
+    """Add a joint between two links, at a position and direction in the first link.
+
+    `limit` contains the lower limit, the upper limit and the velocity limit.
+    """
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=links[0])
     ET.SubElement(joint, "child", link=links[1])

@@ -1,1 +1,1 @@
-"""The operator's page: a client of the service like any other, with a browser in front."""
+"""Operator's page: a client of the service like any other, with a browser as its front end."""

@@ -1,4 +1,4 @@
-"""Connections to the panel's server; idle ones block neither new connections nor the shutdown."""
+"""Connections to the panel's server. Idle connections block neither new connections nor the shutdown."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ from collections.abc import Callable
 from typing import Any
 
 MAX_REQUESTS = 32
-"""Maximum number of open connections that are not tabs (browsers hold none); a new one replaces the oldest."""
+"""Maximum number of open connections that are not tabs.
+
+Browsers hold none open; a new connection replaces the oldest.
+"""
 MAX_TABS = 16
-"""Maximum number of tabs, which are also at most half of all connections."""
+"""Maximum number of tabs, which may also use at most half of all connections."""
 DESCRIPTORS_PER_CONNECTION = 4
-"""Descriptors per connection: its own, and three of websockets."""
+"""File descriptors per connection: its own, and three for websockets."""
 RESERVED_DESCRIPTORS = 24
-"""Descriptors reserved for the rest of the process, in addition to those open at the start."""
+"""File descriptors reserved for the rest of the process, in addition to those that are open at the start."""
 ACCEPT_DELAY_S = 0.1
-"""Delay before the next attempt to accept, after the system had no descriptor or memory for a connection [s]."""
+"""Delay before the next attempt to accept after the system had no descriptor or memory for a connection [s]."""
 CLOSE_TIMEOUT_S = 1.0
 """Time limit for the end of a closed connection [s]."""
 
 
 class Connections:
-    """Acceptor of connections, each handled in its own thread.
+    """Accepts connections and handles each one in its own thread.
 
     A client that holds silent connections, or all descriptors, does not lock out others.
 
     Parameters
     ----------
     listening
-        Socket to accept on.
+        Socket on which connections are accepted.
     handle
-        Receives the socket and address of a connection, and closes the socket.
+        Function that receives the socket and address of a connection, and closes the socket.
     refusal
         Bytes sent to a refused or displaced client, if sending does not block.
     """
@@ -55,7 +58,7 @@ class Connections:
         while True:
             try:
                 connection, address = self._listening.accept()
-            except OSError:  # accept(2): no descriptor, no memory, or the client has gone
+            except OSError:  # accept(2): no descriptor, no memory, or the client has disconnected
                 if self._closed:
                     return
                 self._make_room()
@@ -94,7 +97,7 @@ class Connections:
             self._requests[connection] = None
         try:
             threading.Thread(target=self._serve, args=(connection, address), name="connection", daemon=True).start()
-        except RuntimeError:  # no more threads
+        except RuntimeError:  # no more threads can be started
             self._forget(connection)
             return False
         return True
@@ -112,7 +115,7 @@ class Connections:
             self._changed.notify_all()
 
     def _make_room(self) -> bool:
-        """Refuse the oldest connection that is not a tab, and wait for its end; return whether there was one."""
+        """Drop the oldest connection that is not a tab, and wait until it has closed; return whether there was one."""
         with self._changed:
             eldest = next(iter(self._requests), None)
             if eldest is None:

@@ -1,4 +1,4 @@
-"""Description of a robot for a tab, which draws it and labels its buttons."""
+"""Description of a robot for a tab, which uses it to draw the robot and to label its buttons."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from trirail.wire.vocabulary import Command, Role
 from trirail.workspace.part_positions import RobotParts
 
 STAGE = 0.05
-"""Maximum travel along x of a platform whose lengths are shown in micrometres, as for a stage [m]."""
+"""Maximum travel of the platform along x for which lengths are shown in micrometres, as for a stage [m]."""
 MICROMETRES: dict[str, Any] = {
     "unit": "µm",
     "scale": 1e6,
@@ -35,11 +35,11 @@ MILLIMETRES: dict[str, Any] = {
     "steps": (1e-5, 1e-4, 1e-3, 1e-2),
     "angle_steps": (1e-2, 0.1, 1.0, 1.0),
 }
-"""Unit of lengths on the page, units per metre, and decimals of lengths and degrees; jog steps [m] and [°]."""
+"""Unit of lengths on the page, units per metre, decimals of lengths and degrees, and jog steps [m] and [°]."""
 
 
 def drawn_robot(info: Info) -> DrawnRobot:
-    """Return the robot of a service's information. Raises ServiceError if the service has another version."""
+    """Return the robot described by a service. Raises ServiceError if the service has another version."""
     try:
         return DrawnRobot.from_info(info)
     except (msgspec.ValidationError, ConfigError) as error:
@@ -47,7 +47,7 @@ def drawn_robot(info: Info) -> DrawnRobot:
 
 
 def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dict[str, Any]:
-    """Return the description for a tab, ready to encode; `role` is that of the user."""
+    """Return the description for a tab, ready to be encoded; `role` is the role of the user."""
     parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {

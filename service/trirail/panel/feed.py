@@ -1,4 +1,4 @@
-"""Published data of the service, received once for all tabs: newest state, latest events, description of the robot."""
+"""Data published by the service, received once for all tabs: newest state, latest events, description of the robot."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ SILENCE_S = 1.0
 USERS_PERIOD_S = 2.0
 """Interval between queries of the connected users [s]."""
 MAX_EVENTS = 200
-"""Number of events kept for tabs that open later."""
+"""Number of events kept for tabs that are opened later."""
 MAX_LOOKS = 50
-"""Number of events of the last alignment kept."""
+"""Maximum number of kept events of the last alignment."""
 
 
 class Feed:
     """Subscription to one robot, shared by all tabs.
 
-    A tab reads data while it holds `changed`, which is notified of new data. Raises ServiceError if the service does
-    not answer.
+    A tab reads data while it holds `changed`, which is notified when there is new data. Raises ServiceError if the
+    service does not answer.
     """
 
     def __init__(self, robot: AsyncRobot, loop: LoopThread) -> None:
@@ -48,14 +48,15 @@ class Feed:
         self.changed = threading.Condition()
         self._pose: Triple | None = None
         self.messages: dict[str, bytes] = {}
-        """Messages for a tab, sent once and after each change, as JSON: robot, names of its poses, connected users.
-        The robot is first, because the page cannot draw anything without it."""
+        """Messages for a tab as JSON, sent once and after each change: robot, names of its poses, connected users. The
+        robot is first, because the page cannot draw anything without it.
+        """
         loop.call(self._fetch_robot())
         self.messages["poses"] = loop.call(self._fetch_poses())
         self.state: bytes | None = None
         """Newest state with its stamp, as JSON; None while the service is silent."""
         self.stamp = 0
-        """Arrival time of that state: milliseconds of this process's monotonic clock."""
+        """Arrival time of the newest state, in milliseconds of this process's monotonic clock."""
         self._events: deque[tuple[int, bytes]] = deque(maxlen=MAX_EVENTS)
         self._alignment_events: list[tuple[int, bytes]] = []
         """Events of the last alignment, which later events do not displace."""
@@ -74,18 +75,18 @@ class Feed:
             subscription.cancel()
 
     def events(self, after: int) -> list[tuple[int, bytes]]:
-        """Return the events numbered higher than `after`, in order of arrival, as numbers and JSON."""
+        """Return the events with numbers higher than `after` in order of arrival, each with its number and as JSON."""
         return [event for event in sorted({*self._alignment_events, *self._events}) if event[0] > after]
 
     def find_obstacle(self, goal: PoseGoal) -> Obstacle | None:
-        """Return the obstacle between the measured pose and a goal, like path_check.find_obstacle."""
+        """Return the obstacle between the measured pose and a goal, as in path_check.find_obstacle."""
         if self._pose is None:
             return Obstacle("nobody knows where the robot is", code="unknown")
         end = (goal.x, goal.y, goal.phi)
         return path_check.find_obstacle(self._robot_drawing, self._pose, end, goal.tool, goal.frame)
 
     def check_path(self, name: str, text: str, stretch: bool) -> CheckedPath:
-        """Return the result of checking a file's path."""
+        """Check the path in a file and return the result."""
         return path_check.check_path(self._robot_drawing, name, text, stretch)
 
     async def _receive_states(self) -> None:
@@ -112,7 +113,7 @@ class Feed:
     async def _describe(self) -> None:
         """Query the robot again, because a service that was silent may have restarted."""
         poses = await self._fetch_poses()
-        with contextlib.suppress(TrirailError):  # the old description remains until it answers
+        with contextlib.suppress(TrirailError):  # the old description stays in use until the service answers
             await self._fetch_robot()
             self._publish("poses", poses)
 
@@ -123,7 +124,7 @@ class Feed:
         about = msgspec.json.encode(describe(info, robot, self._robot.user, role))
         self._robot_drawing = robot
         self.recordings = info.recordings
-        """Folder of the service's recordings, on its machine."""
+        """Folder of the service's recordings on the service's machine."""
         self.permissions = permissions(role, Role(info.takeover))
         """Permissions of the panel's user."""
         self._publish("robot", about)
@@ -163,5 +164,5 @@ class Feed:
 
 
 def now() -> int:
-    """Return the time for stamps: milliseconds of the monotonic clock."""
+    """Return the present time for stamps, in milliseconds of the monotonic clock."""
     return time.monotonic_ns() // 1_000_000

@@ -1,6 +1,6 @@
-"""Messages of the page to its server: goals and contents of commands in the service's format, and the page's own.
+"""Messages from the page to its server: goals and commands in the service's format, and the page's own messages.
 
-The server sends State, Event and others, each with its kind in `tell`.
+The server sends State, Event and other messages, each with its kind in `tell`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ Content = Annotated[str, Meta(max_length=MAX_FILE)]
 
 
 class _PageMessage(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
-    """Base of the page's messages."""
+    """Base class of the page's messages."""
 
     permission: ClassVar[str | None] = None
-    """Required permission; None for none."""
+    """Permission that the message requires, or None."""
 
     @property
     def required_permission(self) -> str | None:
-        """Return the required permission."""
+        """Return the permission that the message requires."""
         return self.permission
 
 
@@ -35,20 +35,20 @@ class StateDrawn(_PageMessage, frozen=True, tag="seen"):
     """Notice that the page has drawn a state."""
 
     stamp: int
-    """Stamp of that state."""
+    """Stamp of the drawn state."""
 
 
 class JogHeld(_PageMessage, frozen=True, tag="hold"):
-    """Notice that a jog button is held down; repeated while it is."""
+    """Notice that a jog button is held down. It is repeated as long as the button is held."""
 
     permission = GOAL
 
     velocity: Coordinates
     """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
     seen: int
-    """Stamp of the newest state that the page has drawn: nobody may jog by an outdated picture."""
+    """Stamp of the newest state that the page has drawn, since nobody may jog while looking at an outdated picture."""
     tool: FrameName | None = None
-    """Tool of [frames.tool] about which it turns; the centre if None."""
+    """Tool of [frames.tool] about which the platform turns; the platform's centre if None."""
 
 
 class JogReleased(_PageMessage, frozen=True, tag="release"):
@@ -56,56 +56,56 @@ class JogReleased(_PageMessage, frozen=True, tag="release"):
 
 
 class SendCommand(_PageMessage, frozen=True, tag="command"):
-    """Request to send a command: its button was pressed or its slider moved."""
+    """The operator pressed the button or moved the slider of a command."""
 
     name: Command
     """The command."""
     content: Raw = Raw()
-    """Content of the command, forwarded as it is."""
+    """Content of the command, forwarded unchanged."""
 
     @property
     def required_permission(self) -> str:
-        """Return the permission of the command itself."""
+        """Return the permission that the command itself requires."""
         return self.name
 
 
 class TakeOver(_PageMessage, frozen=True, tag="takeover"):
-    """Request to take the lease over from its holder."""
+    """Request to take over the lease from its holder."""
 
     permission = TAKEOVER
 
 
 class SendGoal(_PageMessage, frozen=True, tag="goal"):
-    """Request to send a goal: the button of a named pose, of a typed one, or of a step was pressed."""
+    """The operator pressed the button for a named pose, a typed-in pose or a step."""
 
     permission = GOAL
 
     goal: PoseGoal | NamedGoal | MoveGoal
-    """Goal, forwarded as it is."""
+    """Goal, forwarded unchanged."""
     seen: int | None = None
     """Stamp of the newest state that the page has drawn, if the goal is relative to it."""
 
 
 class CheckPose(_PageMessage, frozen=True, tag="check"):
-    """Request to check whether a pose is reachable, without motion."""
+    """Request to check whether a pose can be reached, without moving."""
 
     goal: PoseGoal
     """Goal that would be sent."""
     number: int
-    """Number that the answer repeats."""
+    """Number that is repeated in the answer."""
 
 
 class CheckPath(_PageMessage, frozen=True, tag="check path"):
-    """Request to check whether the path in a file can be followed, without motion."""
+    """Request to check whether the path in a file can be followed, without moving."""
 
     name: str
-    """Name of the file: .json contains JSON, any other CSV."""
+    """Name of the file; .json means JSON, any other suffix CSV."""
     text: Content
     """Content of the file."""
     number: int
-    """Number that the answer repeats."""
+    """Number that is repeated in the answer."""
     stretch: bool = False
-    """Whether to slow a path that is too fast."""
+    """Whether to slow down a path that is too fast."""
 
 
 class Follow(_PageMessage, frozen=True, tag="follow"):
@@ -118,7 +118,7 @@ class Follow(_PageMessage, frozen=True, tag="follow"):
     text: Content
     """Content of the file."""
     stretch: bool = False
-    """Whether to slow a path that is too fast."""
+    """Whether to slow down a path that is too fast."""
 
 
 class Teach(_PageMessage, frozen=True, tag="teach"):
@@ -140,5 +140,5 @@ class Forget(_PageMessage, frozen=True, tag="forget"):
 
 
 ServiceRequest = SendCommand | TakeOver | SendGoal | Follow | Teach | Forget
-"""Requests to the service, except held jogs."""
+"""Requests to the service, except those of held jog buttons."""
 AnyPageMessage = StateDrawn | JogHeld | JogReleased | CheckPose | CheckPath | ServiceRequest

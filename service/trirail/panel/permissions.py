@@ -1,4 +1,4 @@
-"""Permissions of a role on the page; the page offers nothing else, and the service checks them again."""
+"""Permissions of a role on the page. The page offers nothing else, and the service checks them again."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from trirail.wire import access
 from trirail.wire.vocabulary import Command, Role
 
 GOAL, POSES, TAKEOVER = "goal", "poses", "takeover"
-"""Permissions to move, to teach poses and to take the lease over; those of commands have the commands' names."""
+"""Permissions to move, to teach poses and to take over the lease. Permissions of commands have the commands' names."""
 
 
 def permissions(role: Role | None, takeover: Role) -> frozenset[str]:
-    """Return the permissions of a role, none for None; `takeover` is the lowest role that may take the lease over."""
+    """Return the permissions of a role; None has none. `takeover` is the lowest role that may take over the lease."""
     least = {GOAL: access.GOAL_ROLE, POSES: access.POSE_ROLE, TAKEOVER: takeover} | {
         each.value: each.role for each in Command
     }

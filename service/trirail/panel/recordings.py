@@ -22,20 +22,20 @@ from trirail.telemetry.sessions import RecordedSession
 from trirail.wire.decoding import decoded, prepare
 
 MAX_SESSIONS = 100
-"""Maximum number of sessions listed, the newest ones."""
+"""Maximum number of listed sessions; the newest are listed."""
 RECORDING_NAME = re.compile(r"[\w.-]+\.rrd", re.ASCII)
-"""Names of recordings that fit into a header."""
+"""Names of recordings that can be used in a header."""
 REPORT_TIMEOUT_S = 300.0
-"""Time limit of a report, and of reading recordings for the list [s]."""
+"""Time limit for a report, and for reading recordings for the list [s]."""
 
 
 def _open_here(path: str, flags: int) -> int:
-    """Open a file without following links out of its folder and without blocking."""
+    """Open a file without blocking, and without following links out of its folder."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 class AlreadySent(Response):
-    """Response that has been sent already."""
+    """Response that has already been sent."""
 
     def serialize(self) -> bytes:
         """Return no bytes, which ends the connection."""
@@ -60,7 +60,7 @@ class Recordings:
         self._one_report = threading.Lock()
 
     def listed(self) -> dict[str, Any]:
-        """Return the folder, whether it is on this machine, and its sessions, newest first, ready to encode."""
+        """Return the folder, whether it is on this machine, and its sessions, newest first, ready to be encoded."""
         return {"folder": str(self._folder), "here": self._here, "sessions": self._sessions()[: -MAX_SESSIONS - 1 : -1]}
 
     def send_file(self, opened: ServerConnection, name: str, headers: dict[str, str]) -> Response | None:
@@ -78,14 +78,16 @@ class Recordings:
             own = {"Content-Type": "application/octet-stream", "Content-Length": str(size), "Connection": "close",
                    "Content-Disposition": f'attachment; filename="{name}"'}  # fmt: skip
             status = HTTPStatus.OK
-            with contextlib.suppress(OSError):  # the browser has gone
+            with contextlib.suppress(OSError):  # the browser has disconnected
                 opened.socket.sendall(Response(status.value, status.phrase, Headers(own | headers)).serialize())
                 if size:
                     opened.socket.sendfile(file, count=size)  # a file still being written: its current part
         return AlreadySent(status.value, status.phrase, Headers())
 
     def report(self, session: str) -> str | None:
-        """Return the output of `trirail report` for a session, from a separate process; None if it does not exist."""
+        """Return the output of `trirail report` for a session, run in a separate process; None if the session does not
+        exist.
+        """
         files = next((each.files for each in self._sessions() if each.session == session), None)
         if files is None or not all(stat.S_ISREG((self._folder / name).lstat().st_mode) for name in files):
             return None
@@ -104,7 +106,9 @@ class Recordings:
         return decoded(done.stdout, _SessionList).sessions if done.returncode == 0 else []
 
     def _run(self, *command: str) -> subprocess.CompletedProcess[bytes]:
-        """Run a `trirail` command in the folder, niced, because the page moves a robot while it reads recordings."""
+        """Run a `trirail` command in the folder at low priority, because the page moves a robot while it reads
+        recordings.
+        """
         return subprocess.run(
             ["nice", sys.executable, "-m", "trirail", *command], cwd=self._folder, capture_output=True,
             timeout=REPORT_TIMEOUT_S, check=False, env=os.environ | {"COLUMNS": "120", "NO_COLOR": "1"},

@@ -1,4 +1,7 @@
-"""Server of the panel: it serves the page's files and a WebSocket per tab on the loopback, to holders of the token."""
+"""Server of the panel.
+
+On the loopback interface, it serves the page's files and a WebSocket per tab to token holders.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +30,14 @@ from trirail.panel.tab import Tab
 from trirail.wire.sizes import MAX_FILE
 
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
-"""Accepted host names: a foreign page whose name resolves to this machine (DNS rebinding) sends another one."""
+"""Accepted host names. A foreign page whose name resolves to this machine (DNS rebinding) sends a different name."""
 
 
 def refused(token: str, path: str, hosts: Sequence[str], origins: Sequence[str]) -> str | None:
     """Return the reason for refusing a request; None if it is accepted.
 
-    `path` is the requested /TOKEN/FILE; `hosts` and `origins` are the values of all headers with these names. A
-    browser sends the origin with every request of a script: it must be the page's own.
+    `path` is the requested /TOKEN/FILE; `hosts` and `origins` contain the values of all headers with these names. A
+    browser sends the origin with every request from a script, and it must be the page's own origin.
     """
     try:
         (host,) = hosts
@@ -53,13 +56,13 @@ def refused(token: str, path: str, hosts: Sequence[str], origins: Sequence[str])
 
 LOOPBACK = "127.0.0.1"
 PORT = 9880
-"""Port of the page, if it is free and no other is requested."""
+"""Port of the page, if it is free and no other port is requested."""
 SOCKET = "socket"
 """Name of the page's WebSocket below the token."""
 MAX_MESSAGE = 3 * MAX_FILE
-"""Maximum size of a message of the page: a file to follow, as a JSON string [bytes]."""
+"""Maximum size of a message from the page, which may contain a file to follow as a JSON string [bytes]."""
 LANGUAGES = "languages.json"
-"""File with the page's languages: code, and name in the language itself."""
+"""File with the languages of the page: their codes, and their names in the languages themselves."""
 SESSIONS, RECORDING, REPORT = "sessions", "recording", "report"
 """Names of the requests for recordings."""
 REQUEST_TIMEOUT_S = 5.0
@@ -72,7 +75,7 @@ TYPES = {
     "json": "application/json",
 }
 HEADERS = {
-    # No content from other origins, no foreign frame around the page (clickjacking), and no leak of the token.
+    # No content from other origins, no frame of another page around this page (clickjacking), and no leak of the token.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -83,16 +86,16 @@ HEADERS = {
 
 
 class Panel:
-    """Page of one robot, served inside the context.
+    """Page of one robot, served while the context is active.
 
     Parameters
     ----------
     robot
         Robot to operate.
     port
-        Port on the loopback; None for 9880, or any free port if that is in use.
+        Port on the loopback interface; None for 9880, or any free port if that one is in use.
     token
-        Secret part of the address; None for a random one.
+        Secret part of the address; None for a random token.
 
     Raises
     ------
@@ -114,7 +117,7 @@ class Panel:
         self._files = dict(_files())
         self._recordings = Recordings(robot.name, self._feed.recordings)
         self.url = f"http://{LOOPBACK}:{listening.getsockname()[1]}/{self._token}/"
-        """Address to open; anyone with it can move the robot."""
+        """Address to open; anyone who has it can move the robot."""
         self._server: Server = serve(
             self._serve,
             sock=listening,
@@ -146,7 +149,7 @@ class Panel:
         Tab(opened, self._robot, self._loop, self._feed).serve()
 
     def _answer(self, opened: ServerConnection, request: Request) -> Response | None:
-        """Answer a request for a file or refuse it; None opens the WebSocket."""
+        """Answer or refuse a request for a file; None opens the WebSocket."""
         headers = request.headers
         path = request.path.partition("?")[0]
         if why := refused(self._token, path, headers.get_all("Host"), headers.get_all("Origin")):
@@ -184,7 +187,9 @@ def _response(status: HTTPStatus, body: bytes, suffix: str) -> Response:
 
 
 def _listen(port: int | None) -> socket.socket:
-    """Listen on a port of the loopback: the requested one, or the default, or any if that is taken."""
+    """Listen on a port of the loopback interface: the requested port, or else the default port, or any port if it is
+    taken.
+    """
     requested = PORT if port is None else port
     if 0 <= requested <= 65535:
         with contextlib.suppress(OSError):

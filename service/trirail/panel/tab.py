@@ -1,4 +1,4 @@
-"""Open tab of the operator's page: it handles the page's messages, and sends the data to show."""
+"""Open tab of the operator's page, which handles the page's messages and sends the data to be shown."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from trirail.wire.goals import Goal
 
 
 class NewestTask:
-    """Worker that runs only the newest submitted task; `name` is the name of its thread."""
+    """Worker that runs only the most recently submitted task; `name` is the name of its thread."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -34,7 +34,7 @@ class NewestTask:
         self._closed = False
 
     def submit(self, task: Callable[[], None]) -> None:
-        """Submit a task, which replaces one that is still waiting."""
+        """Submit a task, which replaces a task that is still waiting."""
         with self._changed:
             self._task = task
             self._changed.notify()
@@ -59,17 +59,20 @@ class NewestTask:
 
 
 MAX_STATES_IN_TRANSIT = 3
-"""Maximum number of states sent and not yet drawn: a frozen tab or a slow network gets no more, so none queue up."""
+"""Maximum number of states that have been sent and not yet drawn.
+
+A frozen tab or a slow network receives no more, so that no states queue up.
+"""
 MAX_ANSWERS = 200
-"""Maximum number of answers kept for a tab that does not read; the oldest are dropped."""
+"""Maximum number of answers kept for a tab that does not read them; the oldest are dropped."""
 
 prepare(AnyPageMessage)
 
 
 class Tab:
-    """Handler of one WebSocket; when the socket closes, the tab releases its jog and its lease.
+    """Handler of one WebSocket. When the socket closes, the tab releases its jog and its lease.
 
-    The service alone decides whether the robot moves: a message that is late or lost does not renew a jog.
+    Only the service decides whether the robot moves: a message that is late or lost does not renew a jog.
     """
 
     def __init__(self, socket: ServerConnection, robot: AsyncRobot, loop: LoopThread, feed: Feed) -> None:
@@ -89,7 +92,7 @@ class Tab:
         sender = threading.Thread(target=self._send, name="tab", daemon=True)
         sender.start()
         try:
-            with contextlib.suppress(ConnectionClosed):  # a tab that was killed, or sent too much, counts as closed
+            with contextlib.suppress(ConnectionClosed):  # a tab that was killed or has sent too much counts as closed
                 for text in self._socket:
                     self._on_message(text)
         finally:
@@ -156,7 +159,7 @@ class Tab:
             self._feed.changed.notify_all()
 
     def _send(self) -> None:
-        """Send all pending messages once, and states only as fast as the page draws them."""
+        """Send all pending messages once, and send states only as fast as the page draws them."""
         sent: dict[str, bytes] = {}
         event, stamp, silent = 0, 0, False
         feed = self._feed

@@ -1,4 +1,4 @@
-"""Requests of a tab to the service, each in its own task, so that STOP never waits."""
+"""Requests from a tab to the service. Each runs in its own task, so that STOP never waits."""
 
 from __future__ import annotations
 
@@ -21,20 +21,26 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
 
 MAX_STATE_AGE_MS = 500
-"""Maximum age of the page's newest state for a jog; if it is older, the page or its connection has stalled [ms]."""
+"""Maximum age of the newest state on the page for a jog [ms]; if older, the page or its connection has stalled."""
 MAX_PENDING = 8
-"""Maximum number of unanswered commands of a tab; commands that stop the robot have the same limit separately."""
+"""Maximum number of unanswered commands of a tab.
+
+Commands that stop the robot have a separate limit of the same size.
+"""
 
 
 class MessageSender(Protocol):
-    """Sender of messages to the page; `to` is a word of the page's languages, `name` that of its object, if any."""
+    """Function that sends messages to the page.
+
+    `to` is a word that the page translates, `name` the name of its object, if any.
+    """
 
     def __call__(self, tell: str, /, **content: Any) -> None:
         """Send a message of kind `tell`."""
 
 
 class TabRequests:
-    """Sender of one tab's requests, and holder of its lease; `send` sends the replies to the page."""
+    """Sender of one tab's requests and holder of its lease; `send` sends the replies to the page."""
 
     def __init__(self, robot: AsyncRobot, loop: LoopThread, send: MessageSender) -> None:
         self._robot = robot
@@ -47,11 +53,11 @@ class TabRequests:
     def close(self) -> None:
         """Release the lease, even if an acquisition is still in progress."""
         self._open = False
-        with contextlib.suppress(ServiceError):  # the connection is closed: the lease ends by its time-out
+        with contextlib.suppress(ServiceError):  # the connection is closed, so the lease ends when it times out
             self._loop.call(self._release())
 
     def begin(self, request: ServiceRequest) -> None:
-        """Send a request in parallel with pending ones; drop a command that is already pending."""
+        """Send a request in parallel with pending requests; drop a command that is already pending."""
         match request:
             case SendCommand(name, content):
                 send = lambda: self._command(name, bytes(content) or None)  # noqa: E731
@@ -70,7 +76,7 @@ class TabRequests:
                 self._loop.start(self._answer(lambda: self._robot.forget(name), "forget", name))
 
     async def _answer(self, send_request: Callable[[], Awaitable[object]], kind: str, name: str = "") -> None:
-        """Send a request and report its result; commands that stop the robot never wait and have their own places."""
+        """Send a request and report its result. Commands that stop the robot never wait and have a separate limit."""
         stops = isinstance(kind, Command) and kind.stops
         repeats = isinstance(kind, Command) and not stops and kind is not Command.SET_OUTPUT  # it is of one output
         if repeats and self._pending[kind]:
@@ -108,7 +114,7 @@ class TabRequests:
         return await self._robot.follow(points, stretch=request.stretch)
 
     async def _acquire(self, *, force: bool = False) -> None:
-        """Acquire the lease and hold it while this tab is open: its keep-alives end with the tab."""
+        """Acquire the lease and hold it while this tab is open; keep-alives are sent only until the tab closes."""
         if self._lease is None or self._lease.lost is not None:
             lease = self._robot.lease(force=force)
             await lease.__aenter__()
@@ -123,7 +129,7 @@ class TabRequests:
 
 
 def refusal(error: TrirailError) -> dict[str, Any]:
-    """Return an error's message, and the code and values that let the page translate it."""
+    """Return the message of an error, with the code and values that the page needs to translate it."""
     fields: dict[str, Any] = {"message": str(error)}
     if isinstance(error, RefusedError):
         fields |= {"code": error.code, "slider": error.slider, "value": error.value, "limit": error.limit}

@@ -1,1 +1,1 @@
-"""Recording and drawing: Rerun's streams, files, black boxes, and reading them."""
+"""Recording and drawing: Rerun streams, files, black boxes, and functions that read them."""

@@ -1,7 +1,8 @@
-"""The black box: the last minute in memory, written to its own file on a fault.
+"""Black box that keeps the last minute in memory, and writes it to its own file on a fault.
 
-The file is `fault-<time>.rrd`, beside the recording, with the same content: every record, the control's inputs, the
-log, the drawing, the configuration and the software. It also has the seconds after the fault, with the stop.
+The file is `fault-<time>.rrd` in the recording's folder, with the same content as the recording: every record, the
+control inputs, the log, the drawing, the configuration and the software. It also contains the seconds after the fault,
+including the stop.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ BEFORE_S = 60.0
 AFTER_S = 2.0
 """Time kept after the fault [s]."""
 MARGIN_S = 1.0
-"""Extra time kept, for batches that begin or end in between [s]."""
+"""Extra time kept, since batches may begin or end in between [s]."""
 
 MAX_MESSAGES_MB = 12.0
-"""Limit of the kept messages, with their overhead in memory [1e6 bytes]: a flood sends more in a minute."""
+"""Limit of the kept messages including their overhead in memory [1e6 bytes]; a flood would send more in a minute."""
 MESSAGE_OVERHEAD = 600
-"""Memory of a message beside its packed bytes: its closure, its tuple and its place in the queue [bytes]."""
+"""Memory that a message needs in addition to its packed bytes: closure, tuple and place in the queue [bytes]."""
 
 Fill = Callable[[Recorder], None]
 Begin = Callable[[str, str], Recorder]
@@ -41,14 +42,14 @@ Begin = Callable[[str, str], Recorder]
 
 
 class StoredInput(NamedTuple):
-    """Input to repeat to the recorder of a black box."""
+    """Input that can be repeated to the recorder of a black box."""
 
     order: int
     t: float
     """Time of its arrival [s]."""
     fill: Fill
     lasting: str = ""
-    """Name of a state that holds until its next update; empty for an event."""
+    """Name of a state that is valid until its next update; empty for an event."""
     size: int = 0
     """Size that counts towards SAID_MB [bytes]."""
 
@@ -59,11 +60,11 @@ class BlackBox:
     Parameters
     ----------
     rate_hz
-        Rate of the loop.
+        Rate of the control loop.
     begin
-        Returns the recorder of a black box, given its name and reason.
+        Function that returns the recorder of a black box, given its name and reason.
     warn
-        Receives a report of each problem with a file.
+        Function that receives a report of each problem with a file.
     """
 
     def __init__(self, rate_hz: int, begin: Begin, warn: Callable[[EventText], None]) -> None:
@@ -81,7 +82,7 @@ class BlackBox:
         self._writing: list[threading.Thread] = []
 
     def records(self, batch: bytes) -> None:
-        """Store packed records; write the file when those after a fault have arrived."""
+        """Store packed records; write the file once the records after a fault have arrived."""
         self._t = last_cycle(batch) / self._rate_hz
         self._records.append(StoredInput(next(self._order), self._t, methodcaller("records", batch)))
         oldest = self._t - BEFORE_S - AFTER_S - MARGIN_S
@@ -93,17 +94,17 @@ class BlackBox:
             self._write(self._faults.popleft())
 
     def event(self, event: Event) -> None:
-        """Store an event, and after a fault prepare its file."""
+        """Store an event; if it is a fault, prepare its file."""
         self._keep_packed(EventReport(event))
         if event.kind == "fault":
             self._faults.append(event)
 
     def control_input(self, item: ControlInput) -> None:
-        """Store an input of the control."""
+        """Store an input of the control loop."""
         self._keep_packed(item)
 
     def latch(self, name: str, *values: object) -> None:
-        """Store a state that holds until its next update, by the name of the recorder's method."""
+        """Store a state that is valid until its next update, by the name of the recorder's method."""
         self._keep(methodcaller(name, *values), lasting=name)
 
     def close(self) -> None:
@@ -126,7 +127,7 @@ class BlackBox:
             self._forget()
 
     def _forget(self) -> None:
-        """Drop the oldest message, except for a state that still holds."""
+        """Drop the oldest message, unless it is a state that is still valid."""
         old = self._messages.popleft()
         self._message_bytes -= old.size
         if old.lasting:
@@ -141,7 +142,7 @@ class BlackBox:
             )
             self._warn(coded(words, EventCode.BLACK_BOX_SHORT, until=self._dropped_at))
         fills = [*self._latched.values(), *(kept.fill for kept in heapq.merge(self._records, self._messages))]
-        # In a thread: it takes a second or two, during which the recording continues.
+        # Runs in a thread, since it takes a second or two during which the recording must continue.
         thread = threading.Thread(target=self._fill, args=(fault, fills), name="black box")
         self._writing = [writing for writing in self._writing if writing.is_alive()] + [thread]
         thread.start()

@@ -1,4 +1,4 @@
-"""Layout of the viewer: the robot large with mode and events below it, the curves beside it; or several robots."""
+"""Layout of the viewer: the robot with mode and events below it, and the curves beside it; or several robots."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trirail.workspace.part_positions import Points
 WINDOW = 8.0
 """Time span of the plots [s]."""
 MARGIN = 0.09
-"""Margin around the robot, as a share of its size."""
+"""Margin around the robot, as a fraction of its size."""
 
 
 class RobotView(NamedTuple):
@@ -24,9 +24,9 @@ class RobotView(NamedTuple):
 
     robot: DrawnRobot
     bounds: Points
-    """Bounds of its parts, (2, 2): lowest and highest x and y [m]."""
+    """Bounds of the robot's parts, (2, 2): lowest and highest x and y [m]."""
     root: str = ""
-    """Entity above all of its entities; empty for the root of the recording."""
+    """Entity above all entities of the robot; empty for the root of the recording."""
 
 
 def layout(shown: RobotView) -> rrb.Blueprint:
@@ -53,7 +53,10 @@ def layout(shown: RobotView) -> rrb.Blueprint:
 
 
 def side_by_side(several: Sequence[RobotView]) -> rrb.Blueprint:
-    """Return the layout for several robots, a column each, by the wall clock, since each loop has its own `t`."""
+    """Return the layout for several robots, with one column each.
+
+    The plots use the wall clock, because each loop has its own `t`.
+    """
     window = rrb.TimeAxis(view_range=_last(WINDOW))
     columns = [
         rrb.Vertical(
@@ -97,7 +100,7 @@ def _situation(shown: RobotView, window: rrb.TimeAxis, timeline: str) -> list[rr
 
 
 def _states(shown: RobotView, window: rrb.TimeAxis) -> rrb.StateTimelineView:
-    """Return the view of the mode, and of the outputs and inputs of a robot that has some."""
+    """Return the view of the mode and, if the robot has any, of its outputs and inputs."""
     if not shown.robot.digital:
         return rrb.StateTimelineView(name="Mode", origin=f"{shown.root}/mode", time_view=window)
     return rrb.StateTimelineView(

@@ -16,15 +16,15 @@ from trirail.wire.event_codes import EventCode, EventText, coded
 
 
 class CandumpLog:
-    """Log of one bus's frames.
+    """Log of the frames on one bus.
 
-    It leaves RESERVE bytes of the disk free, and continues when there is space again. It recreates a deleted file,
+    The log leaves RESERVE bytes of the disk free, and continues when there is space again. It recreates a deleted file,
     and reports that to `warn`.
     """
 
     def __init__(self, path: Path, channel: str, warn: Callable[[EventText], None] = lambda _: None) -> None:
         self.lost = 0
-        """Batches that are not in the file."""
+        """Number of batches that are not in the file."""
         self.trouble = ""
         """Reason why the last batch is not in the file; empty if it is."""
         self._path = path
@@ -38,7 +38,7 @@ class CandumpLog:
         self.lost += bool(self.trouble)
 
     def _append(self, batch: bytes) -> str:
-        """Append a batch completely or not at all; return the reason of a failure, else ""."""
+        """Append a batch completely or not at all; return the reason for a failure, or ""."""
         if identity(self._path) != self._identity:
             try:
                 self._recreate()
@@ -58,7 +58,7 @@ class CandumpLog:
             reason = os.strerror(errno.ENOSPC)
         except OSError as error:
             reason = error.strerror or str(error)
-        with contextlib.suppress(OSError):  # half a line would spoil the next one
+        with contextlib.suppress(OSError):  # a partial line would corrupt the next one
             self._file.truncate(self._size)
             self._file.seek(self._size)
         return f"{self._path} cannot be written: {reason}"
@@ -81,7 +81,9 @@ class CandumpLog:
 
 
 def _format_frame(frame: bytes) -> str:
-    """Format a `struct can_frame` as candump: 3 digits of an 11-bit identifier, 8 of others and of error frames."""
+    """Format a `struct can_frame` as candump does: 3 digits for an 11-bit identifier, 8 for others and for error
+    frames.
+    """
     identifier, length, data = CAN_FRAME.unpack(frame)
     if identifier & ERROR:
         name = f"{identifier & (ERROR | EXTENDED_BITS):08X}"

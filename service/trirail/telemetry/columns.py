@@ -1,4 +1,4 @@
-"""Conversion of arrays to Rerun's columns, many entities per call: a fraction of the cost of Rerun's call for each."""
+"""Conversion of arrays to Rerun columns, with many entities per call, which costs far less than a call per entity."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rerun.chunk import Chunk
 
 SECOND = 1_000_000_000  # [ns]
 RECORD, FIELDS = "/record", rr.ComponentDescriptor("fields")
-"""Entity path and component of each cycle's whole record in a recording."""
+"""Entity path and component of the complete record of each cycle in a recording."""
 
 
 class Column(NamedTuple):
-    """Values of one component of one entity: a list for each time."""
+    """Values of one component of one entity; there is a list for each time."""
 
     path: str
     kind: rr.ComponentDescriptor
@@ -25,14 +25,14 @@ class Column(NamedTuple):
 
 
 class Timelines:
-    """Timelines of all data: `t`, nominal, since the loop's start, and `wall`, the wall clock."""
+    """Timelines of all data: `t`, the nominal time since the start of the loop, and `wall`, the wall clock."""
 
     def __init__(self, rate_hz: int, wall_offset_ns: int) -> None:
         self._rate_hz = rate_hz
         self._wall_offset_ns = wall_offset_ns
 
     def for_records(self, records: NDArray[np.void]) -> dict[str, pa.Array]:
-        """Return the times of records. Steps of `t` are exact if the period is a whole number of nanoseconds."""
+        """Return the times of records. The steps of `t` are exact if the period is a whole number of nanoseconds."""
         t = records["cycle"] * SECOND // self._rate_hz
         return times(t, records["deadline_ns"] + self._wall_offset_ns)
 
@@ -46,7 +46,7 @@ def times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> dict[str, pa.Array]:
 
 
 def chunks(times: dict[str, pa.Array], columns: Iterable[Column]) -> list[Chunk]:
-    """Return columns that share their times as chunks: one for each entity."""
+    """Return columns that share their times as chunks, one for each entity."""
     arrays = list(times.values())
     fields = [pa.field(name, array.type) for name, array in times.items()]
     for path, kind, values in columns:
@@ -60,23 +60,23 @@ def chunks(times: dict[str, pa.Array], columns: Iterable[Column]) -> list[Chunk]
 
 
 def scalars(values: NDArray[np.float64]) -> pa.ListArray:
-    """Return (N, k) as N rows of k numbers."""
+    """Convert an array (N, k) to N rows of k numbers."""
     return _lists(pa.array(_flat(values)), values.shape[1])
 
 
 def vectors(values: NDArray[np.float64]) -> pa.ListArray:
-    """Return (N, k, d) as N rows of k vectors in single precision."""
+    """Convert an array (N, k, d) to N rows of k vectors in single precision."""
     return _lists(_vectors(values), values.shape[1])
 
 
 def strips(values: NDArray[np.float64]) -> pa.ListArray:
-    """Return (N, m, k, d) as N rows of m lines, each through k points in single precision."""
+    """Convert an array (N, m, k, d) to N rows of m lines, each through k points, in single precision."""
     points = _vectors(values)
     return _lists(_lines(points, np.arange(0, len(points) + 1, values.shape[2])), values.shape[1])
 
 
 def ragged(rows: Sequence[Sequence[NDArray[np.float64]]]) -> pa.ListArray:
-    """Return rows of any number of lines, each through any number of points, (k, 2), in single precision."""
+    """Convert rows with any number of lines, each through any number of points (k, 2), to single precision."""
     lines = [line for row in rows for line in row]
     points = _vectors(np.concatenate([np.empty((0, 2)), *lines]))
     ends = np.cumsum([0, *map(len, rows)], dtype=np.int32)
@@ -94,7 +94,7 @@ def layout(kind: np.dtype[Any]) -> pa.StructType:
 
 
 def structs(records: NDArray[np.void]) -> pa.ListArray:
-    """Return records as rows of one struct each, with the same fields."""
+    """Return records as rows that each contain one struct with the same fields."""
     names = records.dtype.names or ()
     fields = []
     for values in (records[name] for name in names):

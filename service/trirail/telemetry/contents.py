@@ -1,6 +1,6 @@
 """Contents of a recording: robot, time, users, goals and faults, counted by the recorder or read from the recording.
 
-They are stored as JSON in a file beside the recording, so that sessions are found without reading recordings.
+They are stored as JSON in a file next to the recording, so that sessions can be found without reading recordings.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, Con
 
 _PART = re.compile(r"-part\d+(-\d+)?$")
 STAMP = "%Y%m%d-%H%M%S"
-"""Format of the local time in the names of recordings: that of their begin; for a black box, that of its fault."""
+"""Format of the local time in the names of recordings, which is the start time or, for a black box, the time of its
+fault.
+"""
 
 
 class FaultEntry(msgspec.Struct):
@@ -35,7 +37,7 @@ class FaultEntry(msgspec.Struct):
 
     @property
     def code(self) -> str:
-        """Cause and code, as "emcy 0x8700"."""
+        """Cause and code, such as "emcy 0x8700"."""
         return f"{self.fault.cause} 0x{self.fault.code:04X}"
 
 
@@ -46,37 +48,37 @@ class Contents(msgspec.Struct):
     """Name of the file."""
     robot: str
     began: float | None = None
-    """Time of its first record [s since 1970]; None where there is none."""
+    """Time of the first record [s since 1970]; None if there is none."""
     ended: float | None = None
-    """Time of its last record."""
+    """Time of the last record [s since 1970]."""
     cycles: int = 0
     users: set[str] = msgspec.field(default_factory=set)
-    """Users that sent goals or commands."""
+    """Users who sent goals or commands."""
     goals: dict[str, dict[str, int]] = msgspec.field(default_factory=dict)
     """Number of goals by user and outcome."""
     faults: list[FaultEntry] = msgspec.field(default_factory=list)
     reason: str | None = None
-    """Fault for which a black box was kept."""
+    """Fault for which a black box was saved."""
     trouble: str | None = None
     """Reason why the file could not be read."""
     running: bool = False
-    """Whether the file is still being written, and these are the contents until now."""
+    """Whether the file is still being written, so that these contents are not final."""
     version: Literal[1] = 1
-    """Version of this record; those of other versions are not read."""
+    """Version of this format; other versions are not read."""
 
     @property
     def session(self) -> str:
-        """Name of the session: that of its first file, without suffix."""
+        """Name of the session, which is the name of its first file without suffix."""
         return _PART.sub("", self.name.removesuffix(".rrd"))
 
     def add_cycles(self, began: float, ended: float, count: int) -> None:
-        """Count cycles, with the times of the first and the last of them [s since 1970]."""
+        """Count cycles, given the times of the first and last of them [s since 1970]."""
         self.began = began if self.began is None else self.began
         self.ended = ended
         self.cycles += count
 
     def event(self, event: Event) -> None:
-        """Count an event's goal or fault."""
+        """Count the goal or fault in an event."""
         if event.outcome is not None:
             ended = self.goals.setdefault(event.user or "", {})
             ended[event.outcome] = ended.get(event.outcome, 0) + 1
@@ -84,7 +86,7 @@ class Contents(msgspec.Struct):
             self.faults.append(FaultEntry(event.time, event.fault or FaultDetail(""), event.message))
 
     def control_input(self, item: ControlInput) -> None:
-        """Add the user of an input of the control."""
+        """Add the user who sent an input of the control loop."""
         match item.given:
             case GoalRequest(user=user) | CheckRequest(user=user) | CommandRequest(user=user) if user:
                 self.users.add(user)
@@ -96,13 +98,13 @@ prepare(Contents)
 
 
 def save(recording: Path, contents: Contents) -> None:
-    """Save the contents of a recording beside it, with the recording's permissions. Raises OSError."""
+    """Save the contents of a recording next to it, with the recording's permissions. Raises OSError."""
     mode = stat.S_IMODE(recording.stat().st_mode)
     files.replace(sidecar(recording), msgspec.json.encode(contents), mode)
 
 
 def load(recording: Path) -> Contents | None:
-    """Return the contents saved beside a recording; None where they are missing, damaged or of another version."""
+    """Return the contents saved next to a recording; None if they are missing, damaged or of another version."""
     try:
         contents = decoded(sidecar(recording).read_bytes(), Contents)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError):
@@ -112,8 +114,8 @@ def load(recording: Path) -> Contents | None:
 
 
 def read_contents(path: Path) -> Contents:
-    """Read the contents of a recording; for an unreadable one, return the reason in `trouble`."""
-    from trirail.telemetry import provenance  # imports Rerun, which takes most of the start-up time
+    """Read the contents of a recording; if it is unreadable, `trouble` contains the reason."""
+    from trirail.telemetry import provenance  # this imports Rerun, which takes most of the start-up time
     from trirail.telemetry.reading import read
 
     contents = Contents(path.name, "")
@@ -139,12 +141,12 @@ def read_contents(path: Path) -> Contents:
 
 
 def _reason(contents: Contents) -> str | None:
-    """Return the message of the fault whose time is in the name of a black box, else of the last fault."""
+    """Return the message of the fault whose time is in the name of a black box; otherwise of the last fault."""
     for entry in (entry for entry in contents.faults if box_name(entry.time) in contents.name):
         return entry.message
     return contents.faults[-1].message if contents.faults else None
 
 
 def box_name(fault_time: float) -> str:
-    """Return the name of the black box of a fault at a time [s since 1970], without suffix."""
+    """Return the name, without suffix, of the black box for a fault at a time [s since 1970]."""
     return f"{BLACK_BOX}{datetime.fromtimestamp(fault_time).astimezone():{STAMP}}"

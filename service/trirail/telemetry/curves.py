@@ -1,4 +1,4 @@
-"""Plotted curves, in millimetres, degrees and microseconds, and the limits drawn beside them."""
+"""Plotted curves, in millimetres, degrees and microseconds, and the limits drawn with them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CENTRE, PHI, SINGULARITY = "/pose/centre", "/pose/phi", "/pose/singularity"
 TIMING = "/loop/timing"
 
 DRAWN_FROM = 0.7
-"""Share of a limit from which it is drawn: a distant limit would flatten the curves."""
+"""Fraction of a limit that a curve must reach for the limit to be drawn: a distant limit would flatten the curves."""
 
 
 class Curve(NamedTuple):
@@ -44,7 +44,7 @@ class Lines(NamedTuple):
     moving: tuple[Curve, ...]
     still: tuple[Limit, ...] = ()
     drawn_from: float = 0.0
-    """Share of a limit from which it is drawn; 0 for always."""
+    """Fraction of a limit that a curve must reach for the limit to be drawn; 0 to draw it always."""
 
 
 def plots(robot: DrawnRobot) -> dict[str, Lines]:
@@ -65,7 +65,7 @@ def plots(robot: DrawnRobot) -> dict[str, Lines]:
 
 
 def timing(rate_hz: int, bus_load: float) -> Lines:
-    """Return the lines of the loop's timing; `bus_load`, 1 for a full bus, is shown as the time of its frames."""
+    """Return the lines of the loop's timing. `bus_load` (1 is a full bus) is shown as the time that its frames take."""
     period = 1e6 / rate_hz
     return Lines(
         (Curve("cycle", palette.CYCLE), Curve("lateness", palette.LATENESS)),
@@ -81,7 +81,7 @@ def values(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the values of the moving lines, (N, lines), for N groups of records that begin at `starts`.
 
-    `newest` are the last records of the groups, `distance` their distances to a singularity [rad].
+    `newest` contains the last record of each group, `distance` the distance of that record to a singularity [rad].
     """
     error = records["following_error"]
     highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
@@ -99,7 +99,7 @@ def values(
 
 
 def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64]:
-    """Return the values of a plot, (N, k), with columns of its limits to their right."""
+    """Return the values of a plot, (N, k), followed by columns with its limits."""
     rows, count = moving.shape
     limits = np.array([limit.value for limit in lines.still])
     table = np.empty((rows, count + len(limits)))
@@ -110,7 +110,7 @@ def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64
 
 
 def _window(x: Range, y: Range) -> tuple[Limit, ...]:
-    """Return the limits of the platform's centre, once where x and y have the same."""
+    """Return the limits of the platform's centre, only once if they are the same for x and y."""
     if x == y:
         return Limit("min", x[0] * 1e3), Limit("max", x[1] * 1e3)
     ends = zip(("x min", "x max", "y min", "y max"), (*x, *y), strict=True)
@@ -122,7 +122,7 @@ def _either_way(limits: Sequence[float], scale: float) -> NDArray[np.float64]:
 
 
 def _sliders(names: Labels, ends: NDArray[np.float64]) -> Lines:
-    """Return the lines of the sliders with their limits, (3, 2), once where all have the same."""
+    """Return the lines of the sliders with their limits, (3, 2), only once if all sliders have the same limits."""
     lines = tuple(Curve(leg, colour) for leg, colour in zip(names, palette.SLIDERS, strict=True))
     alike = bool((ends == ends[0]).all())
     named = [("", ends[0])] if alike else [(f"{leg} ", own) for leg, own in zip(names, ends, strict=True)]

@@ -1,4 +1,4 @@
-"""Data of a robot for its drawing: from its configuration, or from its service."""
+"""Data needed to draw a robot, from its configuration or from its service."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from trirail.wire.state import Info
 prepare(GeometryTable)
 
 DIGITAL = "/signals"
-"""Entity above those of outputs and inputs: views list lanes by name, and the mode first."""
+"""Parent entity of outputs and inputs: views sort lanes by name, and the mode must come first."""
 
 
 class DigitalSignal(NamedTuple):
-    """A digital output or input, and where a cycle's record has it."""
+    """Digital output or input, and its place in the record of a cycle."""
 
     kind: Literal["output", "input"]
     name: str
     axis: int
     mask: int
-    """Its bit in the word of its drive."""
+    """Bit of the signal in the word of its drive."""
 
     @property
     def path(self) -> str:
-        """Entity of its values."""
+        """Entity path of the signal's values."""
         return f"{DIGITAL}/{self.kind}s/{self.name}"
 
     def values(self, records: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Return its value in each record, (N,)."""
+        """Return the value of the signal in each record, (N,)."""
         on: NDArray[np.bool_] = records[f"{self.kind}s"][:, self.axis] & self.mask != 0
         return on
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnRobot:
-    """Data of a robot for its drawing."""
+    """Data needed to draw a robot."""
 
     name: str
     geometry: Geometry
@@ -52,7 +52,7 @@ class DrawnRobot:
     rate_hz: int
     frames: FramesTable
     digital: tuple[DigitalSignal, ...] = ()
-    """Outputs, then inputs."""
+    """Digital outputs, followed by digital inputs."""
 
     @classmethod
     def from_config(cls, settings: Config) -> DrawnRobot:
@@ -70,7 +70,10 @@ class DrawnRobot:
 
     @classmethod
     def from_info(cls, info: Info) -> DrawnRobot:
-        """Return the robot of a service. Raises msgspec.ValidationError or ConfigError if its version differs."""
+        """Return the robot of a service.
+
+        Raises msgspec.ValidationError or ConfigError if the service has another version.
+        """
         each = [_leg(leg) for leg in info.geometry]
         legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)
         limits, frames = converted(info.limits, Limits), converted(info.frames, FramesTable)

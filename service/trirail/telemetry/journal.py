@@ -1,4 +1,4 @@
-"""Logs in a recording, beside the records: the inputs of the control, and the events of the service.
+"""Logs in a recording, in addition to the records: the control inputs, and the events of the service.
 
 Each line has a text for people, and the message itself as JSON for programs.
 """
@@ -34,36 +34,36 @@ from trirail.wire.plan_packets import NotPlanned, PathExtension, PreemptingMotio
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
 JSON, WORDS = rr.ComponentDescriptor("json"), rr.ComponentDescriptor("words")
-"""Components beside the line that a viewer shows: the message itself, and the line without its time."""
+"""Components next to the line that a viewer shows: the message itself, and the line without its time."""
 LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
 class Entry(NamedTuple):
-    """Line to write to a log."""
+    """Line to be written to a log."""
 
     log: str
     """EVENTS or REQUESTS."""
     t: float
-    """Nominal time since the loop's start [s]."""
+    """Nominal time since the start of the loop [s]."""
     wall: float
     """Wall clock [s since 1970]."""
     text: str
     level: Level = "info"
     message: Event | ControlInput | None = None
-    """The message itself; None for a line of the recorder."""
+    """The message itself; None for a line from the recorder."""
 
 
 class Line(NamedTuple):
-    """Line read from a log: an event of the service, or a message of the recorder."""
+    """Line read from a log: an event of the service, or a message from the recorder."""
 
     t: float
-    """Nominal time since the loop's start [s]."""
+    """Nominal time since the start of the loop [s]."""
     wall: np.datetime64
     level: str
     """INFO, WARN or ERROR."""
     text: str
     event: Event | None = None
-    """The event itself; None for a message of the recorder."""
+    """The event itself; None for a message from the recorder."""
 
 
 def event_entry(event: Event) -> Entry:
@@ -72,7 +72,7 @@ def event_entry(event: Event) -> Entry:
 
 
 def input_entry(item: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
-    """Return the entry of an input of the control, at the nominal time of its cycle."""
+    """Return the entry of a control input, at the nominal time of its cycle."""
     wall = (item.now_ns + wall_offset_ns) / SECOND
     return Entry(REQUESTS, item.cycle / rate_hz, wall, _input_text(item), message=item)
 
@@ -86,7 +86,7 @@ def chunks(entries: Sequence[Entry]) -> list[Chunk]:
 def _chunk(log: str, entries: Sequence[Entry]) -> Chunk:
     messages = [[_encoded(entry.message)] if entry.message else [] for entry in entries]
     parts = [
-        # The viewer's own column of times is too narrow for them, and cannot be made wider.
+        # The viewer's own time column is too narrow for these times, and cannot be widened.
         Column(log, TEXT, pa.array([[f"{entry.t:9.3f} s   {entry.text}"] for entry in entries])),
         Column(log, WORDS, pa.array([[entry.text] for entry in entries])),
         Column(log, LEVEL, pa.array([[LEVELS[entry.level]] for entry in entries])),

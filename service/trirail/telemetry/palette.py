@@ -1,11 +1,11 @@
-"""Colours of the views: one for each object, wherever it appears."""
+"""Colours of the views; each object has the same colour wherever it appears."""
 
 from __future__ import annotations
 
 from trirail.wire.vocabulary import Mode
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
-"""Red, green, blue and, where translucent, opacity: 0 to 255."""
+"""Red, green, blue and, if translucent, opacity; each is 0 to 255."""
 
 SLIDERS: tuple[Colour, Colour, Colour] = ((242, 108, 79), (52, 190, 145), (82, 148, 255))
 """Colours of the sliders A, B and C."""
@@ -45,7 +45,7 @@ MODES: dict[Mode, Colour] = {
     Mode.STOPPING: (196, 104, 44),
     Mode.FAULT: (200, 56, 56),
 }
-"""Colour of each mode: unchanged in the live view, pale on paper, as rich's style in terminals."""
+"""Colour of each mode: used unchanged in the live view, paler on paper, and as a rich style in terminals."""
 
 
 OUTCOMES: dict[str, Colour] = {
@@ -58,7 +58,7 @@ OUTCOMES: dict[str, Colour] = {
     "unsettled": (168, 60, 160),
     "unknown": (123, 135, 148),
 }
-"""Colour of each outcome of goals, on paper and in terminals; "unknown" is one that was not recorded."""
+"""Colour of each goal outcome, on paper and in terminals; "unknown" stands for an outcome that was not recorded."""
 
 
 def pale(colour: Colour) -> Colour:
@@ -68,7 +68,7 @@ def pale(colour: Colour) -> Colour:
 
 
 def code(colour: Colour) -> str:
-    """Return the colour as #rrggbb, which matplotlib and rich take."""
+    """Return the colour as #rrggbb, which matplotlib and rich accept."""
     red, green, blue = colour[:3]
     return f"#{red:02x}{green:02x}{blue:02x}"
 

@@ -1,4 +1,4 @@
-"""Provenance of a recording: the configuration, as a file that can be run again, and the software."""
+"""Provenance of a recording: the configuration, as a file that can be used again, and the software."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Software(msgspec.Struct, frozen=True):
 
     trirail: str
     source: str
-    """Fingerprint of the packages' source files: it distinguishes versions without a number."""
+    """Fingerprint of the packages' source files; it distinguishes versions that have no number."""
     machine: str
     versions: dict[str, str]
 
@@ -50,7 +50,7 @@ def software() -> Software:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the libraries that matter, by name."""
+    """Return the versions of Python and of the relevant libraries, by name."""
     return {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
 
 
@@ -61,13 +61,13 @@ def text_documents(config: Config) -> dict[str, str]:
 
 
 def configuration(documents: Mapping[str, str]) -> Config | None:
-    """Return the configuration in a recording's texts; None where there is none. Raises ConfigError."""
+    """Return the configuration in a recording's texts; None if there is none. Raises ConfigError."""
     text = documents.get(CONFIGURATION)
     return parse(text) if text is not None else None
 
 
 def labels(documents: Mapping[str, str]) -> Labels:
-    """Return the labels of the sliders in a recording's texts; their letters where there are none."""
+    """Return the labels of the sliders in a recording's texts, or the letters of the sliders if there are none."""
     try:
         config = configuration(documents)
     except ConfigError:
@@ -76,7 +76,7 @@ def labels(documents: Mapping[str, str]) -> Labels:
 
 
 def recorded_by(documents: Mapping[str, str]) -> Software | None:
-    """Return the software in a recording's texts; None where it is missing or cannot be decoded."""
+    """Return the software in a recording's texts; None if it is missing or cannot be decoded."""
     try:
         return decoded(documents.get(SOFTWARE, ""), Software)
     except msgspec.DecodeError:
@@ -84,13 +84,13 @@ def recorded_by(documents: Mapping[str, str]) -> Software | None:
 
 
 def toml(config: Config) -> str:
-    """Write a configuration as TOML: all of it, defaults included; parse(toml(config)) == config."""
+    """Format a complete configuration as TOML, including defaults, so that parse(toml(config)) == config."""
     tables = msgspec.to_builtins(config)
     return "\n".join(toml_lines(tables, tables, "")).lstrip() + "\n"
 
 
 def toml_lines(tables: Tables, other: Tables, base: str, path: str = "") -> Iterator[str]:
-    """Yield tables as lines of TOML; comments mark values that differ in `other`, named `base`."""
+    """Yield tables as lines of TOML. Comments mark values that differ from `other`, whose name is `base`."""
     inner = {key: value for key, value in tables.items() if _is_tables(value)}
     plain = {key: value for key, value in tables.items() if key not in inner}
     if path and (plain or not inner):
@@ -119,7 +119,7 @@ def _is_tables(value: object) -> bool:
 
 
 def _literal(value: object) -> str:
-    """Format a value as TOML, whose strings, numbers, booleans and arrays are written as in JSON."""
+    """Format a value as TOML, which writes strings, numbers, booleans and arrays as JSON does."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -43,9 +43,9 @@ _MAGIC = b"RRF2"
 _FILE_HEADER = 12
 """Size of magic number, version and options [bytes]."""
 _MESSAGE_HEADER = struct.Struct("<QQ")
-"""Kind of a message, and the number of bytes that follow."""
+"""Kind of a message, and the number of bytes that follow it."""
 _END = 0
-"""Kind of the last message of a closed file; only a table of contents follows."""
+"""Kind of the last message of a closed file; only a table of contents follows it."""
 
 _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
@@ -55,11 +55,11 @@ prepare(Event)
 BY_CYCLE = "cycle"
 """Field by which records are sorted."""
 _LAYOUT = layout(DTYPE)
-"""Fields of the records, as Arrow types of a file."""
+"""Fields of the records, as Arrow types in a file."""
 
 
 class OlderRecordingWarning(UserWarning):
-    """Warning that a recording is older than some fields of its records."""
+    """Warning that a recording is older than some fields of the records."""
 
 
 def read(path: str | os.PathLike[str]) -> Recording:
@@ -108,7 +108,7 @@ def read(path: str | os.PathLike[str]) -> Recording:
 
 
 def join(parts: Sequence[Recording]) -> Recording:
-    """Join the parts of a session, given in any order. Raises ServiceError if they are of different sessions."""
+    """Join the parts of a session, given in any order. Raises ServiceError if they belong to different sessions."""
     first, *others = sorted(parts, key=lambda part: int(part.records["cycle"][0]))
     for other in others:
         if (other.name, other.texts) != (first.name, first.texts):
@@ -132,7 +132,7 @@ def join(parts: Sequence[Recording]) -> Recording:
 def _without_partial_message(path: Path, *, growing: bool = False) -> Iterator[Path]:
     """Yield the file itself or, if its last message was cut off, a copy without that message.
 
-    Rerun reads nothing of a file with a partial message. For a `growing` file, always yield a copy.
+    Rerun cannot read a file that contains a partial message. For a `growing` file, a copy is always yielded.
     """
     try:
         size, length = path.stat().st_size, _complete_length(path)
@@ -153,7 +153,7 @@ def _without_partial_message(path: Path, *, growing: bool = False) -> Iterator[P
 
 
 def _complete_length(path: Path) -> int:
-    """Return the length of a file up to its last complete message [bytes]; all of a closed file."""
+    """Return the length of a file up to its last complete message [bytes]; for a closed file, its whole length."""
     with files.open_regular(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise ServiceError(f"{path}: not a recording: an RRD file begins with {_MAGIC.decode()}")
@@ -170,10 +170,10 @@ def _complete_length(path: Path) -> int:
 
 
 def _chunks(whole: Path, path: Path) -> list[Chunk]:
-    """Return the chunks of the records and of the logs, and the static ones."""
+    """Return the chunks of the records and of the logs, and the static chunks."""
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)  # it was cut off
+            warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)  # the file was cut off
             reader = RrdReader(whole)
         if not reader.recordings():
             raise ServiceError(f"{path}: holds no recording")
@@ -185,9 +185,9 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
 def _cycles(
     batches: Sequence[pa.RecordBatch], path: Path
 ) -> tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.datetime64]]:
-    """Return records by rising cycle, with their times by `_times`.
+    """Return records in order of cycle, with their times from `_times`.
 
-    Raises ServiceError, and warns of missing fields, as documented at `read`.
+    Raises ServiceError, and warns of missing fields, as documented for `read`.
     """
     if not any(batch.num_rows for batch in batches):
         raise ServiceError(f"{path}: holds no records of cycles (entity {RECORD}): was it made by trirail?")
@@ -195,7 +195,7 @@ def _cycles(
     for kind in {part.type for part in parts}:
         _check_layout(kind, path)
     records, end = np.zeros(sum(map(len, parts)), DTYPE), 0
-    for part in parts:  # one batch at a time stays in the processor's cache while its fields are copied
+    for part in parts:  # a single batch stays in the processor's cache while its fields are copied
         end += len(part)
         _place(part, records[end - len(part) : end])
     t, wall = _times(batches)
@@ -206,7 +206,10 @@ def _cycles(
 
 
 def _check_layout(kind: pa.StructType, path: Path) -> None:
-    """Warn of fields that records of this kind lack. Raises ServiceError for unknown fields, or no cycle number."""
+    """Warn of fields that records of this kind lack.
+
+    Raises ServiceError for unknown fields, or without a cycle number.
+    """
     if odd := set(kind) - set(_LAYOUT):
         names = ", ".join(sorted({field.name for field in odd}))
         raise ServiceError(f"{path}: written by another version: its records differ in {names}")
@@ -236,7 +239,7 @@ def _place(part: pa.StructArray, records: NDArray[np.void]) -> None:
 
 
 def _times(batches: Sequence[pa.RecordBatch]) -> tuple[NDArray[np.float64], NDArray[np.datetime64]]:
-    """Return the times of rows: nominal, since the loop's start [s], and by the wall clock, UTC [ns]."""
+    """Return the times of rows: nominal time since the start of the loop [s], and wall clock in UTC [ns]."""
     t, wall = (
         np.concatenate([np.from_dlpack(batch.column(timeline).view(pa.int64())) for batch in batches])
         for timeline in ("t", "wall")
@@ -280,7 +283,7 @@ def _decoded(row: str, decode: Callable[[str], T], path: Path, what: str) -> T:
 
 
 def _static(chunks: list[Chunk], component: str) -> dict[str, str]:
-    """Return the texts of a component that hold for the whole session, by entity path."""
+    """Return the texts of a component that are valid for the whole session, by entity path."""
     return {
         chunk.entity_path: batch.column(component).flatten()[0].as_py()
         for chunk in chunks

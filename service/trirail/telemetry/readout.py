@@ -1,4 +1,4 @@
-"""Readout beside the drawing: mode and fault in words, pose, goal, override, sliders."""
+"""Readout beside the drawing, with mode, fault, pose, goal, override and sliders as text."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _TABLE_RULE = f"|---|{'--:|' * 3}---|{'--:|' * 3}"
 
 
 class ReadoutState(NamedTuple):
-    """State in the readout that is not in the records; it holds until its next update."""
+    """State in the readout that is not in the records; it is valid until its next update."""
 
     goal: str | None = None
     """Id of the current goal."""
     target: Sequence[float] | None = None
-    """Pose that the goal leads to: x, y [m], phi [rad]; None for no goal or a jog."""
+    """Pose to which the goal leads: x, y [m], phi [rad]; None if there is no goal or it is a jog."""
     override: float = 1.0
     """Speed override, 0 to 2."""
     fault: str | None = None
-    """Reason of the robot's fault."""
+    """Reason for the robot's fault."""
 
 
 def markdown(record: np.void, state: ReadoutState, names: Labels = NAMES) -> str:
-    """Return the readout at a record, of wire.records.DTYPE, in millimetres, degrees and micrometres."""
+    """Return the readout for a record of wire.records.DTYPE as Markdown, in millimetres, degrees and micrometres."""
     head = f"**{MODES[record['mode']].upper()}**   override {state.override:.0%}"
     if state.goal is not None:
         share, left = float(record["progress"]), float(record["remaining"])

@@ -1,8 +1,8 @@
-"""Format of the control's inputs in recordings: JSON with unchanged names and order of fields.
+"""Format of the control inputs in recordings: JSON with unchanged names and order of fields.
 
-Between the processes an announcement is one record with a notice, and an answer of the planner holds the reply to the
-goal. The format of recordings is older: it has a record for each kind of notice, and the reply's fields among those of
-the answer. It is kept, so that files of any age can be read, and older programs can read new ones.
+Between the processes, an announcement is one record with a notice, and an answer from the planner contains the reply to
+the goal. The format of recordings is older: it has one record for each kind of notice, and stores the fields of the
+reply among those of the answer. It is kept so that files of any age can be read, and older programs can read new files.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class _RecordedNotice(NamedTuple):
 
     kind: str
     fields: dict[str, str]
-    """Recorded name of each field, by its name in the notice."""
+    """Recorded name of each field, keyed by its name in the notice."""
     constants: dict[str, str]
-    """Values of the fields that are not recorded, because the kind determines them."""
+    """Values of fields that are not recorded because the kind determines them."""
 
 
 _CODED = {"message": "message", "event_code": "event_code", "params": "params"}
@@ -47,10 +47,10 @@ _PLANS = {
     "Planned": ("number", "version", "first", "run", "duration", "slowed", "stops_first", "stop", "bound", "lag"),
     "Extended": ("number", "version", "s", "path", "slowed"),
 }
-"""Recorded fields of the planner's answers, with those of their reply among them."""
+"""Recorded fields of the planner's answers, including the fields of their reply."""
 _OLDEST = ("id", "duration", "slowed", "stops_first", "queued", "lag", "accepted")
 _LATER = tuple(name for name in GoalReply.__struct_fields__ if name not in _OLDEST)
-"""Later fields of a reply, which are recorded where they differ from the reply below."""
+"""Fields that were added to a reply later; they are recorded only if they differ from the reply below."""
 _PLAIN_REPLY = GoalReply("", None)
 _Line = dict[str, Any]
 prepare(_Line, ControlInput, AlignmentLook)
@@ -64,7 +64,7 @@ def encode_input(what: ControlInput) -> str:
         entry = _recorded_plan(what.given)
     elif isinstance(what.given, GoalRequest):
         entry = msgspec.to_builtins(what.given)
-        for name in ("marks", "stop_at"):  # fields of later goals: older programs refuse what they do not know
+        for name in ("marks", "stop_at"):  # fields of later goals: older programs refuse fields that they do not know
             if not entry["goal"].get(name, True):
                 del entry["goal"][name]
     else:
@@ -73,7 +73,7 @@ def encode_input(what: ControlInput) -> str:
 
 
 def decode_input(text: str) -> ControlInput:
-    """Return an input that is JSON. Raises msgspec.DecodeError."""
+    """Return an input, given as JSON. Raises msgspec.DecodeError."""
     line = decoded(text, _Line)
     entry = line.get("given")
     if isinstance(entry, dict) and entry.get("type") in _NOTICES:
@@ -90,7 +90,7 @@ def _recorded_notice(notice: Notice) -> _Line:
 
 
 def _recorded_plan(plan: PreemptingMotion | PathExtension) -> _Line:
-    """Return the recorded fields of an answer of the planner."""
+    """Return the recorded fields of an answer from the planner."""
     fields = msgspec.to_builtins(plan)
     fields |= fields.pop("reply")
     later = [name for name in _LATER if getattr(plan.reply, name) != getattr(_PLAIN_REPLY, name)]
@@ -100,7 +100,7 @@ def _recorded_plan(plan: PreemptingMotion | PathExtension) -> _Line:
 
 
 def _announcement(entry: _Line) -> _Line:
-    """Return the fields of the announcement that was recorded."""
+    """Return the fields of the recorded announcement."""
     kind, fields, constants = _NOTICES[entry["type"]]
     notice: _Line = {"kind": kind} | constants
     notice |= {field: entry[recorded] for field, recorded in fields.items() if recorded in entry}
@@ -111,7 +111,7 @@ def _announcement(entry: _Line) -> _Line:
 
 
 def _plan(entry: _Line) -> _Line:
-    """Return the fields of the planner's answer that was recorded."""
+    """Return the fields of the recorded answer from the planner."""
     reply = {name: entry.pop(name) for name in GoalReply.__struct_fields__ if name in entry}
     unrecorded = {"id": "", "duration": None, "queued": entry["type"] == "Extended"}
     return entry | {"reply": unrecorded | reply}

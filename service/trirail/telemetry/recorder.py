@@ -1,4 +1,4 @@
-"""The recorder: it writes records, events and frames to the file and to the live view."""
+"""Recorder that writes records, events and frames to the file and to the live view."""
 
 from __future__ import annotations
 
@@ -30,20 +30,23 @@ from trirail.wire.packets import ControlInput
 from trirail.wire.records import SIZE, last_cycle, unpack
 
 RECORDS_HZ = 5
-"""Least number of batches of whole records a second to the file."""
+"""Minimum number of batches of complete records per second written to the file."""
 DRAWING_HZ = 1
-"""Batches of drawings a second to the file: fewer take less space, and records suffice to draw them again."""
+"""Number of batches of drawings per second written to the file.
+
+A low rate saves space, and the records are sufficient to draw them again.
+"""
 CHECKS_HZ = 1
-"""Checks a second of files, folder, log and live view."""
+"""Number of checks per second of files, folder, log and live view."""
 TIDY_EVERY = 10.0
-"""Interval of checking the folder, and of writing the newest file's sidecar [s]."""
+"""Interval between checks of the folder, and between writes of the newest file's sidecar [s]."""
 MB = 1e6
 
 
 class Recorder:
-    """Writer of one recording.
+    """Writes one recording.
 
-    With telemetry.capture_can, it also writes all CAN frames to a .log file beside the first.
+    With telemetry.capture_can, it also writes all CAN frames to a .log file next to the first file.
 
     Parameters
     ----------
@@ -56,11 +59,11 @@ class Recorder:
     name, reason
         Name and reason of a black box, which has one file and may fill the disk.
     sidecars
-        Whether to write the contents of each file beside it, for `trirail sessions`.
+        Whether to write the contents of each file next to it, for `trirail sessions`.
     live
         Whether to serve the live view.
     warn
-        Receives reports of missing data; if it is None, they are in the log only.
+        Function that receives reports of missing data; if it is None, they are only in the log.
     wall_ns, monotonic_ns
         Clocks [ns].
 
@@ -117,7 +120,7 @@ class Recorder:
         streams.attach(self._files, DRAWING_HZ)
         self._live: Relay | None = None
         self.live_url = ""
-        """Address for viewers; empty without a live view."""
+        """Address for viewers; empty if there is no live view."""
         if server:
             self._live = live_relay(streams.open(server))
             streams.attach(self._live, LIVE_HZ)
@@ -131,9 +134,9 @@ class Recorder:
         self._next_entry = 0.0
         self._tidy_error = ""
         self._reported_trouble = ""
-        """Reported loss, as in `unrecorded`; empty for none."""
+        """Loss that was reported, as in `unrecorded`; empty if there is none."""
         self._recovered_at = 0.0
-        """Time at which the end of the loss may be reported [s]."""
+        """Time from which the end of the loss may be reported [s]."""
 
     @property
     def path(self) -> Path:
@@ -147,12 +150,12 @@ class Recorder:
 
     @property
     def cause(self) -> str:
-        """Reason of the newest lost batch; empty if none is lost."""
+        """Reason why the most recently lost batch was lost; empty if none was lost."""
         return self._files.cause or self._frames_cause
 
     @property
     def unrecorded(self) -> tuple[str, str]:
-        """Data that currently reaches no file, and the reason; both empty while everything is written."""
+        """Data that currently does not reach any file, and the reason; both are empty while everything is written."""
         if self._files.trouble:
             return "nothing is recorded", self._files.trouble
         if self._frames and self._frames.trouble:
@@ -166,7 +169,7 @@ class Recorder:
 
     @property
     def missing(self) -> tuple[int, int, int]:
-        """Number of batches missing in the file and in the live view, and of cycles that this recorder missed."""
+        """Numbers of batches missing in the file and in the live view, and of cycles that this recorder missed."""
         return self.lost, self.skipped, self._missed_cycles
 
     def records(self, batch: bytes) -> None:
@@ -186,7 +189,7 @@ class Recorder:
             self._contents.add_cycles(began, ended, len(rows))
 
     def save(self) -> None:
-        """Write all records and log lines received until now, so that they outlive this process."""
+        """Write all records and log lines received so far, so that they survive the end of this process."""
         self._records.flush()
         self._streams.save()
 
@@ -197,17 +200,17 @@ class Recorder:
             self._contents.event(event)
 
     def control_input(self, item: ControlInput) -> None:
-        """Write an input of the control."""
+        """Write an input of the control loop."""
         self._streams.control_input(item)
         if self._contents is not None:
             self._contents.control_input(item)
 
     def update_state(self, standing: ReadoutState) -> None:
-        """Set the state of the readout, which holds from now on."""
+        """Set the state that the readout shows from now on."""
         self._streams.update_state(standing)
 
     def bus_load(self, share: float) -> None:
-        """Set the load of the bus, 1 for a full bus."""
+        """Set the bus load; 1 is a full bus."""
         self._streams.bus_load(share)
 
     def frames(self, batch: bytes) -> None:
@@ -217,7 +220,10 @@ class Recorder:
             self._frames_cause = self._frames.trouble or self._frames_cause
 
     def close(self) -> None:
-        """Write the rest and complete the file; wait at most a few seconds for a stuck disk or viewer."""
+        """Write the remaining data and finish the file.
+
+        If the disk or a viewer is not responding, this waits for at most a few seconds.
+        """
         self._flush()
         if words := self._missing_text():
             self._streams.log("warning", words)
@@ -230,7 +236,7 @@ class Recorder:
             self._live.close()
 
     def _open(self, path: Path) -> rr.RecordingStream:
-        """Begin a file with everything needed to view it alone."""
+        """Begin a file that contains everything needed to view it on its own."""
         self._write_sidecar()
         self._contents = Contents(path.name, self._config.robot.name, reason=self._reason)
         stream = self._streams.open(rr.FileSink(path))
@@ -240,7 +246,7 @@ class Recorder:
         return stream
 
     def _write_sidecar(self, *, running: bool = False) -> None:
-        """Write the contents of the newest file beside it: final, or with `running` those until now."""
+        """Write the contents of the newest file next to it; with `running`, they are not final."""
         if not self._sidecars or self._contents is None:
             return
         self._contents.running = running
@@ -267,7 +273,7 @@ class Recorder:
         t = self._streams.t
         if not self._is_black_box:
             self._rotate()
-        if self._live:  # without a viewer it shares the file's drawings, which costs nothing
+        if self._live:  # without a viewer, it shares the drawings of the file, which costs nothing
             self._streams.attach(self._live, LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ)
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
@@ -282,9 +288,10 @@ class Recorder:
             self._warn(coded(words, EventCode.RECORDING_INCOMPLETE, lost=lost, skipped=skipped, absent=absent))
 
     def _report_trouble(self, t: float) -> bool:
-        """Report the begin and the end of a loss once each; return whether a loss is being reported.
+        """Report the beginning and the end of a loss once each; return whether a loss is being reported.
 
-        The end is reported after REPORT_EVERY without a loss, because a full disk may have space intermittently.
+        The end is reported after REPORT_EVERY seconds without a loss, because a full disk may have space
+        intermittently.
         """
         problem, why = self.unrecorded
         if problem:
@@ -299,7 +306,7 @@ class Recorder:
         return bool(self._reported_trouble)
 
     def _rotate(self) -> None:
-        """Continue in another file if it is due, but not on a full disk, which has no space for it."""
+        """Continue in another file if it is due, unless the disk is full and has no space for another file."""
         telemetry, volumes = self._config.telemetry, self._files
         full = volumes.age >= telemetry.rotate_minutes * 60.0 or volumes.size >= telemetry.rotate_mb * MB
         if full and not volumes.trouble:
@@ -320,7 +327,7 @@ class Recorder:
                 self._warn(coded(words, EventCode.RECORDINGS_KEPT, error=str(error)))
 
     def _missing_text(self) -> str:
-        """Return a text about missing data if there is more than last reported, else ""."""
+        """Return a message about missing data if there is more than last reported, otherwise ""."""
         if self.missing == self._reported:
             return ""
         self._reported = self.missing
@@ -332,14 +339,17 @@ class Recorder:
 
 
 def _remedy(error: OSError) -> str:
-    """Return the next step after a file could not be created."""
+    """Return what to do after a file could not be created."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "free some space on that disk; telemetry.keep_mb limits the size of all recordings"
     return "set telemetry.directory to a folder that can be written"
 
 
 def _overwrite(path: Path) -> Path:
-    """Create an empty file, or empty it. Raises FileError if it is not regular: a FIFO would wait for a reader."""
+    """Create an empty file, or empty an existing one.
+
+    Raises FileError if the file is not regular, since a FIFO would wait for a reader.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         files.check(path)

@@ -1,4 +1,4 @@
-"""A recording in numpy, and selections of it: a time span, a goal, fewer rows, some columns, and those as a table."""
+"""Recording in numpy, and selections of it: a time span, a goal, fewer rows, some columns, and tables of these."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 FIELD_NAMES = DTYPE.names or ()
 TIMES = ("t", "wall")
-"""Columns beside the fields: nominal time since the loop's start [s], and wall clock (UTC)."""
+"""Columns in addition to the fields: nominal time since the start of the loop [s], and wall clock (UTC)."""
 _COORDINATES = ("x", "y", "phi")
 _SLIDERS = tuple(name.lower() for name in NAMES)
 _ROUNDING = 1e-6
-"""Tolerance of the time between two rows, so that 10 ms are ten cycles of a millisecond."""
+"""Tolerance for the time between two rows, so that 10 ms are ten cycles of one millisecond."""
 
 
 class RecordedAlignment(NamedTuple):
-    """Looks of one alignment, calibration or check, as its client reported them."""
+    """Looks of one alignment, calibration or check, as reported by its client."""
 
     id: str
     """Prefix of the ids of its goals."""
@@ -41,13 +41,13 @@ class RecordedAlignment(NamedTuple):
     purpose: str
     """One of alignment, calibration and check."""
     t: tuple[float, ...]
-    """Nominal times at which its looks were reported, since the loop's start [s]."""
+    """Nominal times at which the looks were reported, since the start of the loop [s]."""
     looks: tuple[AlignmentLook, ...]
     """Looks in order. The last has the end; if an error or a calibration ended it, it is not one of the cameras."""
 
     @property
     def end(self) -> str:
-        """Reason of its end; unknown where none was reported."""
+        """Reason why it ended; unknown if no end was reported."""
         return self.looks[-1].end or "unknown"
 
     @property
@@ -69,22 +69,24 @@ class Recording(NamedTuple):
     """Content of a recording."""
 
     name: str
-    """Name of the robot and time of the begin; empty if the file has none."""
+    """Name of the robot and start time; empty if the file contains none."""
     records: NDArray[np.void]
-    """Records of all cycles, (N,), of wire.records.DTYPE, by rising `cycle`, without those that missed the file."""
+    """Records of all cycles, (N,), of wire.records.DTYPE, in order of `cycle`, without those that did not reach the
+    file.
+    """
     t: NDArray[np.float64]
-    """Nominal times of the records since the loop's start, (N,) [s]."""
+    """Nominal times of the records since the start of the loop, (N,) [s]."""
     wall: NDArray[np.datetime64]
     """Wall-clock times of the records, (N,), UTC [ns]."""
     events: list[Line]
     """Lines of the log, in order."""
     texts: dict[str, str]
-    """Text documents that hold for the whole session, by entity path: /configuration, /software."""
+    """Text documents that are valid for the whole session, by entity path: /configuration, /software."""
     requests: tuple[ControlInput, ...] = ()
-    """Inputs of the control, in order: goals and commands, each with the cycle that took it, and disturbances."""
+    """Control inputs in order: goals and commands, each with the cycle that handled it, and disturbances."""
 
     def __repr__(self) -> str:
-        """Return name, duration and numbers of cycles and events in one line."""
+        """Return the name, the duration, and the numbers of cycles and events in one line."""
         duration = float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
         name = self.name or "unnamed"
         return f"<Recording {name}: {duration:.1f} s, {len(self.records)} cycles, {len(self.events)} events>"
@@ -104,9 +106,9 @@ class Recording(NamedTuple):
         begin, end
             First and last time `t` [s].
         goal
-            Id of a goal: its cycles alone.
+            Id of a goal; only its cycles are returned.
         every
-            Interval of the rows [s]: the first row of each, not a mean.
+            Interval of the rows [s]. The first row of each interval is returned, not a mean.
 
         Returns
         -------
@@ -147,16 +149,16 @@ class Recording(NamedTuple):
 
     @property
     def alignments(self) -> list[RecordedAlignment]:
-        """Alignments, calibrations of cameras and checks that clients reported, in order, with every look."""
+        """Alignments, camera calibrations and checks that clients reported, in order, with every look."""
         return _alignments(self.events)
 
     def table(self, every: float | str | None = None, columns: Sequence[str] = ()) -> pd.DataFrame:
-        """Return the records as a DataFrame of pandas, indexed by `t` [s], in SI units and radians.
+        """Return the records as a pandas DataFrame, indexed by `t` [s], in SI units and radians.
 
         Parameters
         ----------
         every
-            Interval of the rows, in seconds or as a text such as "10ms"; None for all rows.
+            Interval of the rows, in seconds or as text such as "10ms"; None for all rows.
         columns
             Names of fields, or words in names, such as pose or error; all fields if empty. Columns of poses end in
             _x, _y, _phi, those of sliders in _a, _b, _c.
@@ -164,7 +166,7 @@ class Recording(NamedTuple):
         Raises
         ------
         ServiceError
-            Unknown column, or pandas is not installed.
+            A column is unknown, or pandas is not installed.
         """
         try:
             import pandas as pd
@@ -183,11 +185,11 @@ class Recording(NamedTuple):
 
 
 def table(recording: Recording, columns: Sequence[str] = ()) -> pa.Table:
-    """Return the records as a table: t [s], wall (UTC), mode by its name, then the fields of wire.records.FIELDS.
+    """Return the records as a table: t [s], wall (UTC), the name of the mode, then the fields of wire.records.FIELDS.
 
-    SI units and radians. Columns of sliders end in _a, _b, _c, of poses in _x, _y, _phi, of the parts of a cycle in
-    their names. `columns` selects fields after t, each by its name, or by a word in several names, such as error or
-    commanded. Raises ServiceError for an unknown column.
+    The table uses SI units and radians. Columns of sliders end in _a, _b, _c, those of poses in _x, _y, _phi, and those
+    of the parts of a cycle in their names. `columns` selects the fields after t, each by its name or by a word in
+    several names, such as error or commanded. Raises ServiceError for an unknown column.
     """
     fields = chosen(columns)
     table_columns: dict[str, pa.Array] = {"t": pa.array(recording.t)}
@@ -200,7 +202,10 @@ def table(recording: Recording, columns: Sequence[str] = ()) -> pa.Table:
 
 
 def chosen(columns: Sequence[str]) -> tuple[str, ...]:
-    """Return the requested fields, each once, or all without a request. Raises ServiceError for an unknown word."""
+    """Return the requested fields without duplicates, or all fields if none are requested.
+
+    Raises ServiceError for an unknown word.
+    """
     everything = ("wall", "mode", *(name for name in FIELD_NAMES if name != "mode"))
     fields: list[str] = []
     for column in columns:
@@ -216,7 +221,7 @@ def chosen(columns: Sequence[str]) -> tuple[str, ...]:
 
 
 def _columns(name: str, values: NDArray[np.void]) -> Iterator[tuple[str, pa.Array]]:
-    """Yield a field's columns with their names."""
+    """Yield the columns of a field with their names."""
     if name == "mode":
         yield name, pa.DictionaryArray.from_arrays(pa.array(values), pa.array([str(mode) for mode in MODES]))
     elif values.ndim == 1:
@@ -228,7 +233,7 @@ def _columns(name: str, values: NDArray[np.void]) -> Iterator[tuple[str, pa.Arra
 
 
 def _goal(recording: Recording, goal: str) -> tuple[int, float]:
-    """Return the cycle that took a goal, and the time of its end [s]; infinite where that is not recorded."""
+    """Return the cycle that accepted a goal, and its end time [s], which is infinite if it is not recorded."""
     taken_at = {
         item.given.id: item.cycle for item in reversed(recording.requests) if isinstance(item.given, GoalRequest)
     }

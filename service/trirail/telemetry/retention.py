@@ -1,7 +1,7 @@
-"""Retention of recordings: deletion of the oldest when all together take too much space.
+"""Retention of recordings: the oldest are deleted when all recordings together take too much space.
 
-No file time decides here: a machine without a battery clock dates files years off until it has the network's time.
-A file that is being written is locked, and the dates and numbers in the names give the order of files.
+File times are not used, because a machine without a battery-backed clock dates files years off until it has the network
+time. A file that is being written is locked, and the dates and numbers in the names determine the order of the files.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from typing import NamedTuple
 BLACK_BOX = "fault-"
 """Prefix of the names of black boxes."""
 _NAME = re.compile(r"(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-part(?P<part>\d+))?(-(?P<again>\d+))?\.rrd")
-"""Names given by the recorder. Files with other names belong to users, and are never deleted."""
+"""Pattern of names given by the recorder. Files with other names belong to users, and are never deleted."""
 
 
 def sidecar(recording: Path) -> Path:
-    """Return the file with the contents of a recording: demo-20260131-120000.rrd.json."""
+    """Return the path of the file with a recording's contents, such as demo-20260131-120000.rrd.json."""
     return recording.with_name(f"{recording.name}.json")
 
 
@@ -29,22 +29,25 @@ class _StoredRecording(NamedTuple):
     path: Path
     size: int
     order: tuple[bool, bool, str, str, int, int]
-    """Sorting key: older recordings first, by date, part and number in the name, those of the running session last."""
+    """Sort key that puts older recordings first, by date, part and number in the name, and the running session last."""
 
     @property
     def files(self) -> list[Path]:
-        """The recording, and the files beside it: the log of CAN frames, and the sidecar."""
+        """The recording and the files that belong to it: the log of CAN frames, and the sidecar."""
         beside = (self.path, self.path.with_suffix(".log"), sidecar(self.path))
         return [path for path in beside if path.exists()]
 
 
 def lock(path: Path) -> int:
-    """Lock a file as being written, and return the descriptor that holds the lock; -1 where it cannot be opened."""
+    """Lock a file that is being written.
+
+    Return the descriptor that holds the lock, or -1 if the file cannot be opened.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError:
         return -1
-    with contextlib.suppress(OSError):  # a network file system may have no locks
+    with contextlib.suppress(OSError):  # a network file system may not support locks
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     return descriptor
 
@@ -56,7 +59,7 @@ def unlock(descriptor: int) -> None:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder, of this or another process, has the file locked. Raises FileNotFoundError."""
+    """Whether a recorder in this or another process has locked the file. Raises FileNotFoundError."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:
@@ -71,10 +74,10 @@ def is_being_written(path: Path) -> bool:
 
 
 def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
-    """Delete the oldest recordings until all together take no more than `at_most` bytes; return the deleted ones.
+    """Delete the oldest recordings until all together take no more than `at_most` bytes; return the deleted files.
 
     Recordings of the running `session` are deleted after all others, regardless of dates, and black boxes last. Files
-    that are being written stay. Raises OSError if a file cannot be deleted.
+    that are being written are kept. Raises OSError if a file cannot be deleted.
     """
     recordings = sorted(_recordings(directory, session), key=lambda kept: kept.order)
     total = sum(kept.size for kept in recordings)
@@ -87,7 +90,7 @@ def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
                 continue
             for path in kept.files:
                 path.unlink()
-        except FileNotFoundError:  # another process deleted it just now
+        except FileNotFoundError:  # another process has just deleted it
             pass
         else:
             deleted.append(kept.path)

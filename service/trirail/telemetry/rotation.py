@@ -1,4 +1,4 @@
-"""Rotated files of a session's recording, one after the other, each complete in itself."""
+"""Rotated files of a session's recording; each file is complete in itself."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from trirail.telemetry.sinks import Archive
 from trirail.wire.event_codes import EventCode, EventText, coded
 
 SOON, RETRY = 1.0, 10.0
-"""Delay from the failure of a file to the first attempt with another one, and interval of further attempts [s]."""
+"""Delay from the failure of a file to the first attempt with another one, and interval between further attempts [s]."""
 TRIAL = 1 << 19
-"""Size of the test data written to a new file [bytes]: more than its first content, whose writing is not checked."""
+"""Size of the test data written to a new file [bytes]. It exceeds the initial content, whose writing is not checked."""
 
 Open = Callable[[Path], rr.RecordingStream]
 Close = Callable[[rr.RecordingStream], None]
 
 
 class RotatedFiles:
-    """Writer of batches into the newest of several files.
+    """Writes batches to the newest of several files.
 
-    Another file begins on `turn`, or when the newest one fails or is deleted; `warn` receives a report of a deletion.
+    A new file begins on `turn`, or when the newest file fails or is deleted; `warn` receives a report of a deletion.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class RotatedFiles:
         self.path = path
         """Newest file."""
         self.cause = ""
-        """Reason of the newest lost batch."""
+        """Reason why the most recently lost batch was lost."""
         self._first = path
         self._begin = begin
         self._end = end
@@ -50,20 +50,20 @@ class RotatedFiles:
         self._warn = warn
         self._number = 1
         self._lost_before = 0
-        self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # destroying them would wait for their disk
+        self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # destroying them would wait for the disk
         self._retry: float | None = None
         self._lock = -1
-        """Lock that shows others that the newest file is being written."""
+        """Descriptor of the lock that shows other processes that the newest file is being written."""
         self._open()
 
     @property
     def lost(self) -> int:
-        """Number of batches that are in no file."""
+        """Number of batches that did not reach any file."""
         return self._lost_before + self._archive.lost
 
     @property
     def trouble(self) -> str:
-        """Reason why the last batch is in no file; empty if it is in one."""
+        """Reason why the last batch did not reach any file; empty if it did."""
         return self._archive.trouble
 
     @property
@@ -80,7 +80,7 @@ class RotatedFiles:
             return 0
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Write a batch, or count it as lost; the wait for the disk is short."""
+        """Write a batch, or count it as lost, without waiting long for the disk."""
         now = self._clock()
         if self._archive.gone and (self._retry is None or now >= self._retry):
             self._retry, deleted = now + RETRY, self.path
@@ -100,7 +100,7 @@ class RotatedFiles:
             self.turn()
 
     def turn(self) -> bool:
-        """Continue in another file; where that cannot be written, stay in this one and return False."""
+        """Continue in another file; if it cannot be written, stay in this file and return False."""
         number = self._number + 1
         try:
             path = claim(self._first.parent, f"{self._first.stem}-part{number}")
@@ -118,7 +118,7 @@ class RotatedFiles:
         return True
 
     def close(self) -> None:
-        """Complete the newest file, unless the disk is stuck."""
+        """Finish the newest file, unless the disk is not responding."""
         self._archive.close()
         retention.unlock(self._lock)
         self._lock = -1
@@ -131,7 +131,7 @@ class RotatedFiles:
 
 
 def claim(directory: Path, name: str) -> Path:
-    """Create an empty file with an unused name. Raises OSError where it cannot be written."""
+    """Create an empty file with an unused name. Raises OSError if it cannot be written."""
     directory.mkdir(parents=True, exist_ok=True)
     path, number = directory / f"{name}.rrd", 1
     while True:
@@ -152,7 +152,7 @@ def claim(directory: Path, name: str) -> Path:
 
 
 def _try(descriptor: int) -> None:
-    """Check that data reaches the disk: an empty file can be created on a full one. Raises OSError."""
+    """Check that data reaches the disk, since an empty file can be created even on a full disk. Raises OSError."""
     if os.write(descriptor, bytes(TRIAL)) < TRIAL:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     os.fsync(descriptor)

@@ -1,8 +1,8 @@
 """Drawing of the robot in Rerun: static parts once, then columns made from records.
 
-`/record` holds every field of every record unchanged, in SI units. All else is drawn from it for people: in
-millimetres, degrees and microseconds, thinned to the resolution of a screen. In thinned curves, following error,
-lateness and cycle time show their worst value, the rest their newest.
+`/record` contains every field of every record unchanged, in SI units. Everything else is drawn from it for people, in
+millimetres, degrees and microseconds, thinned to the resolution of a screen. Thinned curves show the worst value of
+following error, lateness and cycle time, and the newest value of everything else.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from trirail.workspace.part_positions import Points, RobotParts
 from trirail.workspace.reach import Reach
 
 ORIGIN = 0.02
-"""Arms of the cross at the base frame's origin, as a share of the robot's size."""
+"""Length of the arms of the cross at the base frame's origin, as a fraction of the robot's size."""
 POSITIONS = rr.Points2D.descriptor_positions()
 STRIPS = rr.LineStrips2D.descriptor_strips()
 TRANSLATION = rr.Transform3D.descriptor_translation()
@@ -38,8 +38,8 @@ _ORIGIN_CROSS = (np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.
 
 
 def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tuple[str, rr.AsComponents]]:
-    """Yield the static parts: entity path and archetype."""
-    yield "/robot", rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # 2D views have y downwards
+    """Yield the entity path and archetype of each static part."""
+    yield "/robot", rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # the y axis of 2D views points downwards
     yield "/robot/rails", _lines(parts.rails, [palette.FRAME], 4.5, order=10)
     yield "/robot/travel", _lines(parts.travel, [palette.dark(c) for c in palette.SLIDERS], 3.0, order=11)
     yield "/robot/stops", _lines(parts.stops, [palette.LIMIT], 1.2, order=12)
@@ -62,10 +62,10 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
         "/robot/platform/centre",
         rr.Points2D([[0.0, 0.0]], radii=rr.Radius.ui_points(4.0), colors=[palette.CENTRE], draw_order=31),
     )
-    yield (  # each slider, and the pivot that the platform turns on
+    yield (  # each slider, and the pivot about which the platform turns
         "/robot/sliders",
         rr.Points2D.from_fields(
-            radii=[-8.5] * 3 + [-3.0] * 3,  # negative: points of the screen, not metres
+            radii=[-8.5] * 3 + [-3.0] * 3,  # negative values are screen points, not metres
             colors=[*palette.SLIDERS, *[palette.PIN] * 3],
             draw_order=32,
         ),
@@ -73,7 +73,7 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
 
 
 def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
-    """Return the moving parts in `records`, (N,), and the trace of the centre to them from `before`."""
+    """Return the moving parts in `records`, (N,), and the trace of the centre from `before` up to them."""
     sliders = part_positions.slider_points(geometry, records["position"])
     crossing = part_positions.cross_slide_lines(geometry, parts, sliders, records["pose"][:, 2])
     pivots = part_positions.pivot_points(geometry, sliders, records["pose"])
@@ -88,7 +88,7 @@ def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], reco
 
 
 def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
-    """Return the platform at the goal's pose, with a cross at its centre; nothing without a goal."""
+    """Return the platform at the goal's pose, with a cross at its centre; the column is empty without a goal."""
     if pose is None:
         return Column("/robot/goal", STRIPS, columns.ragged([[]]))
     cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _ORIGIN_CROSS]
@@ -97,7 +97,7 @@ def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
 
 
 def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsComponents]]:
-    """Yield the tools on the platform and the axes of work frames, each with its name."""
+    """Yield the tools on the platform and the axes of the work frames, each with its name."""
     if frames.tool:
         tools = np.array(list(frames.tool.values()))
         yield "/robot/platform/tools", _labelled(tools, list(frames.tool), [palette.CENTRE], 3.0, order=31)
@@ -145,9 +145,9 @@ def _placed(path: str, pose: Points) -> list[Column]:
 
 
 DRAWN_HZ = 100
-"""Samples of the drawing a second."""
+"""Number of samples of the drawing per second."""
 OUTLINES_HZ = 10
-"""Greatest number of outlines of the workspace a second."""
+"""Maximum number of workspace outlines per second."""
 
 MARKDOWN = rr.components.MediaType.MARKDOWN
 TEXT = rr.TextDocument.descriptor_text()
@@ -158,7 +158,7 @@ LEVELS = ("off", "on")
 
 
 class Scene:
-    """A robot for Rerun. `wall_offset_ns` is the wall clock less the monotonic one."""
+    """Robot drawn in Rerun. `wall_offset_ns` is the wall clock minus the monotonic clock."""
 
     def __init__(self, robot: DrawnRobot, wall_offset_ns: int) -> None:
         self._rate_hz = robot.rate_hz
@@ -172,7 +172,7 @@ class Scene:
         """Bounds of the robot, (2, 2): lowest and highest x and y [m]."""
 
     def still(self) -> Iterator[tuple[str, rr.AsComponents]]:
-        """Yield the static parts: entity path and archetype."""
+        """Yield the entity path and archetype of each static part."""
         yield from still(self._parts, self._frames, self._geometry.labels)
         for path, lines in self._plots.items():
             yield path, _series(lines)
@@ -191,16 +191,16 @@ class Scene:
             yield signal.path, rr.StateConfiguration(values=list(LEVELS), labels=list(LEVELS), colors=colours)
 
     def bus_load(self, share: float) -> Iterator[tuple[str, rr.AsComponents]]:
-        """Set the bus load, 1 for a full bus; yield the static parts that change with it."""
+        """Set the bus load (1 is a full bus), and yield the static parts that change with it."""
         self._plots[curves.TIMING] = lines = curves.timing(self._rate_hz, share)
         yield curves.TIMING, _series(lines)
 
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return whole records, unchanged."""
+        """Return complete records, unchanged."""
         return columns.chunks(self._timelines.for_records(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
     def drawn(self, records: NDArray[np.void], standing: ReadoutState) -> list[Chunk]:
-        """Return the drawing of one or more records, in order. `standing` holds at the last of them."""
+        """Return the drawing of one or more records, in order. `standing` is the state at the last record."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         newest = records[ends]
         parts = moving(self._geometry, self._parts, records[starts], newest)
@@ -212,7 +212,7 @@ class Scene:
         return chunks + self._status(records) + self._switched(records) + self._readout(records[-1], standing)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
-        """Return the drawing of the goal's pose from the time of `record` on; `pose` is None without a goal."""
+        """Return the drawing of the goal's pose from the time of `record` on; `pose` is None if there is no goal."""
         return columns.chunks(self._timelines.for_records(record.reshape(1)), [goal(self._parts, pose)])
 
     def _readout(self, record: np.void, standing: ReadoutState) -> list[Chunk]:
@@ -220,7 +220,7 @@ class Scene:
         return columns.chunks(self._timelines.for_records(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
 
     def _status(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return mode and outline of the workspace at the first record, and at changes of the mode and of φ."""
+        """Return the mode and the workspace outline at the first record, and at changes of the mode and of φ."""
         changed = np.diff(records["mode"], prepend=len(MODES)) != 0
         some = np.arange(0, len(records), max(1, self._rate_hz // OUTLINES_HZ))
         steps = self._reach.outline_indices(records["pose"][some, 2])
@@ -245,7 +245,7 @@ class Scene:
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first and the last row of each run of rows whose cycles are in the same group of `size`."""
+    """Return the first and last row of each run of rows whose cycles are in the same group of `size`."""
     changes = np.flatnonzero(np.diff(cycles // max(1, size))) + 1
     return np.concatenate([[0], changes]), np.concatenate([changes, [len(cycles)]]) - 1
 

@@ -1,4 +1,4 @@
-"""Search for sessions in a folder of recordings, by the recordings' sidecars."""
+"""Search for sessions in a folder of recordings, using the sidecars of the recordings."""
 
 from __future__ import annotations
 
@@ -16,45 +16,45 @@ from trirail.telemetry.retention import is_being_written
 
 
 class SessionFilter(NamedTuple):
-    """Filter of sessions; None for any."""
+    """Filter for sessions; None matches any value."""
 
     robot: str | None = None
     since: float | None = None
-    """Earliest time of the end [s since 1970]."""
+    """Earliest end of a session [s since 1970]."""
     until: float | None = None
-    """Latest time of the begin [s since 1970]."""
+    """Latest start of a session [s since 1970]."""
     fault: str | None = None
-    """Part of a fault's cause, code as 0x8700, or message; case is ignored."""
+    """Part of the cause, the code (such as 0x8700) or the message of a fault; case is ignored."""
     user: str | None = None
-    """User that sent a goal or command; with `outcome`, user of a goal with that outcome."""
+    """User who sent a goal or command; with `outcome`, user of a goal with that outcome."""
     outcome: str | None = None
 
 
 class RecordedSession(Struct):
-    """Session of one file, or of several if its recording was rotated."""
+    """Recorded session, in one file or, if its recording was rotated, in several."""
 
     session: str
     robot: str
     began: float | None
-    """Time of the begin [s since 1970]; None where nothing was recorded."""
+    """Start time [s since 1970]; None if nothing was recorded."""
     ended: float | None
     cycles: int
     files: list[str]
     reason: str | None
-    """Fault for which a black box was kept."""
+    """Fault for which a black box was saved."""
     trouble: str | None
-    """Reason why one of its files could not be read."""
+    """Reason why a file of the session could not be read."""
     users: list[str]
     goals: dict[str, int]
-    """Number of ended goals, by outcome."""
+    """Number of finished goals by outcome."""
     faults: list[str]
-    """Messages of its faults, in order."""
+    """Messages of the session's faults, in order."""
     running: bool = False
-    """Whether it is still being recorded: then these values are some seconds old."""
+    """Whether the session is still being recorded, in which case these values are some seconds old."""
 
 
 def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], None] | None = None) -> list[Contents]:
-    """Return the contents of each recording of a folder, in the order of their names.
+    """Return the contents of each recording in a folder, in the order of their names.
 
     A recording that is being written is omitted until its recorder has written its sidecar.
 
@@ -63,9 +63,10 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
     folder
         Folder of the recordings.
     reread
-        Whether to read all recordings; otherwise only those without a usable sidecar. The sidecar is written again.
+        Whether to read all recordings and write their sidecars again; otherwise, only recordings without a usable
+        sidecar are read.
     on_read
-        Called with each recording before it is read.
+        Function called with each recording before it is read.
     """
     listed = []
     for path in sorted(folder.glob("*.rrd"), key=lambda path: path.name):
@@ -79,7 +80,7 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
                 if on_read is not None:
                     on_read(path)
                 known = contents.read_contents(path)
-                with contextlib.suppress(OSError):  # the folder is another user's: read it again the next time
+                with contextlib.suppress(OSError):  # the folder belongs to another user: read it again the next time
                     contents.save(path, known)
         if known is not None:
             listed.append(known)
@@ -87,7 +88,7 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
 
 
 def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
-    """Return the sessions of files that match a filter, in the order of their begin."""
+    """Return the sessions in files that match a filter, in the order of their start."""
     parts_of: dict[str, list[Contents]] = {}
     for file in sorted(files, key=lambda file: (file.began or 0.0, file.name)):
         parts_of.setdefault(file.session, []).append(file)
@@ -95,7 +96,7 @@ def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> 
 
 
 def fault_codes(files: Iterable[Contents]) -> list[str]:
-    """Return cause and code of each fault in files, without repetition."""
+    """Return the cause and code of each fault in files, without duplicates."""
     return sorted({entry.code for file in files for entry in file.faults})
 
 

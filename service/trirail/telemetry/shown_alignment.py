@@ -16,19 +16,19 @@ from trirail.wire.messages import Event
 
 RESIDUALS, TABLE = "/alignment/residual", "/alignment/table"
 MOST_LOOKS = 8
-"""Number of newest looks in the table, a column each."""
+"""Number of newest looks in the table, with one column for each."""
 _TEXT = rr.TextDocument.descriptor_text()
 _SCALARS = rr.Scalars.descriptor_scalars()
 
 
 class ShownAlignment:
-    """Drawing of the current alignment, or of the last one."""
+    """Drawing of the current or the last alignment."""
 
     def __init__(self) -> None:
         self._looks: list[AlignmentLook] = []
 
     def drawing_of(self, event: Event, look: AlignmentLook) -> list[Chunk]:
-        """Add a look, and return its drawing."""
+        """Add a look and return its drawing."""
         if self._looks and (self._looks[0].id, self._looks[0].purpose) != (look.id, look.purpose):
             self._looks.clear()
         self._looks = [*self._looks, look][-MOST_LOOKS:]
@@ -60,5 +60,5 @@ def _cell(look: AlignmentLook, name: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text from outside with Markdown's special characters escaped."""
+    """Escape Markdown's special characters in text from outside."""
     return "".join(f"\\{character}" if character in r"\`*_{}[]()<>#+-!|~" else character for character in text)

@@ -1,7 +1,7 @@
 """Sinks of a recording: a file for everything, and a live view that may be slow, frozen or absent.
 
-Rerun's sinks do not report their failures: they stop accepting data, and then block every sender for ever.
-This module prevents that, and counts the data that does not reach a sink.
+Rerun's sinks do not report their failures: they stop accepting data, and then block every sender forever. This module
+prevents that, and counts the data that does not reach a sink.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from trirail.errors import ServiceError
 
 LOOPBACK = "127.0.0.1"
 BACKLOG = 20
-"""Greatest number of batches that wait for the live view: 2 s."""
+"""Maximum number of batches that wait for the live view, equal to 2 s."""
 RESERVE = 64 << 20
-"""Space left free on the disk [bytes]: a file sink never recovers from a full disk."""
+"""Space that is left free on the disk [bytes], since a file sink never recovers from a full disk."""
 DISK_TIMEOUT_S = 2.0
 """Time-out for the disk, or for the end of a thread [s]."""
 
 
 def disk_shortage(directory: Path, reserve: int) -> str:
-    """Return why no data can be written to a folder while `reserve` bytes stay free; empty if it can."""
+    """Return why no data can be written to a folder while `reserve` bytes stay free; return "" if it can."""
     try:
         free = shutil.disk_usage(directory).free
     except OSError as error:
@@ -41,7 +41,9 @@ def disk_shortage(directory: Path, reserve: int) -> str:
 
 
 def identity(path: Path) -> tuple[int, int] | None:
-    """Return the device and inode, which distinguish a file from a later one of its name; None without a file."""
+    """Return the device and inode, which distinguish a file from a later one with the same name; None if there is no
+    file.
+    """
     try:
         status = path.stat()
     except OSError:
@@ -50,11 +52,11 @@ def identity(path: Path) -> tuple[int, int] | None:
 
 
 class Archive:
-    """Recording file; each batch reaches the operating system before the next, and `reserve` bytes stay free."""
+    """Recording file. Each batch reaches the operating system before the next one, and `reserve` bytes stay free."""
 
     def __init__(self, stream: rr.RecordingStream, path: Path, reserve: int = RESERVE) -> None:
         self.lost = 0
-        """Batches that are not in the file."""
+        """Number of batches that are not in the file."""
         self.trouble = ""
         """Reason why the last batch is not in the file; empty if it is."""
         self._stream = stream
@@ -65,27 +67,27 @@ class Archive:
         self._stuck = False
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Write a batch, or count it as lost; the wait for the disk is short."""
+        """Write a batch, or count it as lost, without waiting long for the disk."""
         self.trouble = self._write(chunks)
         self.lost += bool(self.trouble)
 
     @property
     def gone(self) -> bool:
-        """Whether the file has been deleted or moved: data written to it would not be found."""
+        """Whether the file has been deleted or moved, so that data written to it could not be found."""
         return identity(self._path) != self._identity
 
     @property
     def stuck(self) -> bool:
-        """Whether the file accepts no more data: Rerun's sink does not recover from a failed disk."""
+        """Whether the file accepts no more data, since Rerun's sink does not recover from a disk failure."""
         return self._stuck
 
     def close(self) -> None:
-        """Complete the file, unless the disk is stuck."""
+        """Finish the file, unless the disk is not responding."""
         if self._flushed(DISK_TIMEOUT_S):
             self._stream.disconnect()
 
     def _write(self, chunks: list[Chunk]) -> str:
-        """Write a batch; return the reason of a failure, else ""."""
+        """Write a batch; return the reason for a failure, or ""."""
         if self.gone:
             return f"{self._path} has been deleted or moved, and no other file can be created there"
         if full := disk_shortage(self._directory, self._reserve):
@@ -98,7 +100,7 @@ class Archive:
     def _flushed(self, within: float) -> bool:
         try:
             self._stream.flush(timeout_sec=within)
-        except RuntimeError:  # the only sign of a failing disk: data is not written in time
+        except RuntimeError:  # the only sign of a failing disk is that data is not written in time
             self._stuck = True
         else:
             self._stuck = False
@@ -106,7 +108,7 @@ class Archive:
 
 
 class Relay:
-    """Relay of batches in its own thread; when the receiver falls behind, it skips to the newest batch."""
+    """Relay of batches in its own thread. When the receiver falls behind, the relay skips to the newest batch."""
 
     def __init__(self, deliver: Callable[[list[Chunk]], None], finish: Callable[[], None]) -> None:
         self.skipped = 0
@@ -129,7 +131,7 @@ class Relay:
             self._changed.notify()
 
     def close(self) -> None:
-        """Deliver the waiting batches, unless the receiver is stuck."""
+        """Deliver the waiting batches, unless the receiver is not responding."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -147,7 +149,7 @@ class Relay:
 
 
 def free_port() -> int:
-    """Return an unused port of the loopback."""
+    """Return an unused port on the loopback interface."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         port: int = probe.getsockname()[1]
@@ -155,7 +157,7 @@ def free_port() -> int:
 
 
 def is_watched(port: int) -> bool:
-    """Whether anyone is connected to a port that this process listens on."""
+    """Whether any client is connected to a port on which this process listens."""
     return any(_serves(int(name), port) for name in os.listdir("/dev/fd"))
 
 
@@ -167,17 +169,17 @@ def _serves(descriptor: int, port: int) -> bool:
         with socket.socket(fileno=os.dup(descriptor)) as connection:
             connection.getpeername()  # raises for the listening socket, which has no peer
             return connection.family == socket.AF_INET and connection.getsockname()[1] == port
-    except OSError:  # closed meanwhile
+    except OSError:  # closed in the meantime
         return False
 
 
 def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
-    """Return a server for viewers on this machine; it keeps `memory_mb` of the past for viewers that connect late.
+    """Return a server for viewers on this machine; it keeps `memory_mb` of past data for viewers that connect late.
 
-    They receive the newest data first, so that they show the present immediately. Raises ServiceError if the port is
-    in use.
+    Viewers receive the newest data first, so that they show the present state immediately. Raises ServiceError if the
+    port is in use.
     """
-    with socket.socket() as probe:  # the sink would only log a taken port, and discard all data
+    with socket.socket() as probe:  # if the port were taken, the sink would only log it, and discard all data
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((LOOPBACK, port))

@@ -1,4 +1,4 @@
-"""Conversion of the loops' messages for sinks: drawings in batches, the goal, lines of the log."""
+"""Conversion of the loop's messages for sinks: drawings in batches, the goal, and log lines."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from trirail.wire.records import DTYPE, unpack
 
 APPLICATION = "trirail"
 LIVE_HZ = 5
-"""Batches of drawings a second to a live view: the rate of its picture."""
+"""Number of batches of drawings per second sent to a live view, which is its frame rate."""
 REPORT_EVERY = 10.0
-"""Least interval between reports of missing data in the log [s]."""
+"""Minimum interval between reports of missing data in the log [s]."""
 
 
 class Sink(Protocol):
-    """Receiver of batches; it counts those that it cannot accept."""
+    """Receiver of batches, which counts those that it cannot accept."""
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
         """Write a batch without a long wait, or count it as lost."""
@@ -41,13 +41,13 @@ class Sink(Protocol):
 class Streams:
     """Recording of one robot, with its drawing, its layout and its sinks.
 
-    All entities are below the entity `root`: other robots may be in the same recording.
+    All entities are below the entity `root`, so that other robots can be in the same recording.
     """
 
     def __init__(self, robot: DrawnRobot, name: str, wall_offset_ns: int, root: str = "") -> None:
         self.scene = Scene(robot, wall_offset_ns)
         self.shown = RobotView(robot, self.scene.bounds, root)
-        """Data of the robot for a layout."""
+        """Data of the robot that a layout needs."""
         self._name = name
         self._rate_hz = robot.rate_hz
         self._wall_offset_ns = wall_offset_ns
@@ -63,7 +63,7 @@ class Streams:
         self._alignment = ShownAlignment()
 
     def open(self, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
-        """Return a stream of this recording to a sink of Rerun, with the static parts and the layout in it."""
+        """Return a stream of this recording to a Rerun sink, including the static parts and the layout."""
         stream = rr.RecordingStream(APPLICATION, recording_id=self._recording)
         stream.set_sinks(sink, default_blueprint=blueprint.layout(self.shown))
         stream.send_recording_name(self._name)
@@ -71,15 +71,16 @@ class Streams:
         return stream
 
     def join(self, stream: rr.RecordingStream) -> None:
-        """Send the static parts to a stream, now and when they change."""
+        """Send the static parts to a stream, now and whenever they change."""
         for path, archetype in self.scene.still():
             stream.log(f"{self.shown.root}{path}", archetype, static=True)
         self._streams.append(stream)
 
     def attach(self, sink: Sink, drawing_hz: int) -> None:
-        """Pass all later messages to a sink, and `drawing_hz` batches of drawings a second.
+        """Forward all subsequent messages to a sink, with `drawing_hz` batches of drawings per second.
 
-        Another call changes the rate. Sinks of the same rate share their drawings, since drawing costs the most.
+        Call this again to change the rate. Sinks with the same rate share their drawings, since drawing is the most
+        expensive part.
         """
         if self._rates.get(sink) == drawing_hz:
             return
@@ -102,12 +103,12 @@ class Streams:
         self._newest = batch[-DTYPE.itemsize :]
 
     def update_state(self, state: ReadoutState) -> None:
-        """Set the state of the readout from the next record on."""
+        """Set the state that the readout shows from the next record on."""
         self._goal_drawn = self._goal_drawn and state.target == self._state.target
         self._state = state
 
     def bus_load(self, share: float) -> None:
-        """Set the load of the bus, 1 for a full bus."""
+        """Set the bus load; 1 is a full bus."""
         for path, archetype in self.scene.bus_load(share):
             for stream in self._streams:
                 stream.log(f"{self.shown.root}{path}", archetype, static=True)
@@ -119,7 +120,7 @@ class Streams:
             self._waiting += self._alignment.drawing_of(event, event.alignment)
 
     def control_input(self, item: ControlInput) -> None:
-        """Add an input of the control to the log."""
+        """Add an input of the control loop to the log."""
         self._entries.append(journal.input_entry(item, self._rate_hz, self._wall_offset_ns))
 
     def log(self, level: Level, message: str) -> None:
@@ -128,15 +129,15 @@ class Streams:
         self._entries.append(Entry(EVENTS, self.t, wall, message, level))
 
     def resend_state(self) -> None:
-        """Send data that is otherwise sent only on change with the next records, because a sink began a new file."""
+        """Send all data with the next records, including data sent only on change, because a sink began a new file."""
         self._goal_drawn = self._state.target is None
 
     def drop(self, stream: rr.RecordingStream) -> None:
-        """Remove a complete stream."""
+        """Remove a finished stream."""
         self._streams.remove(stream)
 
     def save(self) -> None:
-        """Send all pending messages in one batch, which costs about the same with one line or ten."""
+        """Send all pending messages in one batch, which costs about the same for one line as for ten."""
         chunks = self._placed(self._waiting + journal.chunks(self._entries))
         self._waiting, self._entries = [], []
         if chunks:
@@ -166,7 +167,7 @@ class Streams:
 
 
 def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
-    """Return a stream to a sink of Rerun, with several robots side by side, each below its root."""
+    """Return a stream to a Rerun sink that shows several robots side by side, each below its root."""
     stream = rr.RecordingStream(APPLICATION, recording_id=str(uuid.uuid4()))
     stream.set_sinks(sink, default_blueprint=blueprint.side_by_side([streams.shown for streams in several]))
     stream.send_recording_name(name)
@@ -176,7 +177,7 @@ def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.
 
 
 class MissingDataReport:
-    """Report of missing data in the log, at most every REPORT_EVERY seconds, when more is missing than before."""
+    """Reports missing data in the log when more is missing than before, at most every REPORT_EVERY seconds."""
 
     def __init__(self, streams: Streams, words: str, counts: Callable[[], tuple[int, ...]]) -> None:
         self._streams = streams
@@ -194,7 +195,7 @@ class MissingDataReport:
 
 
 class Batches:
-    """Collector of records into batches."""
+    """Collects records into batches."""
 
     def __init__(self, size: int, deliver: Callable[[NDArray[np.void]], None]) -> None:
         self._batch_bytes = max(1, size) * DTYPE.itemsize
@@ -202,7 +203,7 @@ class Batches:
         self._pending = bytearray()
 
     def add(self, batch: bytes) -> None:
-        """Add packed records; deliver all when there are enough for a batch."""
+        """Add packed records; deliver all records when there are enough for a batch."""
         self._pending += batch
         if len(self._pending) >= self._batch_bytes:
             self.flush()
