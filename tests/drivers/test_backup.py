@@ -753,7 +753,11 @@ class TestFileOfAnotherProgram:
             ("[6083]", "[6081]", "already exists"),
             ("[6081]", "[6081SUB1]", "belongs to no object"),
             ("LowLimit=1", "DataType=0x0006", "already exists"),
-            ("DataType=0x0007\nAccessType=rw\nLowLimit=1", "DataType=0x0006\nAccessType=rw", "has 4 bytes, but 2 in the file"),
+            (
+                "DataType=0x0007\nAccessType=rw\nLowLimit=1",
+                "DataType=0x0006\nAccessType=rw",
+                "has 4 bytes, but 2 in the file",
+            ),
         ],
     )
     def test_is_refused_whole_where_anything_is_wrong(self, old: str, new: str, said: str, tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ BASE, MEASURED, COMMANDED = "base", "platform_measured", "platform_commanded"
 """Names of frames. The platform of the URDF is a separate link, which joints move."""
 JOINTS = tuple(f"{joint}_{leg}" for joint in ("slider", "pivot", "cross") for leg in "abc")
 """Joints of the URDF: sliders, pivots and cross slides of the legs A, B, C."""
-OK, WARN, ERROR = 0, 1, 2
+OK, ERROR = 0, 2
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 Message = tuple[int, str, Any]
 """Wall-clock time [ns], topic and message."""

@@ -261,10 +261,6 @@ class Outputs:
 
     # ------------------------------------------------------------------ inputs
 
-    def input_values(self, words: Sequence[int]) -> dict[str, bool]:
-        """Return the value of each input, given the drives' input words."""
-        return {name: bool(words[axis] & bit) for name, (axis, bit) in self._inputs.items()}
-
     def edges(self, before: Sequence[int], now: Sequence[int]) -> list[tuple[str, bool]]:
         """Return the inputs that differ between two readings of the drives' words, with their new values."""
         return [
