@@ -78,7 +78,7 @@ class Unready(NamedTuple):
     reason: str
     """One line for people: the drive does not answer, has restarted, or is refused."""
     objects: int = 0
-    """Number of objects of the drive read or written so far; 0 outside a set-up."""
+    """Number of objects of the drive read or written up to now; 0 outside a set-up."""
     expected: int = 0
     """Number of objects read or written in the drive's last set-up; 0 if there was none."""
     counted: str = "objects"

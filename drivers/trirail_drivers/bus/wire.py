@@ -212,7 +212,7 @@ class Wire:
             self.warn(f"CAN bus: {reason}")
         elif canerrors.error_number(error) is not None:  # ENOBUFS, EAGAIN: the interface is there, reopening is no help
             self.fail(DriveFault("", "bus", 0, f"CAN bus: {reason}"))
-        else:  # The queue is full or the adapter is gone: python-can gives no number and so does not tell which.
+        else:  # The queue is full or the adapter is gone: python-can gives no number and so does not show which.
             self._awaits_frame = True
             self.lose(reason, dead=False)
 

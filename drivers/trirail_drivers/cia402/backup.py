@@ -43,7 +43,7 @@ _SAVE: Final = b"save"
 _SDO_CHANNELS: Final = range(0x1200, 0x1300)
 """SDO parameters of CiA 301, whose identifiers depend on the node id."""
 _POWERED: Final = (*HAS_POWER, PowerState.FAULT_REACTION_ACTIVE, None)
-"""States with power; None stands for a statusword that encodes no CiA 402 state."""
+"""States with power; None represents a statusword that encodes no CiA 402 state."""
 
 T = TypeVar("T")
 

@@ -18,7 +18,7 @@ _NONE = 0
 async def choose_modes(remote: Remote, *, homes: bool) -> tuple[int, ...]:
     """Return the modes to try: cyclic synchronous position mode or, without it, interpolated position mode.
 
-    Bit n - 1 of 6502h stands for mode n; without that object, both modes are returned. Raises DriveError if the drive
+    Bit n - 1 of 6502h represents mode n; without that object, both modes are returned. Raises DriveError if the drive
     has neither mode, or if it `homes` but has no homing mode.
     """
     modes = await remote.peek(0x6502)

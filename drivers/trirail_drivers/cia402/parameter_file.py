@@ -202,7 +202,7 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
     """Return the sections that describe objects, in a form that canopen reads, and the node id and serial number."""
     sections = configparser.RawConfigParser(inline_comment_prefixes=(";",))
     sections.optionxform = lambda optionstr: _KEYWORDS.get(optionstr.lower(), optionstr)  # type: ignore[method-assign]
-    # Strict, unlike an EDS: it is impossible to tell which of two duplicate values to write into a drive.
+    # Strict, unlike an EDS: it is impossible to know which of two duplicate values to write into a drive.
     strict = configparser.RawConfigParser(allow_no_value=True)
     strict.read_string(path.read_text(encoding="utf-8-sig", errors="replace").rstrip("\x1a\0 \r\n\t"))
     with eds.open_text(path) as text:

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 NO_OFFSET: Final = -1
-"""Offset that stands for a value that a frame does not contain."""
+"""Offset that marks a value that a frame does not contain."""
 NOTHING_SENT: Final = -1
 """Value of `outputs_sent` before any outputs were sent."""
 

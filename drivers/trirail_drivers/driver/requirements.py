@@ -25,7 +25,7 @@ class Rule(NamedTuple):
     key: str
     """Key that is wrong if the check fails."""
     reads: tuple[str, ...]
-    """Other keys on which the result depends; the name of a table stands for all its keys."""
+    """Other keys on which the result depends; the name of a table includes all its keys."""
     check: Callable[[], object]
     """Function that raises a TrirailError with the key, its value and a valid value."""
 

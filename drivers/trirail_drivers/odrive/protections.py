@@ -37,7 +37,7 @@ MIN_WATCHDOG_CYCLES: Final = 3
 _FLOAT32_TOLERANCE: Final = 1e-6
 """Relative error of times, which are 32-bit floats."""
 Settings = Mapping[str, float]
-"""Settings of a drive by path, in drive units; 1 stands for true."""
+"""Settings of a drive by path, in drive units; 1 is true."""
 
 
 class Protection(NamedTuple):

@@ -115,7 +115,7 @@ class SetpointSender:
         """Advance the ramp by one period. When it ends, end the quick stop, which removes power.
 
         While the bus accepts no setpoint, the ramp loses velocity but keeps its position: a drive without setpoints
-        soon comes to rest, and must not catch up with the ramp when the bus works again.
+        soon stops, and must not catch up with the ramp when the bus works again.
         """
         if not self.sent or self._standstill_time is None:
             return

@@ -35,7 +35,7 @@ class Mechanics:
     acceleration: float = 1.0
     """Fixed unit of acceleration [counts/s²]."""
     untold: tuple[int, ...] = ()
-    """Which of 60A9h and 60AAh are 0, whatever the EDS contains: their units are those fixed here."""
+    """Objects of 60A9h and 60AAh that are 0, whatever the EDS contains: their units are those fixed here."""
 
 
 class FactorGroup:

@@ -53,7 +53,7 @@ RESIDUAL_PANEL = "to go [µm]"
 MARK_COLOURS = ("#0e7c86", "#7a4fc0", "#b7791f", "#d1495b", "#2e8b57", "#2f6fb3")
 """Colours of marks, in the order of their names."""
 MIN_RESIDUAL_UM = 1e-3
-"""Lowest value on the logarithmic scale [µm]; it also stands for a residual of zero."""
+"""Lowest value on the logarithmic scale [µm]; it also represents a residual of zero."""
 
 
 def draw(file: Path, recording: Recording, summary: Summary) -> None:
