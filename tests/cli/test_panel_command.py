@@ -71,7 +71,7 @@ def test_a_file_without_a_token_is_refused(tmp_path: Path, text: str) -> None:
     file = tmp_path / "panel.token"
     file.write_text(text)
     file.chmod(0o600)
-    with pytest.raises(ConfigError, match="no token"):
+    with pytest.raises(ConfigError, match="not a valid token"):
         read_token(file)
 
 

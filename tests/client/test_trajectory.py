@@ -41,7 +41,7 @@ def test_a_row_that_is_too_short_or_too_long_is_named(rows: list[tuple[float, ..
     line = data.draw(st.integers(0, len(rows) - 1))
     count = data.draw(st.integers(1, 9).filter(lambda count: count != len(HEAD)))
     cells[line] = (cells[line] * 2)[:count]
-    with pytest.raises(TrirailError, match=rf"path\.csv: line {line + 2}: {count} of 7 columns$"):
+    with pytest.raises(TrirailError, match=rf"path\.csv: line {line + 2}: {count} columns; expected 7$"):
         read_text(csv_of(cells))
 
 

@@ -112,7 +112,7 @@ def test_a_value_that_does_not_stick_is_refused(closing: Closing) -> None:
         keep(index, subindex, b"\1\0" if index == 0x208E else data, check_writable)
 
     vars(rig.nodes[1].local).update(set_data=set_data)
-    with pytest.raises(ConfigurationRefused, match=r"drive B: object 208E:00 .*: wanted 256, found 1 after 0\.05"):
+    with pytest.raises(ConfigurationRefused, match=r"drive B: object 208E:00 .*: expected 256, found 1 after 0\.05"):
         rig.drives.configure(PERIOD)
 
 

@@ -110,7 +110,7 @@ class TestConfigure:
         new.devices[1].axis_state = AxisState.CLOSED_LOOP_CONTROL
         monkeypatch.setattr(new.devices[1], "fail", lambda errors: None)
         new.keep_power(1)
-        with pytest.raises(DriveError, match=r"drive B: does not take its power off: .*closed loop control"):
+        with pytest.raises(DriveError, match=r"drive B: did not power off: .*closed loop control"):
             new.drives.configure(PERIOD)
 
     def test_drive_without_heartbeat(self, new: Rig) -> None:

@@ -86,7 +86,7 @@ def read(name: str, path: Path) -> Table:
     try:
         return _DECODER.decode(files.text(path))
     except FileError as error:
-        raise DriveError(f"{key}: {error}; download the one for your firmware: {DOWNLOADS}") from error
+        raise DriveError(f"{key}: {error}; download the file for your firmware from {DOWNLOADS}") from error
     except (msgspec.MsgspecError, RecursionError) as error:
         raise DriveError(
             f"{key}: {path} is not a valid flat_endpoints.json ({error}); download it: {DOWNLOADS}"

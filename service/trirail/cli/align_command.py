@@ -70,7 +70,7 @@ def calibrate(
 
     if lens == "radial" and centre is None:
         raise TrirailError(
-            "a radial lens wants --centre U V, the pixel on its axis: the middle of the picture for most"
+            "--lens radial needs --centre U V, the pixel on the optical axis: usually the centre of the picture"
         )
     moves = calibration_moves(lens, by, notation.radians(angle, False))
     with source.open_source() as (look, known), service.open() as robot:

@@ -116,7 +116,7 @@ class KeyFolder:
     def _find(self, name: str) -> IssuedCertificate:
         matches = [each for each in self.issued() if each.name == name]
         if not matches:
-            raise ServiceError(f"{self.folder}: nobody is called {name}; trirail keys list shows who there is")
+            raise ServiceError(f"{self.folder}: there is no user {name}; trirail keys list shows the users")
         return matches[0]
 
     def _robot(self) -> IssuedCertificate:

@@ -184,7 +184,7 @@ class Codes:
             name = str(code.number)
             if name in self.marks:
                 both = f"{self.views[name]} and {picture}"
-                raise TrirailError(f"code {name} is in the pictures {both}: give each mark a number of its own")
+                raise TrirailError(f"code {name} is in the pictures {both}: give each mark its own number")
             self.marks[name], self.views[name] = (code.mark.u, code.mark.v), picture
 
 

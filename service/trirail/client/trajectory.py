@@ -138,7 +138,7 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
 def _numbers(where: str, names: Sequence[str], row: Sequence[str]) -> dict[str, float]:
     """Return the numbers of a row by their columns. Raises TrirailError."""
     if len(row) != len(names):
-        raise TrirailError(f"{where}: {len(row)} of {len(names)} columns")
+        raise TrirailError(f"{where}: {len(row)} columns; expected {len(names)}")
     values = {}
     for name, cell in zip(names, row, strict=True):
         try:

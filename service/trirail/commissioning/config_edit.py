@@ -35,7 +35,7 @@ def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
     result = tomlkit.dumps(document)
     # tomlkit edits the text; only the parsed result shows that nothing else has changed.
     if parse(result) != replace_values(parse(text), changes):
-        raise ConfigError(f"changes {dict(changes)}: cannot be written into this file; edit it by hand")
+        raise ConfigError(f"changes {dict(changes)}: cannot be written to this file; edit it by hand")
     return result
 
 
@@ -72,7 +72,7 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
     after = parse(result)
     expected = msgspec.structs.replace(replace_values(before, counts), geometry=after.geometry)
     if after != expected or geometry_of(geometry(after.geometry)) != geometry_of(robot):
-        raise ConfigError("the new geometry cannot be written into this file; edit it by hand")
+        raise ConfigError("the new geometry cannot be written to this file; edit it by hand")
     if map_file is None:
         return result
     document = tomlkit.parse(result)

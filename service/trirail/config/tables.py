@@ -376,7 +376,7 @@ def geometry(table: GeometryTable) -> Geometry:
         raise ConfigError("geometry: give either l0 (the symmetric robot) or three [[geometry.leg]] tables")
     if table.l0 is not None and table.kind != "3-PRP":
         raise ConfigError(
-            f"geometry: l0 is for the paper's 3-PRP robot; for {table.kind} give three [[geometry.leg]] tables"
+            f"geometry: l0 is only for the symmetric 3-PRP robot; for {table.kind} give three [[geometry.leg]] tables"
         )
     labels = _labels(table)
     try:

@@ -176,7 +176,8 @@ class Poses:
         check_new_pose(name)
         if name in self._configured:
             raise RefusedError(
-                RefusalCode.CONFIGURED_POSE, f"{name} is in [poses]: teach another name, or change it there"
+                RefusalCode.CONFIGURED_POSE,
+                f"{name} is defined in [poses]: teach another name, or change it in that section",
             )
         if len(self._taught) >= MAX_TAUGHT_POSES and name not in self._taught:
             raise RefusedError(RefusalCode.BUSY, f"{MAX_TAUGHT_POSES} poses are kept already: remove one")
@@ -227,7 +228,9 @@ class Poses:
             return
         check_new_pose(name)
         if name in self._configured:
-            raise RefusedError(RefusalCode.CONFIGURED_POSE, f"{name} is in [poses]: remove it there")
+            raise RefusedError(
+                RefusalCode.CONFIGURED_POSE, f"{name} is defined in [poses]: remove it from that section"
+            )
         there_are = ", ".join(sorted(self._taught)) or "none"
         raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r} was taught: there is {there_are}")
 

@@ -267,7 +267,7 @@ class Looks:
         look = structs.replace(received, words=quoted(received.words))
         now = self._clock()
         if self._pace.wait(user, now) > 0.0:
-            raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks a second: send fewer")
+            raise RefusedError(RefusalCode.BUSY, f"more than {LOOKS_PER_SECOND:g} looks per second: send fewer")
         self._pace.count(user, now)
         level: Level = "info" if look.end in SUCCESSFUL_ENDS else "warning"
         text = alignment_event_text(look, in_words(look))
