@@ -130,7 +130,7 @@ def test_nothing_else_is_read_otherwise_for_its_commas(line: str) -> None:
         (f"watch --connect {NOBODY}", f"no service at {NOBODY}"),
         ("status --robot a/b", "robot 'a/b' is not a valid name"),
         ("status --robot *", "robot '*' is not a valid name"),
-        ("view no.rrd", "no.rrd is no file"),
+        ("view no.rrd", "no.rrd is not a file"),
         ("report no.rrd", "no.rrd: No such file or directory"),
         ("replay no.rrd", "no.rrd: No such file or directory"),
         ("run no.toml", "no.toml: No such file or directory"),

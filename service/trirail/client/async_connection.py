@@ -57,7 +57,7 @@ class AsyncConnection:
         for part in before:
             self.query_unanswered(parts, part)
         query = self._connection.query(parts, payload, within)
-        async with aclosing(self._replies(self._connection.session.get, attachment=copy, **query)) as replies:
+        async with aclosing(self._replies(lambda session: session.get, attachment=copy, **query)) as replies:
             async for reply in replies:
                 answer = self._connection.read(reply, kind)
                 if not isinstance(answer, ServiceError):
@@ -67,8 +67,9 @@ class AsyncConnection:
 
     async def users(self) -> list[str]:
         """Return the names of the users who have a session to this robot."""
-        get, key = self._connection.session.liveliness().get, self._connection.key("here", "*")
-        async with aclosing(self._replies(get, key_expr=key, timeout=HERE_WITHIN)) as here:
+        key = self._connection.key("here", "*")
+        get = self._replies(lambda session: session.liveliness().get, key_expr=key, timeout=HERE_WITHIN)
+        async with aclosing(get) as here:
             return sorted({str(reply.ok.key_expr).rpartition("/")[2] async for reply in here if reply.ok is not None})
 
     async def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
@@ -142,13 +143,16 @@ class AsyncConnection:
         """Deliver every batch of records in the event loop, until the subscriber's context ends."""
         return self._connection.records(self._in_loop(deliver))
 
-    async def _replies(self, get: Callable[..., object], **query: Any) -> AsyncGenerator[zenoh.Reply]:
-        """Yield the replies to a query sent with Zenoh's `get`; closing the generator cancels the query."""
+    async def _replies(
+        self, get_of: Callable[[zenoh.Session], Callable[..., object]], **query: Any
+    ) -> AsyncGenerator[zenoh.Reply]:
+        """Yield the replies to a query sent with a `get` of the session; closing the generator cancels the query."""
         replies: asyncio.Queue[zenoh.Reply | None] = asyncio.Queue()
         left = zenoh.CancellationToken()
         over = self._in_loop(lambda: replies.put_nowait(None))
         handler = zenoh.handlers.Callback(self._in_loop(replies.put_nowait), over, indirect=False)
-        get(handler=handler, cancellation_token=left, **query)
+        with self._connection.open_session() as session:
+            get_of(session)(handler=handler, cancellation_token=left, **query)
         try:
             while (reply := await replies.get()) is not None:
                 yield reply

@@ -78,7 +78,8 @@ class Connection:
     def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
         """Query the key made of `parts` without waiting for a reply."""
         handler = zenoh.handlers.Callback(_ignore, indirect=False)
-        self.session.get(**self.query(parts, payload, REPLY_WITHIN), handler=handler)
+        with self.open_session() as session:
+            session.get(**self.query(parts, payload, REPLY_WITHIN), handler=handler)
 
     def query(self, parts: tuple[str, ...], payload: bytes | None, within: float) -> dict[str, Any]:
         """Return the arguments of a session's `get` for a query of the key made of `parts`.
@@ -152,7 +153,8 @@ class Connection:
             deliver(answers[0] if answers else silent)
 
         handler = zenoh.handlers.Callback(on_reply, on_end, indirect=False)
-        self.session.get(**query, handler=handler)
+        with self.open_session() as session:
+            session.get(**query, handler=handler)
 
     def to_be_asked_for_role(self, *parts: str) -> str | None:
         """Return the user whose role may explain a missing reply on the key made of `parts`; None if there is none."""
@@ -196,32 +198,40 @@ class Connection:
 
     def subscribe_to_states(self, deliver: Callable[[State], None]) -> zenoh.Subscriber[None]:
         """Deliver every state, until the subscriber's context ends."""
-        return self.session.declare_subscriber(self.key("state"), self._reader.messages(State, deliver))
+        with self.open_session() as session:
+            return session.declare_subscriber(self.key("state"), self._reader.messages(State, deliver))
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
         """Deliver every event, including those of a restarted gateway; `history` delivers past events as well."""
-        return declare_advanced_subscriber(
-            self.session,
-            self.key("event"),
-            self._reader.messages(Event, lambda event: deliver(self._note_sequence(event))),
-            history=HistoryConfig(detect_late_publishers=True) if history else None,
-            recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
+        with self.open_session() as session:
+            return declare_advanced_subscriber(
+                session,
+                self.key("event"),
+                self._reader.messages(Event, lambda event: deliver(self._note_sequence(event))),
+                history=HistoryConfig(detect_late_publishers=True) if history else None,
+                recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+            )
 
     def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
         """Deliver every batch of records, until the subscriber's context ends."""
-        return self.session.declare_subscriber(self.key("records"), self._reader.batches(deliver))
+        with self.open_session() as session:
+            return session.declare_subscriber(self.key("records"), self._reader.batches(deliver))
 
     def key(self, *parts: str) -> str:
         """Return the robot's key of these parts."""
         return zenoh_session.key(self.robot, *parts)
 
-    @property
-    def session(self) -> zenoh.Session:
-        """Zenoh session. Raises ServiceError once it is closed."""
+    @contextlib.contextmanager
+    def open_session(self) -> Iterator[zenoh.Session]:
+        """Yield the Zenoh session. Raises ServiceError once it is closed, also if that happens within the context."""
         if not self.close.alive:
             raise ServiceError(CLOSED)
-        return self._opened
+        try:
+            yield self._opened
+        except zenoh.ZError as error:
+            if self.close.alive:
+                raise
+            raise ServiceError(CLOSED) from error
 
     def _note_sequence(self, message: Message) -> Message:
         """Record the first state that reflects a message of the service; return the message."""
