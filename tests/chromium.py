@@ -97,6 +97,14 @@ class Page:
             assert time.monotonic() < deadline, f"not {expression}: {self.text('body')}"
             time.sleep(0.02)
 
+    def until_equal(self, expression: str, value: object) -> None:
+        """Wait until an expression of JavaScript has a value: the page follows the robot, a moment later."""
+        deadline = time.monotonic() + WITHIN
+        while (found := self.evaluate(expression)) != value:
+            if time.monotonic() > deadline:
+                assert found == value, expression
+            time.sleep(0.02)
+
     def text(self, selector: str) -> str:
         found: str = self.evaluate(f"document.querySelector({selector!r}).innerText")
         return found

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from trirail.alignment.images import Pair
 from trirail.alignment.procedure import Alignment, AlignmentTask, align, calibrate_by_moves, measure_part
 from trirail.client.alignment import UnrecordedAlignmentWarning, drive, drive_async
-from trirail.errors import AlignmentError, ServiceError
+from trirail.errors import AlignmentError, RefusalCode, RefusedError, ServiceError
 from trirail.wire import boundary
 from trirail.wire.looks import AlignmentLook
 from trirail_drivers.interface import Triple
@@ -181,3 +181,48 @@ def no_other_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
+
+
+@given(
+    st.integers(0, 5),
+    st.sampled_from(["reply", "wait"]),
+    st.sampled_from([KeyboardInterrupt(), asyncio.CancelledError(), ServiceError("no reply"), TimeoutError("late")]),
+)
+def test_an_interrupted_motion_is_stopped_and_waited_for(motion: int, place: str, error: BaseException) -> None:
+    stops: list[int] = []
+    sent = 0
+
+    class Stopped(Told):
+        def send(self, goal: Any) -> Any:
+            nonlocal sent
+            sent += 1
+            handle = super().send(goal)
+            if sent <= motion:
+                return handle
+            if place == "reply":
+                raise error
+
+            def wait(_: float) -> Any:
+                raise error
+
+            return SimpleNamespace(wait=wait, result=None)
+
+        def stop(self) -> None:
+            stops.append(sent)
+
+    told = Stopped(3)
+    with pytest.raises(type(error)):
+        told.drive(calibrate_by_moves())
+    assert stops == [motion + 1]
+
+
+def test_a_refused_motion_stops_nothing() -> None:
+    class Refusing(Told):
+        def send(self, goal: Any) -> Any:
+            raise RefusedError(RefusalCode.NOT_ENABLED, "the robot is disabled")
+
+        def stop(self) -> None:
+            raise AssertionError("another user's motion would be stopped")
+
+    with pytest.raises(RefusedError, match="disabled"):
+        Refusing(4).drive(calibrate_by_moves())

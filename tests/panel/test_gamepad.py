@@ -163,5 +163,5 @@ def test_a_pad_where_nothing_may_move_says_why(held: Page, robot: FakeRobot) -> 
     push(held, 1.0, 0.0, 0.0)
     press(held, LEFT)
     held.until("document.querySelector('#answer').textContent.includes(document.querySelector('.hold').title)")
-    assert held.evaluate("document.querySelector('.hold').title")
+    held.until("document.querySelector('.hold').title")
     assert not robot.sent

@@ -128,7 +128,7 @@ def test_no_word_of_the_page_is_outside_of_the_languages(browser: Page, robot: F
         page.languages("xx")
         page.navigate(panel.url)
         page.until(f"{SHOWN} && document.querySelector('#people').textContent")
-        assert page.evaluate("document.querySelector('#mode-name').textContent") == "⟦disabled⟧"
+        page.until_equal("document.querySelector('#mode-name').textContent", "⟦disabled⟧")
         assert outside(page) == []
         page.click("[data-command=enable]")
         page.until("document.querySelector('#mode-name').textContent === '⟦holding⟧'")
@@ -208,7 +208,7 @@ def test_the_language_is_the_browser_s_or_that_of_the_switch_and_keeps_the_lease
         page.until("document.querySelector('#lease').textContent.startsWith('Sie')")
         page.choose("#language", "en")
         page.until(f"document.querySelector('[data-command=enable]').innerText === {shown['en']!r}")
-        assert page.evaluate("document.documentElement.lang") == "en"
+        page.until_equal("document.documentElement.lang", "en")
         page.until("document.querySelector('#lease').textContent.startsWith('You')")
         assert "release" not in robot.commands
         page.close()

@@ -47,7 +47,7 @@ def test_a_viewer_cannot_switch(browser: Page, robot: FakeRobot) -> None:
         page.open(panel.url)
         page.until("document.querySelector('#inputs .lamp')")
         page.until("document.body.dataset.contact === 'yes'")
-        assert page.evaluate(f"document.querySelector('{VALVE}').disabled")
+        page.until(f"document.querySelector('{VALVE}').disabled")
         page.close()
 
 
@@ -56,7 +56,7 @@ def test_ticks_are_where_outputs_will_switch_and_where_they_have(page: Page, rob
     planned += [planned[0] | {"mark": 1, "pose": [0.03, 0.01, 0.0], "number": 3}]
     robot.say("two marks", kind="output", goal="g-1", planned=planned)
     page.until(f"{TICKS} tick.getAttribute('class')).join() === 'tick planned,tick planned'")
-    assert page.evaluate(f"{TICKS} tick.textContent)") == ["valve on", "3 × valve on"]
+    page.until_equal(f"{TICKS} tick.textContent)", ["valve on", "3 × valve on"])
     assert page.evaluate(f"{TICKS} [tick.cx.baseVal.value, tick.cy.baseVal.value])") == [
         pytest.approx([0.02, -0.01]),
         pytest.approx([0.03, -0.01]),

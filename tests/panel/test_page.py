@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import signal
 import time
@@ -248,7 +249,7 @@ def test_a_fault_is_told_with_its_reason_and_reset(enabled: Page, robot: FakeRob
     alarm = enabled.evaluate("(({innerText, role}) => [innerText, role])(document.querySelector('#alarm'))")
     assert "EMCY 8700" in alarm[0]
     assert alarm[1] == "alert"
-    assert enabled.evaluate("[...document.querySelectorAll('.hold')].every((button) => button.disabled)")
+    enabled.until("[...document.querySelectorAll('.hold')].every((button) => button.disabled)")
     enabled.click("[data-command=reset]")
     enabled.until("document.querySelector('#alarm').hidden")
     assert robot.mode == "disabled"
@@ -302,13 +303,13 @@ def test_the_last_alignment_is_shown_with_what_each_mark_had_to_go(page: Page, r
 
     shown = "document.querySelector('#alignment').innerText"
     button = "document.querySelector('[data-view=alignment]')"
-    assert page.evaluate(f"{button}.disabled")
+    page.until(f"{button}.disabled")
     told(1, {"left": 4.123e-4, "<b>": 1e-4}, correction=(1e-4, 0.0, 0.0))
     page.until(f"!{button}.disabled")
     told(2, {"left": 3.1e-7, "<b>": 2e-7}, end="reached", seconds=0.25)
     page.click("[data-view=alignment]")
     for words in ("align-1 of bob", "reached in 0.25 s, corrections: 1", "look 2", "412.3 µm", "0.31 µm", "<b>"):
-        assert words in page.evaluate(shown), words
+        page.until(f"{shown}.includes({json.dumps(words)})")
     robot.say("a look", kind="alignment", user="bob", alignment={"id": "align-2", "purpose": "check", "number": 1})
     for _ in range(300):
         robot.say("much else")
@@ -322,8 +323,8 @@ def test_the_last_alignment_is_shown_with_what_each_mark_had_to_go(page: Page, r
 @pytest.mark.usefixtures("slow_hand")
 def test_the_last_minutes_are_drawn_and_a_silent_time_is_a_gap(enabled: Page, robot: FakeRobot) -> None:
     enabled.click("[data-view=charts]")
-    assert enabled.evaluate("document.querySelector('#mechanism').hasAttribute('hidden')")
-    assert enabled.evaluate("document.querySelectorAll('#charts canvas').length") == 4
+    enabled.until("document.querySelector('#mechanism').hasAttribute('hidden')")
+    enabled.until_equal("document.querySelectorAll('#charts canvas').length", 4)
     enabled.key_down("ArrowRight")
     moves(robot)
     rows = "(await import('./panel.js')).charts.rows"
@@ -375,7 +376,7 @@ def test_what_is_in_the_way_is_said_before_anything_moves(enabled: Page) -> None
     typed(enabled, "500", "0", "0")
     enabled.until("document.querySelector('#going').dataset.may === 'no'")
     assert "slider" in enabled.text("#going-says")
-    assert enabled.evaluate("document.querySelector('.wanted').parentElement.getAttribute('class')") == "barred"
+    enabled.until_equal("document.querySelector('.wanted').parentElement.getAttribute('class')", "barred")
 
 
 @pytest.mark.parametrize("word", ["ten", "10 furlongs", "1.2.3", "1e3", "--5", "5 mm mm"])
@@ -383,9 +384,9 @@ def test_what_is_no_number_is_said_and_goes_nowhere(word: str, enabled: Page, ro
     before = robot.pose
     typed(enabled, "1", word, "0")
     assert "a number was expected" in enabled.text("#going-says")
-    assert enabled.evaluate("document.querySelector('#to-y').getAttribute('aria-invalid')") == "true"
+    enabled.until_equal("document.querySelector('#to-y').getAttribute('aria-invalid')", "true")
     enabled.click("#go")
-    assert enabled.evaluate("document.activeElement.id") == "to-y"
+    enabled.until_equal("document.activeElement.id", "to-y")
     assert robot.pose == before
 
 
@@ -434,11 +435,11 @@ def test_a_place_is_kept_and_forgotten_by_its_name(enabled: Page, robot: FakeRob
     enabled.click("#forget")
     enabled.until("!document.querySelector('#poses').innerText.includes('pick')")
     enabled.write("#pose-name", "park")  # of the configuration
-    assert enabled.evaluate("document.querySelector('#forget').disabled")
+    enabled.until("document.querySelector('#forget').disabled")
 
 
 def test_only_a_robot_that_homes_has_the_button(page: Page, browser: Page) -> None:
-    assert page.evaluate("document.querySelector('[data-command=home]').hidden")
+    page.until("document.querySelector('[data-command=home]').hidden")
     homing = FakeRobot(homes=("A", "C"))
     with Panel(homing.robot()) as panel:
         other = browser.another()
@@ -474,7 +475,7 @@ def test_a_service_that_is_silent_is_told_and_comes_back(page: Page, robot: Fake
         ".map((kind) => document.querySelector(kind).getBoundingClientRect().width > 0)"
     )
     assert not any(page.evaluate(moving))  # nobody knows where it is
-    assert page.evaluate("document.querySelector('.rail').getBoundingClientRect().width")
+    page.until("document.querySelector('.rail').getBoundingClientRect().width")
     robot.silent.clear()
     page.until(f"{SHOWN} && document.querySelector('#alarm').hidden")
     assert all(page.evaluate(moving))
@@ -510,7 +511,7 @@ def test_events_come_with_their_time_the_past_too(page: Page, robot: FakeRobot) 
     page.until("document.querySelector('#events li').innerText.includes('<b>lacks</b>')")
     newest = page.evaluate("document.querySelector('#events li').innerText")
     assert newest.split("recorder")[0].strip().count(":") == 2
-    assert page.evaluate("document.querySelector('#events li').className") == "warning"
+    page.until_equal("document.querySelector('#events li').className", "warning")
 
 
 def test_nothing_is_loaded_from_elsewhere_and_nothing_fails(page: Page, panel: Panel) -> None:
@@ -589,7 +590,7 @@ def test_everything_fits_and_stop_is_always_in_reach(enabled: Page, robot: FakeR
     ends = ("0", "document.documentElement.scrollHeight")
     for (width, height, phone), place in itertools.product(SIZES.values(), ends):
         enabled.resize(width, height, phone=phone)
-        assert enabled.evaluate("document.documentElement.scrollWidth") == width
+        enabled.until_equal("document.documentElement.scrollWidth", width)
         enabled.evaluate(f"scrollTo(0, {place})")
         x, y, w, h = enabled.evaluate(
             "(({x, y, width, height}) => [x, y, width, height])"

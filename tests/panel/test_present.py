@@ -61,7 +61,7 @@ def test_what_is_done_is_said_until_it_is_so_no_longer(enabled: Page, robot: Fak
     robot.refusal = RefusedError(RefusalCode.LEASE_OVER, "taken over by bob")
     robot.holder = "bob"
     enabled.until(f"{ANSWER} === '' && document.querySelector('#lease').textContent.startsWith('bob')")
-    assert enabled.evaluate("document.querySelector('header').contains(document.querySelector('#lease'))")
+    enabled.until("document.querySelector('header').contains(document.querySelector('#lease'))")
 
 
 def test_a_line_goes_by_itself_after_a_while(enabled: Page, robot: FakeRobot) -> None:
@@ -213,7 +213,7 @@ def test_a_jog_is_one_line_of_events(enabled: Page, robot: FakeRobot) -> None:
         enabled.until("document.querySelector('#events li').textContent.includes('done')")
         robot.say(f"after jog {jogs}")
         enabled.until(f"document.querySelector('#events li').textContent.includes('after jog {jogs}')")
-        assert enabled.evaluate(lines) == before + 2
+        enabled.until_equal(lines, before + 2)
 
 
 # ---------------------------------------------------------------------- what would be lost
@@ -295,11 +295,11 @@ def test_a_stage_is_shown_in_micrometres_and_gone_to_in_them(browser: Page, robo
         page = browser.another()
         page.open(panel.url)
         page.until(f"{SHOWN} && document.querySelector('#pose').textContent.includes('1234.5 µm')")
-        assert page.evaluate("document.querySelector('#to-x').placeholder") == "µm"
+        page.until_equal("document.querySelector('#to-x').placeholder", "µm")
         assert "µm/s" in page.text("#sliders")
         assert "µm/s" in page.text("#speed-says")
         page.click("#here")
-        assert page.evaluate("document.querySelector('#to-x').value") == "1234.5"
+        page.until_equal("document.querySelector('#to-x').value", "1234.5")
         typed(page, "250", "0.5 mm", "0")
         page.click("#go")
         until(lambda: bool(robot.moved_to), "it goes")
@@ -326,7 +326,7 @@ def test_german_has_decimal_commas_and_words_for_what_the_service_says(page: Pag
     assert "−12,30 mm" in page.text("#pose")
     assert "." not in page.text("#numbers") + page.text("#speed-says") + page.text("#steps")
     page.click("#here")
-    assert page.evaluate("document.querySelector('#to-y').value") == "-12,3"
+    page.until_equal("document.querySelector('#to-y').value", "-12,3")
     typed(page, "-12,3", "0", "0")
     page.until("document.querySelector('#going').dataset.may === 'yes'")
     typed(page, "500", "0", "0")
@@ -335,7 +335,7 @@ def test_german_has_decimal_commas_and_words_for_what_the_service_says(page: Pag
     robot.refusal = RefusedError(RefusalCode.NOT_AT_REST, "slider A is moved from outside", slider="A")
     page.click("[data-command=enable]")
     page.until(f"{ANSWER}.startsWith('Ein: ein Schlitten wird von außen bewegt')")
-    assert page.evaluate("document.querySelector('#answer span').title") == "slider A is moved from outside"
+    page.until_equal("document.querySelector('#answer span').title", "slider A is moved from outside")
     robot.refusal = RefusedError(RefusalCode.OUT_OF_WORKSPACE, "no", slider="B", value=0.1525, limit=0.15)
     page.click("[data-command=enable]")
     page.until(f"{ANSWER}.endsWith('außerhalb der Grenzen: Schlitten B 152,50 mm, Grenze 150,00 mm')")

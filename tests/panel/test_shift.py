@@ -186,7 +186,7 @@ def test_a_file_is_checked_and_drawn_before_it_is_followed(page: Page, robot: Fa
     wait(lambda: bool(robot.followed), "it follows")
     assert len(robot.followed[0]) == 21
     page.until("document.querySelector('#file-progress').style.visibility === ''")
-    assert page.evaluate("document.querySelector('#file-progress').value") == 0.25
+    page.until_equal("document.querySelector('#file-progress').value", 0.25)
     assert page.text("#file-says") == "path.csv: 25 %, 3.0 s left"
     page.click("#stop")
     page.until("document.querySelector('#file-progress').style.visibility === 'hidden'")
@@ -198,7 +198,7 @@ def test_one_that_is_too_fast_is_refused_or_slowed_where_that_is_wanted(page: Pa
     may(page, "no")
     assert "times too fast" in page.text("#file-says")
     assert drawn(page) == ("route barred", 21)
-    assert page.evaluate("document.querySelector('#follow').disabled")
+    page.until("document.querySelector('#follow').disabled")
     page.click("#stretch")
     may(page, "yes")
     assert "times slower than asked for" in page.text("#file-says")
@@ -210,11 +210,11 @@ def test_a_file_is_slowed_and_followed_by_keys_alone(page: Page, robot: FakeRobo
     page.evaluate("document.querySelector('#stretch').focus()")
     page.type_key("Enter")
     may(page, "yes")
-    assert page.evaluate("document.querySelector('#stretch').checked")
+    page.until("document.querySelector('#stretch').checked")
     assert not robot.followed
     page.type_key("Tab")
     page.type_key("Tab")
-    assert page.evaluate("document.activeElement.id") == "follow"
+    page.until_equal("document.activeElement.id", "follow")
     page.type_key("Enter")
     wait(lambda: bool(robot.followed), "it follows")
 
@@ -247,7 +247,7 @@ def test_keys_in_a_list_choose_and_move_nothing_but_stop_is_stop(page: Page, rob
 def test_a_file_that_cannot_be_followed_says_why(page: Page, name: str, text: str, why: str) -> None:
     choose(page, text, name)
     page.until(f"document.querySelector('#file-says').textContent.includes({why!r})")
-    assert page.evaluate("document.querySelector('#follow').disabled")
+    page.until("document.querySelector('#follow').disabled")
 
 
 def test_json_is_followed_too_and_a_refusal_is_told(page: Page, robot: FakeRobot) -> None:
@@ -257,7 +257,7 @@ def test_json_is_followed_too_and_a_refusal_is_told(page: Page, robot: FakeRobot
     robot.refusal = RefusedError(RefusalCode.WRONG_START, "the trajectory begins elsewhere")
     page.click("#follow")
     page.until("document.querySelector('#answer').textContent.includes('begins elsewhere')")
-    assert page.evaluate("document.querySelector('#file-progress').style.visibility") == "hidden"
+    page.until_equal("document.querySelector('#file-progress').style.visibility", "hidden")
 
 
 # ---------------------------------------------------------------------- the lease, and who is there

@@ -165,11 +165,14 @@ async def _report(robot: StageRobot, reports: LookReports, message: bytes | None
 
 
 async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
-    handle: MotionHandle = await completed(robot.send(structs.replace(goal, id=goal_id)))
+    handle: MotionHandle | None = None
     try:
+        handle = await completed(robot.send(structs.replace(goal, id=goal_id)))
         check(await completed(handle.wait(GOAL_WITHIN)))
-    except BaseException:
-        if handle.result is None:
+    except RefusedError:  # the goal was refused or has ended
+        raise
+    except BaseException:  # even without a reply, the goal may have been accepted
+        if handle is None or handle.result is None:
             await completed(robot.stop())
         raise
 
