@@ -1,7 +1,7 @@
 """trirail: a background service that drives a 3-PRP planar parallel robot in real time.
 
-Public names of the package. Each is loaded on first access: `import trirail` stays fast, `Robot` needs neither compiled
-code nor plots, and the kinematics needs no network.
+This module provides the public names of the package. Each name is loaded on first access, so `import trirail` is fast,
+`Robot` loads neither compiled code nor plotting libraries, and the kinematics does not load the network library.
 
 from trirail import Robot, AsyncRobot            # a connection to a running service
 from trirail import read                         # a recording, into numpy
@@ -71,7 +71,7 @@ _MODULE_OF = {name: module for module, names in _NAMES_BY_MODULE.items() for nam
 
 
 def __getattr__(name: str) -> object:
-    """Load a public name from its module: PEP 562."""
+    """Load a public name from its module (PEP 562)."""
     if name == "__version__":
         from importlib.metadata import version  # its import takes longer than all others
 

@@ -8,7 +8,10 @@ import sys
 
 
 def main() -> None:
-    """Run a command. While the command line loads, for a third of a second, Ctrl-C ends the process at signal level."""
+    """Run a command.
+
+    Loading the command line takes a third of a second; during that time, Ctrl-C ends the process at signal level.
+    """
     _open_standard_streams()
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # nohup ignores it
     if handled:
@@ -21,7 +24,10 @@ def main() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Open the standard streams that are closed, as by `>&-`: else a file that a command opens takes their number."""
+    """Open standard streams that were closed, for example by `>&-`.
+
+    Otherwise the next file that a command opens would get the file descriptor of a standard stream.
+    """
     for number in (0, 1, 2):
         try:
             os.fstat(number)

@@ -1,4 +1,7 @@
-"""Errors of the service: one tree under TrirailError, with object, value, limit and remedy in the message."""
+"""Errors of the service.
+
+All errors derive from TrirailError. Their messages name the object, its value, the limit and the remedy.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +25,11 @@ __all__ = [
 
 
 class ConfigError(TrirailError):
-    """A configuration file is invalid; the message names file, key, value and the allowed values."""
+    """A configuration file is invalid; the message names the file, the key, its value and the allowed values."""
 
 
 class ServiceError(TrirailError):
-    """The service cannot start, or cannot be reached."""
+    """The service cannot start or cannot be reached."""
 
 
 class WaitTimeoutError(TrirailError, TimeoutError):
@@ -38,7 +41,7 @@ class EmptyRecordingError(ServiceError):
 
 
 class KinematicsError(TrirailError, ValueError):
-    """A pose or slider positions are unreachable or singular; the message names leg, value and limit.
+    """A pose or a set of slider positions is unreachable or singular; the message names the leg, value and limit.
 
     `leg` is "A", "B", "C", or "" if no single leg is at fault; `value` and `limit` are in metres or radians.
     """
@@ -51,24 +54,26 @@ class KinematicsError(TrirailError, ValueError):
 
 
 class AlignmentFault(StrEnum):
-    """Reason why marks do not determine the pose of a part."""
+    """Reason why the marks do not determine the pose of a part."""
 
     MISSING = "missing"
-    """Too few marks were found, or one is not in the calibration."""
+    """Too few marks were found, or the calibration does not contain one of them."""
     DISTANCE = "distance"
-    """The distance of two marks is wrong: another part, a wrong calibration, heat."""
+    """The distance between two marks is wrong: the part is a different one, the calibration is wrong, or heat expanded
+    the part."""
     SWAPPED = "swapped"
-    """The names of marks are exchanged."""
+    """The names of two marks are swapped."""
     STILL = "still"
     """The marks do not move with the stage."""
     MOVES = "moves"
-    """The moves of a calibration are too few, or all in one direction."""
+    """The calibration has too few moves, or all of them are in one direction."""
 
 
 class AlignmentError(TrirailError):
-    """Marks do not determine the pose of a part; no correction is sent.
+    """The marks do not determine the pose of a part; no correction is sent.
 
-    `fault` is the reason, for programs; `value` and `limit` are in the fault's own unit, None if it has no limit.
+    `fault` is the reason in a form for programs. `value` and `limit` are in the unit of that fault, and None if the
+    fault has no limit.
     """
 
     def __init__(
@@ -81,12 +86,12 @@ class AlignmentError(TrirailError):
 
 
 class RefusalCode(StrEnum):
-    """Reason why a goal or command is refused or was not carried out; the message has the details for people."""
+    """Reason why a goal or command was refused or not carried out; the message gives the details for people."""
 
     meaning: str
-    """Meaning, in one line."""
+    """Meaning of the code, in one line."""
     remedy: str
-    """Next step of the sender."""
+    """What the sender should do next."""
 
     # The message.
     MALFORMED = (
@@ -218,7 +223,7 @@ class RefusalCode(StrEnum):
     OTHER = "other", "a code that is unknown to this client; no service sends it", "see the message"
 
     def __new__(cls, code: str, meaning: str = "", remedy: str = "") -> Self:
-        """Create a member from its row; a code alone is looked up by the enumeration."""
+        """Create a member from its row in the table; the enumeration itself looks up members by code."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.meaning, member.remedy = meaning, remedy
@@ -226,15 +231,15 @@ class RefusalCode(StrEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> RefusalCode | None:
-        """Map a newer service's code to OTHER, so that an old client still reports the refusal."""
+        """Map an unknown code to OTHER, so that an old client can still report a refusal by a newer service."""
         return cls.OTHER if isinstance(value, str) else None
 
 
 class RefusedError(TrirailError):
-    """The service refused a goal or command, or a client refused it in advance.
+    """The service refused a goal or command, or the client refused it before sending it.
 
-    `code` is the reason, for programs. If one slider or value is at fault, `slider` is "A", "B" or "C", `value` the
-    requested value and `limit` its limit, in SI units and radians.
+    `code` is the reason in a form for programs. If a single slider or value is at fault, `slider` is "A", "B" or "C",
+    `value` is the requested value, and `limit` is the limit of that value, both in SI units and radians.
     """
 
     def __init__(

@@ -1,4 +1,7 @@
-"""Display names of sliders and drives: the labels of [geometry]. Programs, keys and records use the letters A, B, C."""
+"""Display names of sliders and drives, which are the labels in [geometry].
+
+Programs, keys and records always use the letters A, B and C.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ def label(name: str, labels: Labels) -> str:
 
 
 def drive(name: str, labels: Labels) -> str:
-    """Return the display name of a drive: the letter of its table [drives.A], and its slider's label if it has one."""
+    """Return the display name of a drive.
+
+    The name is the letter of the drive's table, such as [drives.A], with the label of its slider if it has one.
+    """
     slider = label(name, labels)
     return f"drive {name}" if slider == name else f"drive {name} ({slider})"

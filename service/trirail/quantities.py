@@ -1,4 +1,4 @@
-"""Formatting of quantities for people, in millimetres and degrees; programs get SI units."""
+"""Formatting of quantities in millimetres and degrees for people; programs receive SI units."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import math
 from typing import Final
 
 DISPLAY_UNITS: Final = {"m": (" mm", 1e3), "rad": ("°", 180.0 / math.pi)}
-"""Displayed unit of an SI unit, and the factor to it."""
+"""Display unit for each SI unit, and the factor that converts to it."""
 _SMALLER: Final = {"m": ((" µm", 1e6), (" nm", 1e9)), "rad": ((" mrad", 1e3), (" µrad", 1e6), (" nrad", 1e9))}
 _DIGITS: Final = 6
 FAMILIAR_UNITS: Final = {"m": (1e-3, 1.0), "rad": (math.pi / 180.0, 2.0)}
-"""Millimetre and degree in SI, and the smallest number that suggests that they were intended."""
+"""Size of a millimetre and a degree in SI units, and the smallest number that suggests that they were intended."""
 _ZERO: Final = 1e-12
-"""Magnitude below which a number of mm or ° is displayed as 0."""
+"""Magnitude below which a number of millimetres or degrees is displayed as 0."""
 
 
 def worded(value: float, unit: str) -> str:
-    """Format a value in m, rad or a rate of these, with six significant digits."""
+    """Format a length, an angle or a rate of change of either with six significant digits."""
     return apart(value, value, unit)[0]
 
 
 def apart(value: float, other: float, unit: str) -> tuple[str, str]:
-    """Format two values with six significant digits, or with as many as distinguish them."""
+    """Format two values with six significant digits, or with as many more as are needed to tell them apart."""
     base, per, rate = unit.partition("/")
     shown, size = DISPLAY_UNITS.get(base, (f" {base}" if base else "", 1.0))
     digits = _DIGITS
@@ -31,7 +31,7 @@ def apart(value: float, other: float, unit: str) -> tuple[str, str]:
 
 
 def beyond(name: str, value: float, limit: float, unit: str) -> str:
-    """Describe a value beyond its limit, by the difference if six digits do not show it."""
+    """Describe a value beyond its limit; state the difference if six digits are too few to show it."""
     base, per, rate = unit.partition("/")
     size = DISPLAY_UNITS.get(base, ("", 1.0))[1]
     if math.isfinite(value) and _same(value * size, limit * size, _DIGITS):
@@ -44,13 +44,14 @@ def beyond(name: str, value: float, limit: float, unit: str) -> str:
 
 
 _WHOLE_TOLERANCE: Final = 1e-6
-"""Rounding error of an angle that was converted from degrees [0.01°]."""
+"""Maximum rounding error of an angle that was converted from degrees [0.01°]."""
 
 
 def meant(value: float, limit: float, unit: str) -> float | None:
-    """Return a bare number above a limit in SI, as if it were in millimetres or degrees; None if that is implausible.
+    """Reinterpret a bare number that exceeds its SI limit as millimetres or degrees.
 
-    An angle of whole hundredths of a degree is taken as converted from degrees already.
+    Returns the value in SI units, or None if this interpretation is implausible. An angle that is a whole number of
+    hundredths of a degree is assumed to have been converted from degrees already.
     """
     size, minimum = FAMILIAR_UNITS[unit.removesuffix("/s")]
     hundredths = 100.0 * math.degrees(value)
@@ -64,4 +65,4 @@ def _same(value: float, other: float, digits: int) -> bool:
 
 
 def _number(value: float, digits: int) -> str:
-    return f"{0.0 if abs(value) < _ZERO else value:.{digits}g}"  # 0 and -0 are one number
+    return f"{0.0 if abs(value) < _ZERO else value:.{digits}g}"  # display -0 as 0

@@ -1,1 +1,1 @@
-"""The command line: `trirail`."""
+"""The `trirail` command line."""

@@ -1,4 +1,4 @@
-"""`trirail align`: cameras calibrated by moves of the stage, a part laid right, and a look alone."""
+"""`trirail align`: calibrate the cameras by moves of the stage, align a part, or only check its position."""
 
 from __future__ import annotations
 
@@ -43,25 +43,25 @@ def calibrate(
 ) -> int:
     """Calibrate the cameras by six moves of the stage, and save the calibration with the marks' present positions.
 
-    Enable the robot first. All marks must be in the pictures, also after the moves. The file's targets are the marks'
-    positions after the last move: align a part before the calibration, or edit the targets.
+    Enable the robot first. All marks must be in the pictures before and after each move. The targets in the file are
+    the marks' positions after the last move, so align a part before you calibrate, or edit the targets.
 
     Parameters
     ----------
     file
         Calibration to write; an existing file is saved as FILE.old.
     by
-        How far to move along x and y, each both ways [m], or with a unit: 0.5mm.
+        Distance of the moves along x and y, in both directions [m], or with a unit: 0.5mm.
     angle
-        How far to turn, both ways [rad], or with a unit.
+        Angle of the rotations, in both directions [rad], or with a unit.
     one_camera
-        The program's marks are all seen by one camera; else each has a camera, or a place of one, of its own.
+        One camera sees all marks of the program. Otherwise each mark has its own camera, or its own camera position.
     lens
-        What the pictures are like: perspective and radial lenses take four more moves, into the corners.
+        Model of the lens. The perspective and radial models need four more moves, into the corners.
     centre
-        Of a radial lens: the pixel U V on its axis, the middle of the picture for most.
+        Pixel U V on the axis of a radial lens, which is the middle of the picture for most lenses.
     approach
-        How far beyond each place to go first, X Y PHI [m, rad], so that backlash is always on the same side.
+        Distance X Y PHI [m, rad] to go beyond each place first, so that backlash is always on the same side.
     """
     from trirail.alignment.procedure import calibrate_by_moves, calibration_moves, observe_mean
     from trirail.client import calibration_file
@@ -110,22 +110,22 @@ def run(
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
-    """Move the part until its marks are at their targets; exit 1 where they are not within the tolerance.
+    """Move the part until its marks are at their targets; exit 1 if they are not within the tolerance.
 
     Parameters
     ----------
     file
-        The calibration, from `trirail align calibrate`.
+        Calibration, from `trirail align calibrate`.
     tolerance
-        How far a mark may be from its target [m], or with a unit: 2um.
+        Maximum distance of a mark from its target [m], or with a unit: 2um.
     angle
-        By what angle the part may be turned [rad], or with a unit; 24 µrad are 5 arcsec.
+        Maximum angle between the part and its target [rad], or with a unit; 24 µrad are 5 arcsec.
     corrections
-        How many may be made.
+        Maximum number of corrections.
     distance_ppm
-        By how much the marks' distance may differ from their targets'.
+        Maximum difference between the distance of the marks and the distance of their targets [ppm].
     approach
-        As at the calibration: how far beyond each place to go first, X Y PHI.
+        Distance X Y PHI to go beyond each place first, as in the calibration.
     """
     from trirail.alignment.procedure import AlignmentTask, align
     from trirail.client import calibration_file
@@ -166,18 +166,18 @@ def check(
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
-    """Look once, say how the part lies, and move nothing; with --moves instead whether the cameras stand as they did.
+    """Measure the part once without moving it; with --moves, check instead that no camera has moved.
 
-    Exit 1 where a camera has been shifted or turned.
+    Exit 1 if a camera has been shifted or turned.
 
     Parameters
     ----------
     file
-        The calibration, from `trirail align calibrate`.
+        Calibration, from `trirail align calibrate`.
     distance_ppm
-        By how much the marks' distance may differ from their targets'.
+        Maximum difference between the distance of the marks and the distance of their targets [ppm].
     moves
-        Make the calibration's moves again, with any part, and compare the cameras with how they were then.
+        Repeat the moves of the calibration, with any part, and compare the cameras with their state at that time.
     """
     from trirail.alignment.calibration_diff import compare_views
     from trirail.alignment.procedure import AlignmentTask, measure_part, repeat_calibration
@@ -223,7 +223,7 @@ def _load_calibration(file: Path, service: Service) -> CalibrationFile:
 
 
 def _checked_calibration(kept: CalibrationFile, file: Path, geometry: str) -> CameraCalibration:
-    """Return the calibration; one that was made with another geometry is unconfirmed again, and said to be so."""
+    """Return the calibration; if it was made with another geometry, mark it unconfirmed and print a warning."""
     if kept.is_of_geometry(geometry):
         return kept.calibration
     terminal.print_error(
@@ -236,5 +236,5 @@ def _checked_calibration(kept: CalibrationFile, file: Path, geometry: str) -> Ca
 def _with_progress(
     requests: Generator[AlignmentRequest, Observation, T], service: Service, looks: int | None = None
 ) -> Generator[AlignmentRequest, Observation, T]:
-    """Return what asks for the same, and tells a person of each look, where no program reads."""
+    """Return a generator of the same requests that also prints each look, unless the output is JSON."""
     return requests if service.json else alignment_lines.print_looks(requests, looks)

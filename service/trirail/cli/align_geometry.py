@@ -1,4 +1,4 @@
-"""`trirail align geometry`: the stage's own geometry by its cameras, as a new configuration that a person asks for."""
+"""`trirail align geometry`: measure the stage's geometry with its cameras and propose a new configuration."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROGRAM = MarkSource()
 
 
 class _Written(NamedTuple):
-    """Files that were written; None for those that nobody wanted."""
+    """Files that were written; None for each file that was not requested."""
 
     config: Path | None = None
     cameras: Path | None = None
@@ -47,31 +47,31 @@ def geometry(
     source: MarkSource = PROGRAM,
     service: Service = HERE,
 ) -> int:
-    """Find the stage's own rails, pivots, scales and cameras by moves over its whole travel, and propose them.
+    """Measure the stage's rails, pivots, scales and cameras by moves over its whole travel, and propose the results.
 
-    The robot is enabled, and the marks of a part in the pictures. Nothing is written without a yes; CONFIG is never
-    changed. The new configuration takes effect when the service is started with it.
+    The robot must be enabled, and the marks of a part must be in the pictures. Nothing is written unless you answer
+    yes, and CONFIG is never changed. The new configuration takes effect when you start the service with it.
 
     Parameters
     ----------
     config
         Configuration with which the service runs.
     field
-        Size of the pictures: COLUMNS ROWS in pixels. Poses are planned so that marks stay in them.
+        Size of the pictures, COLUMNS ROWS in pixels. Poses are planned so that the marks stay in the pictures.
     out
-        Configuration to write; one with a free name beside CONFIG if absent.
+        Configuration to write. If absent, it gets an unused name beside CONFIG.
     calibration
-        Calibration of the cameras to write, for `trirail align run`; an existing file is kept as FILE.old.
+        Camera calibration to write, for `trirail align run`; an existing file is saved as FILE.old.
     poses
-        How many looks to take, 12 or more.
+        Number of looks to take, 12 or more.
     one_camera
-        The program's marks are all seen by one camera; else each has a camera of its own.
+        One camera sees all marks of the program. Otherwise each mark has its own camera.
     lens
-        What the pictures are like.
+        Model of the lens.
     approach
-        How far beyond each pose to go first, X Y PHI [m, rad], so that backlash is always on the same side.
+        Distance X Y PHI [m, rad] to go beyond each pose first, so that backlash is always on the same side.
     yes
-        Write without a question.
+        Write the files without asking.
     """
     from trirail.alignment.procedure import observe_mean
     from trirail.client.alignment import drive
@@ -113,7 +113,7 @@ def geometry(
 
 
 def _check_same(settings: Config, path: Path, robot: Robot) -> None:
-    """Refuse a file that is not the service's. Raises ConfigError."""
+    """Raise ConfigError if the configuration file is not the one with which the service runs."""
     from trirail import config
     from trirail.client.stage_geometry import geometry_id
     from trirail.config.as_built import geometry_of
@@ -125,7 +125,7 @@ def _check_same(settings: Config, path: Path, robot: Robot) -> None:
 
 
 def _usable_map(result: GeometryCalibration, settings: Config, *, quiet: bool) -> AsBuilt | None:
-    """Return the map of the remaining errors if it helps and the limits allow it; say its effect unless `quiet`."""
+    """Return the map of the remaining errors if it helps and the limits allow it; print its effect unless `quiet`."""
     from trirail import config
     from trirail.config import as_built
 
@@ -148,7 +148,7 @@ def _usable_map(result: GeometryCalibration, settings: Config, *, quiet: bool) -
 
 
 def _answers_yes(question: str) -> bool:
-    """Ask at the terminal, or the lines of a script; the end of the input is a no."""
+    """Ask a question; read the answer from the terminal or from a script. The end of the input counts as no."""
     terminal.out.print(f"{terminal.plain(question)} \\[y/N] ", end="")
     try:
         return input().strip().lower() in ("y", "yes")
@@ -166,7 +166,7 @@ def _write(
     targets: Marks,
     errors: AsBuilt | None,
 ) -> _Written:
-    """Write the configuration, the cameras' calibration, and the map. Raises ConfigError, FileError."""
+    """Write the configuration, the calibration of the cameras, and the map. Raises ConfigError or FileError."""
     from trirail.client import calibration_file
     from trirail.commissioning import config_edit
     from trirail.config import as_built
@@ -189,7 +189,7 @@ def _write(
 
 
 def _remarks(settings: Config, taught: list[str]) -> list[str]:
-    """Return the list of data that was made with the old geometry."""
+    """Return remarks on data that was created with the old geometry."""
     remarks = []
     if taught:
         remarks.append(f"taught poses {', '.join(taught)}: flagged until each is taught again")
@@ -212,7 +212,7 @@ def _report(written: _Written, path: Path, remarks: list[str]) -> None:
 
 
 def _content(result: GeometryCalibration) -> dict[str, object]:
-    """Return a calibration for programs; an infinite deviation is null."""
+    """Return a calibration in a form for programs, in which an infinite deviation is null."""
     residual_map = None
     if result.map is not None:
         residual_map = {"before": result.map.before, "after": result.map.after, "helps": result.map.helps}

@@ -1,4 +1,4 @@
-"""Alignments in lines: calibrations, measurements, how they ended; those of a recorded session in its report."""
+"""Text output of alignments: calibrations, measurements, results, and the alignments in the report of a session."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 ARCSECONDS = 3600.0 * 180.0 / math.pi
 FRAME_DEVIATION = 1e-12
-"""Standard deviation below which a parameter is fixed by the choice of the frame [m, rad]; rounding leaves no zero."""
+"""Standard deviation below which a parameter counts as fixed by the choice of the frame [m, rad]. The threshold is not
+zero because of rounding."""
 SUCCESSFUL_ENDS = ("reached", "calibrated", "checked")
 
 
 def show_recorded(alignments: list[AlignmentSummary]) -> None:
-    """Print each with what its marks had to go, look by look."""
+    """Print each alignment with the remaining distances of its marks at every look."""
     terminal.out.print("\nalignments")
     for each in alignments:
         colour = "green" if each.end in SUCCESSFUL_ENDS else "yellow"
@@ -42,7 +43,7 @@ def show_recorded(alignments: list[AlignmentSummary]) -> None:
 
 
 def show_calibration(result: CameraCalibration, file: Path) -> None:
-    """Print what a calibration has found, and where it is kept."""
+    """Print the results of a calibration and the file in which it is saved."""
     for name, view in result.views.items():
         mirrored = ", mirrored" if view.mirrored else ""
         terminal.print_line(f"view {name}: {1e6 / view.scale:.3f} µm a pixel{mirrored}")
@@ -53,7 +54,7 @@ def show_calibration(result: CameraCalibration, file: Path) -> None:
 
 
 def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
-    """Print the corrections to a geometry, the undetermined ones, the outliers, and the residuals."""
+    """Print the corrections to a geometry, the undetermined parameters, the outliers, and the residuals."""
     shown = {name: _labelled(name, labels) for name in result.parameters}
     for name, value in result.parameters.items():
         unit = "ppm" if name.endswith("scale") else "µrad" if name.endswith("angle") else "µm"
@@ -93,13 +94,13 @@ def show_geometry(result: GeometryCalibration, labels: Sequence[str]) -> None:
 
 
 def _labelled(name: str, labels: Sequence[str]) -> str:
-    """Return a parameter's name with the label of its slider."""
+    """Return the name of a parameter with the label of its slider."""
     leg, _, parameter = name.partition(" ")
     return f"{labels[NAMES.index(leg)]} {parameter}"
 
 
 def show_changes(changes: Iterable[ViewChange]) -> None:
-    """Print how each camera stands beside how it was calibrated."""
+    """Print how much each camera has moved since it was calibrated."""
     for each in changes:
         (x, y), (dx, dy) = each.shift, each.shift_deviation
         verdict = "[red]was moved: calibrate again[/]" if each.is_changed else "as it was"
@@ -114,7 +115,10 @@ def show_changes(changes: Iterable[ViewChange]) -> None:
 def print_looks(
     requests: Generator[AlignmentRequest, Observation, T], looks: int | None
 ) -> Generator[AlignmentRequest, Observation, T]:
-    """Wish for the same, and print each look as it comes; `looks` is how many there will be, where that is known."""
+    """Yield the same requests, and print each look when it arrives.
+
+    `looks` is the total number of looks, or None if it is unknown.
+    """
     from trirail.alignment.alignment_request import LookReport
 
     number = 0
@@ -137,7 +141,7 @@ def _describe_look(report: LookReport, seen: Observation) -> str:
 
 
 def format_measurement(alignment: Measurement) -> str:
-    """Return how a part lies, in a line."""
+    """Return a one-line description of the position of a part."""
     x, y = alignment.shift
     return (
         f"to go: x {x * 1e6:.2f} µm, y {y * 1e6:.2f} µm, φ {alignment.turn * ARCSECONDS:.2f} arcsec; "
@@ -146,7 +150,7 @@ def format_measurement(alignment: Measurement) -> str:
 
 
 def show_alignment(result: Alignment) -> None:
-    """Print how an alignment ended."""
+    """Print the result of an alignment."""
     reasons = {
         "reached": "the part lies right",
         "corrections": "no correction is left: raise --corrections or --tolerance, or look at backlash and noise",

@@ -1,4 +1,7 @@
-"""The command line: `trirail COMMAND`. Errors are one line on standard error; exit 1, or 2 for wrong usage."""
+"""The command line `trirail COMMAND`.
+
+An error is printed as one line on standard error. The exit code is then 1, or 2 for wrong usage.
+"""
 
 from __future__ import annotations
 
@@ -51,14 +54,14 @@ app = App(
 def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Literal["text", "json"] | None = None) -> int:
     """Run the service in the foreground until SIGTERM or Ctrl-C.
 
-    Then it stops in a controlled way, disables the drives, and exits with 0.
+    The service then makes a controlled stop, disables the drives, and exits with 0.
 
     Parameters
     ----------
     record
-        Recording file to write, instead of one named by the time in the configured folder.
+        Recording file to write. By default, the file is in the configured folder and is named after the time.
     log
-        Write what happens as lines for people, or as JSON, instead of as [telemetry] log has it.
+        Format of the log: text for people, or JSON. By default, [telemetry] log selects it.
     """
     from trirail.processes.operating_system import ONE_THREAD
 
@@ -83,7 +86,7 @@ def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Litera
         if form == "json":
             lines.log(f"up: robot {settings.robot.name}, goals {', '.join(settings.zenoh.listen)}")
         else:
-            with suppress(OSError, SystemExit):  # a full disk, or a reader that has gone, at which Rich would exit
+            with suppress(OSError, SystemExit):  # on a full disk or a closed pipe, Rich would exit
                 terminal.up(settings, ready)
 
     try:
@@ -97,17 +100,17 @@ def run(config: ConfigFile = None, /, *, record: Path | None = None, log: Litera
 def demo(name: str = "sim", /, *, stay: Annotated[bool, Flag] = False, record: Path | None = None) -> int:
     """Drive simulated drives through a tour of goals, and report.
 
-    It starts a service of its own and enables it.
+    The command starts its own service and enables the robot.
 
     Parameters
     ----------
     name
-        A shipped configuration, as `trirail config` lists it: sim, or a stage as uvw, xxy, uvw-ppr; or align: parts
-        that are laid right on uvw by two simulated cameras.
+        Shipped configuration, as listed by `trirail config`: sim, or a stage such as uvw, xxy or uvw-ppr. With align,
+        two simulated cameras align parts on uvw.
     stay
-        Keep the service and its live view up afterwards, until Ctrl-C.
+        Keep the service and its live view running afterwards, until Ctrl-C.
     record
-        Recording file to leave.
+        Recording file to keep.
     """
     from trirail.cli import demo as shown
 
@@ -122,16 +125,16 @@ def doctor(
 ) -> int:
     """Check this machine and a configuration.
 
-    Exit 1 only if something would keep the robot from running.
+    Exit 1 only if a problem would prevent the robot from running.
 
-    Ten seconds of it measure which rates this machine holds, by cycles that only exchange the frames.
+    For ten seconds, the command runs cycles that only exchange frames, to measure which rates this machine can hold.
 
     Parameters
     ----------
     quick
-        Leave that measurement out.
+        Skip that measurement.
     json
-        Print one JSON object instead of words, with the numbers.
+        Print one JSON object with the numbers instead of text.
     """
     from trirail.cli import probes, rail_drawing
     from trirail.cli.doctor import run_checks
@@ -174,19 +177,19 @@ def view(
 ) -> int:
     """Open the Rerun viewer on the robot, or on a recording.
 
-    Until it is closed, or Ctrl-C.
+    The command ends when you close the viewer or press Ctrl-C.
 
-    Several robots, --robot a --robot b, are side by side: those behind one router.
+    Several robots behind one router, --robot a --robot b, are shown side by side.
 
     Parameters
     ----------
     file
-        Recording to open, instead of the live view.
+        Recording to open instead of the live view.
     web
-        Show it in a browser on this machine, instead of in a window of its own.
+        Show the view in a browser on this machine instead of in its own window.
     records
-        Draw it here, from the records that the service publishes; so it is done anyway for several robots, and
-        where --connect names another machine.
+        Draw the view on this machine from the records that the service publishes. This is always the case for several
+        robots, and if --connect names another machine.
     """
     from trirail.cli import view as viewer
 
@@ -229,9 +232,9 @@ def completion(shell: Shell | None = None, /, *, install: Annotated[bool, Flag] 
     Parameters
     ----------
     shell
-        The shell: bash, zsh or fish; the one in use if absent.
+        Shell: bash, zsh or fish. If absent, the current shell.
     install
-        Write it where the shell finds it, and load it from the shell's start file where that is needed.
+        Write the script to where the shell finds it and, if necessary, load it from the shell's start file.
     """
     with help_pages.show_all(app):
         return script(app, shell, install=install)
@@ -244,7 +247,7 @@ def help_(*command: str) -> int:
     Parameters
     ----------
     command
-        A command, or all.
+        Name of a command, or all.
     """
     if command == ("all",):
         with help_pages.show_all(app):
@@ -258,21 +261,21 @@ help_pages.arrange(app)
 
 
 class Terminated(BaseException):
-    """Request to end this process by SIGTERM or SIGHUP; as after Ctrl-C, the command releases its lease and drives."""
+    """SIGTERM or SIGHUP asked this process to end. As after Ctrl-C, the command releases its lease and drives."""
 
 
 def _terminated(number: int, _frame: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)  # timeout(1) sends it twice, into the way out
+    signal.signal(number, signal.SIG_IGN)  # timeout(1) sends it twice, which would interrupt the exit
     raise Terminated
 
 
 def main() -> None:
-    """Run a command and exit as it says."""
+    """Run a command and exit with its exit code."""
     words = sys.argv[1:]
     warnings.showwarning = lambda message, *_, **__: terminal.print_error(str(message))
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is signal.SIG_DFL:  # not where it is ignored, as under nohup
+            if signal.getsignal(number) is signal.SIG_DFL:  # unless it is ignored, as under nohup
                 signal.signal(number, _terminated)
         code = app(
             notation.numbers(notation.spread(words)),
@@ -293,14 +296,14 @@ def main() -> None:
         code = 130
     except Terminated:
         code = 143
-    except BrokenPipeError:  # the reader, head for one, has seen enough
+    except BrokenPipeError:  # the reader, such as head, has closed the pipe
         sys.stderr.close()
         code = 0
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
-    """Return the error in a command line, with the command and a pointer to its usage."""
+    """Return the message for a wrong command line, with the command and a pointer to its usage."""
     message = str(error).strip()
     behind = words[words.index("--") :] if "--" in words else []
     unknown = error.token.keyword if isinstance(error, UnknownOptionError) else None
@@ -314,6 +317,6 @@ def _wrong_usage(error: CycloptsError, words: list[str]) -> str:
         options = error.app.assemble_argument_collection() if error.app else ()
         if more.endswith(".toml") and any("--config" in option.names for option in options):
             message += f": a configuration is --config {more.split()[-1]}"
-    by_command = type(error) is CycloptsError  # raised by the command itself, which is not told how it was called
+    by_command = type(error) is CycloptsError  # raised by the command itself, which does not know its name
     command = " ".join(("trirail", *(words[:1] if by_command else error.command_chain or ())))
     return f"{message} ({command} --help tells the usage)"

@@ -1,4 +1,7 @@
-"""`trirail commission`: the guide for the first hour with real drives, at a terminal, from a script, or by itself."""
+"""`trirail commission`: guide for the first hour with real drives.
+
+A person at a terminal or a script answers the questions, or the command accepts every proposed answer itself.
+"""
 
 from __future__ import annotations
 
@@ -41,23 +44,24 @@ def commission(
 
     It moves one drive at a time, 1 mm at 5 mm/s, and asks before each step.
 
-    The steps: nodes on the bus, set-up, each slider by hand, power on one drive alone, 1 mm there and back, homing,
-    watchdogs, a square of the platform, its kind; then a new configuration with the results. You can refuse and repeat
-    every step. Ctrl-C stops all drives immediately. A report is saved. Answers are lines of standard input, from a
-    person or a script. Exit 0 only if no step found an error. Stop the service first.
+    The steps are: find the nodes on the bus, set up the drives, move each slider by hand, switch on the power of one
+    drive alone, move it 1 mm there and back, home, test the watchdogs, move the platform along a square, and determine
+    the kind of mechanism. The command then writes a new configuration with the results. You can refuse and repeat every
+    step. Ctrl-C stops all drives immediately. A report is saved. Answers are lines of standard input, from a person or
+    a script. The exit code is 0 only if no step found an error. Stop the service first.
 
     Parameters
     ----------
     config
         Configuration file; it is never changed.
     out
-        Configuration to write; one with a free name beside CONFIG if absent.
+        Configuration to write. If absent, it gets an unused name beside CONFIG.
     report
-        Report to write (JSON; the same in words beside it, .txt); commission-ROBOT-TIME.json if absent.
+        Report to write in JSON, with a text version beside it (.txt). If absent, commission-ROBOT-TIME.json.
     yes
-        Give every answer that simulated drives propose, ask nothing. Only with simulated drives.
+        Ask nothing and accept every proposed answer. Only with simulated drives.
     fault
-        A fault on demand of simulated drives, as "A reversed" or "B scale 0.5"; may be repeated.
+        Fault to simulate in simulated drives, such as "A reversed" or "B scale 0.5"; may be repeated.
     json
         Print the report as one JSON object; all other output goes to standard error.
     """
@@ -94,7 +98,10 @@ def commission(
 
 @contextlib.contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Note Ctrl-C and SIGTERM instead of ending: the drives are stopped first. A second one does end."""
+    """Record Ctrl-C and SIGTERM instead of exiting, so that the drives are stopped first.
+
+    A second signal ends the process.
+    """
     came = False
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -112,10 +119,10 @@ def interruption() -> Iterator[Callable[[], bool]]:
 
 
 class Console:
-    """A person at a terminal, a script's lines, or nobody, where every proposed answer is taken."""
+    """Source of answers: a person at a terminal, the lines of a script, or the proposed answers themselves."""
 
     def __init__(self, *, by_itself: bool, quiet: bool) -> None:
-        """`quiet` leaves standard output to the report."""
+        """Create a console; `quiet` reserves standard output for the report."""
         self._by_itself = by_itself
         self._shown = terminal.err if quiet else terminal.out
         self._typed = b""
@@ -127,7 +134,7 @@ class Console:
         self._shown.print(terminal.plain(line), soft_wrap=True)
 
     def show_judgement(self, judgement: Judgement) -> None:
-        """Print a verdict with its words, and under it what to do."""
+        """Print a verdict and its text, with the remedy below it."""
         first, *others = judgement.words
         verdict = f"[{VERDICTS[judgement.verdict]}]{judgement.verdict:8}[/]"
         self._shown.print(f"  {verdict} {terminal.plain(first)}", soft_wrap=True)
@@ -137,11 +144,11 @@ class Console:
             self._shown.print(f"  {'':8} -> {terminal.plain(judgement.remedy)}", soft_wrap=True)
 
     def ask(self, question: Question, idle: Callable[[], object]) -> str:
-        """Print a question and take the next line; at the end of the input the person has left."""
+        """Print a question and return the next line as the answer; the end of the input counts as quitting."""
         from trirail.commissioning.person import QuitRequest
 
         if not self._echoes:
-            # Input typed before the question, such as a second Enter, is no answer: the question may ask for motion.
+            # Input typed before the question, such as a second Enter, is not an answer: the answer may start a motion.
             termios.tcflush(sys.stdin, termios.TCIFLUSH)
             self._typed = b""
         proposed = f" \\[{terminal.plain(question.default)}]" if question.default is not None else ""
@@ -160,7 +167,7 @@ class Console:
             self._shown.print("  enter an answer, or q to leave: ", end="")
 
     def _next(self) -> str | None:
-        """Return the next line that was typed; None where none is there yet."""
+        """Return the next line that was typed, or None if there is none yet."""
         if self._by_itself:
             return ""
         if b"\n" not in self._typed and self._open and select.select([sys.stdin], [], [], 0.0)[0]:
@@ -173,7 +180,7 @@ class Console:
         return line.decode(errors="replace").strip()
 
     def _last(self) -> str:
-        """Return what stands after the last line's end; where that was nothing, the person has left."""
+        """Return the text after the last line break. Raises QuitRequest if it is empty."""
         from trirail.commissioning.person import QuitRequest
 
         line, self._typed = self._typed.decode(errors="replace").strip(), b""

@@ -18,12 +18,12 @@ from trirail.errors import ConfigError
 app = App(name="config", help="List and copy shipped configurations, show effective values.")
 
 BASE = "sim.toml"
-"""The shipped configuration with which others are compared."""
+"""Shipped configuration with which other configurations are compared."""
 _Tables = dict[str, Any]
 
 
 def _folder() -> Path:
-    """Return the folder of the shipped configurations, in the installed package or in a checkout."""
+    """Return the folder of the shipped configurations, either in the installed package or in a checkout."""
     from trirail.config import SIM
 
     return SIM.parent
@@ -31,7 +31,7 @@ def _folder() -> Path:
 
 @app.default
 def shipped(*, json: Json = False) -> int:
-    """List the shipped configurations, which `trirail config copy` copies, each with its purpose."""
+    """List the shipped configurations with their purposes; `trirail config copy` copies one."""
     files = shipped_files()
     if json:
         terminal.json({"folder": str(_folder()), "files": files})
@@ -45,14 +45,16 @@ def shipped(*, json: Json = False) -> int:
 
 @app.command
 def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
-    """Copy a shipped file to change it: a configuration, the systemd unit, … Never over a file that exists.
+    """Copy a shipped file, such as a configuration or the systemd unit, so that you can change the copy.
+
+    An existing file is never overwritten.
 
     Parameters
     ----------
     name
-        As `trirail config` lists it; ".toml" may be left out.
+        Name, as listed by `trirail config`; ".toml" may be left out.
     dest
-        File or folder; the folder one is in, if absent.
+        Destination file or folder. If absent, the current folder.
     """
     source = shipped_file(name)
     target = dest or Path()
@@ -94,7 +96,7 @@ def show(config: ConfigFile = None, /, *, json: Json = False) -> int:
 
 
 def shipped_files() -> dict[str, str]:
-    """Return the names of the shipped files, each with the line that says what it is for."""
+    """Return the names of the shipped files, each with the line that states its purpose."""
     return {_name(path): _purpose(path) for path in _shipped()}
 
 
@@ -106,12 +108,12 @@ def _shipped() -> list[Path]:
 
 
 def _name(path: Path) -> str:
-    """Return how a file is called: from the folder of shipped ones on."""
+    """Return the name of a shipped file, which is its path relative to the folder of shipped files."""
     return path.relative_to(_folder()).as_posix()
 
 
 def _purpose(path: Path) -> str:
-    """Return what a file is for: its first line is a comment that says so; JSON has no comments, but a field."""
+    """Return the purpose of a file from the comment in its first line, or from a field if the file is JSON."""
     if path.suffix == ".json":
         return str(json_text.loads(path.read_bytes())["description"])
     with path.open(encoding="utf-8") as file:
@@ -119,7 +121,7 @@ def _purpose(path: Path) -> str:
 
 
 def shipped_file(name: str) -> Path:
-    """Return the shipped file of a name; ".toml" may be left out. Raises ConfigError."""
+    """Return the shipped file with this name; ".toml" may be left out. Raises ConfigError if there is none."""
     for path in _shipped():
         if name in (_name(path), _name(path).removesuffix(".toml")):
             return path
@@ -127,7 +129,7 @@ def shipped_file(name: str) -> Path:
 
 
 def _tables(path: Path) -> _Tables:
-    """Return a file's configuration as tables, arrays as lists."""
+    """Return the configuration in a file as tables, with arrays as lists."""
     from trirail.config import load  # numba, with the kinematics
 
     config = load(path)
@@ -138,7 +140,7 @@ def _tables(path: Path) -> _Tables:
 
 
 def _paired(tables: _Tables, other: _Tables, path: str = "") -> Iterator[tuple[str, object, object]]:
-    """Yield each key of either, by its whole path, with both values; None for none."""
+    """Yield the full path of each key in either table with both values; a missing value is None."""
     for key in {**tables, **other}:
         name = f"{path}.{key}" if path else key
         value, was = tables.get(key), other.get(key)

@@ -1,4 +1,4 @@
-"""`trirail demo`: the whole service on simulated drives, driven by a client from outside as a user would."""
+"""`trirail demo`: the whole service with simulated drives, commanded by a client in the same way as by a user."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GOAL_TIMEOUT_S = 15.0
 
 
 class DemoMove(NamedTuple):
-    """One goal of the tour: a name, x, y [m], phi [rad] and the speed."""
+    """One goal of the tour: its name, x, y [m], phi [rad] and speed."""
 
     name: str
     x: float
@@ -44,9 +44,9 @@ ALIGNMENT = (
     DemoMove("the other way", -0.003, 0.004, math.radians(-2.5)),
     DemoMove("back to the centre", *CENTRE),
 )
-"""For stages of millimetres."""
+"""Goals for stages whose travel is a few millimetres."""
 STAGE_RANGE_M = 0.02
-"""The greatest |x| of a stage's table up to which it is one of millimetres [m]."""
+"""Largest |x| of a stage's table for which the stage gets the goals in `ALIGNMENT` [m]."""
 TOUR = (
     DemoMove("paper: rotation by 30°", 0.0, 0.0, math.pi / 6, 0.18),
     DemoMove("back to the centre", *CENTRE),
@@ -70,12 +70,12 @@ class _Row(NamedTuple):
 
 
 def tour(config: Config) -> tuple[DemoMove, ...]:
-    """Return the goals for a robot: the paper's and a round, or those of alignment."""
+    """Return the goals for a robot: the paper's goals and a round trip, or the goals of an alignment stage."""
     return ALIGNMENT if max(map(abs, config.limits.platform.x)) <= STAGE_RANGE_M else TOUR
 
 
 def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
-    """Run the demo on a shipped configuration; return 0 if every goal ended `done` and the service ended well."""
+    """Run the demo on a shipped configuration; return 0 if every goal is `done` and the service ended normally."""
     file = shipped_file(name)
     config = load(file)
     if config.can.interface != "simulated":
@@ -107,7 +107,7 @@ def run(name: str = "sim", *, stay: bool, record: Path | None) -> int:
 
 
 def run_align(record: Path | None) -> int:
-    """Run the demo of alignment; return 0 if every part lies right."""
+    """Run the alignment demo; return 0 if every part was aligned."""
     from trirail.cli import demo_align
 
     file = shipped_file("uvw")

@@ -1,6 +1,6 @@
-"""`trirail demo align`: parts laid right by two simulated cameras, with pictures, marks and residuals in Rerun.
+"""`trirail demo align`: align parts with two simulated cameras; Rerun shows pictures, marks and residuals.
 
-The cameras see a stage that is built otherwise than configured, with play in its drives.
+The cameras see a stage that differs from its configuration and has backlash in its drives.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ MOVE_M, MOVE_ANGLE = 0.5e-3, math.radians(0.5)
 SIZE = 960, 720
 EXPOSURE, DELAY = 0.004, 0.01
 WAIT_S = 0.02
-"""Time until the cameras show a new position: exposure and delay, and the drives' settling [s]."""
+"""Time until the cameras show a new position [s]. It covers exposure, delay and the settling of the drives."""
 BUILT_OFF, BUILT_TURNED, PLAY = 50e-6, 0.1e-3, 0.5e-6
-"""Largest building errors of the stage, in position [m] and angle [rad]; the drives' backlash [m]."""
+"""Largest as-built errors of the stage in position [m] and angle [rad], and backlash of the drives [m]."""
 COLOURS = {"mark": (90, 200, 250), "target": (250, 200, 60), "residual": (240, 90, 90)}
 
 
 class DrawnCameras:
-    """Two simulated cameras over a part, whose pictures go to Rerun as they are taken."""
+    """Two simulated cameras over a part. Each picture is sent to Rerun when it is taken."""
 
     def __init__(self, stage: StageAsBuilt, stream: rr.RecordingStream, seed: int) -> None:
         self.part: Mapping[str, Pair] = MARK_POSITIONS
@@ -58,7 +58,7 @@ class DrawnCameras:
         self._rng = np.random.default_rng(seed)
 
     def capture(self) -> dict[str, Pair]:
-        """Take a picture with each, find the disc in it, and show both."""
+        """Take a picture with each camera, find the disc in the picture, and show both."""
         marks: dict[str, Pair] = {}
         now = time.monotonic()
         self._stream.set_time("time", duration=now)
@@ -88,7 +88,10 @@ class DrawnCameras:
 
 
 def run(file: Path, recording: Path, parts: int = PART_COUNT, seed: int = 0) -> int:
-    """Calibrate, then align `parts` parts; return 0 if all succeeded. Pictures go to `recording` and the live view."""
+    """Calibrate the cameras, then align `parts` parts; return 0 if all succeeded.
+
+    Pictures are written to `recording` and shown in the live view.
+    """
     config = load(file)
     recording.parent.mkdir(parents=True, exist_ok=True)
     pictures = recording.with_name(f"{recording.stem}-pictures.rrd")
@@ -105,14 +108,14 @@ def run(file: Path, recording: Path, parts: int = PART_COUNT, seed: int = 0) -> 
             cameras = DrawnCameras(stage, stream, seed)
             results = list(_parts(robot, cameras, stream, parts, seed))
             robot.disable()
-            stream.disconnect()  # while the live view is there to take the rest
+            stream.disconnect()  # while the live view can still receive the rest
     out.print(f"[bold]recording[/]  {plain(str(recording))}", soft_wrap=True)
     out.print(f"[bold]pictures[/]   {plain(str(pictures))}: look at them with trirail view", soft_wrap=True)
     return 0 if len(results) == parts and all(result.reached for result in results) else 1
 
 
 def _layout() -> rrb.Blueprint:
-    """Return both cameras side by side, beside them what is left of each part."""
+    """Return a layout with both cameras side by side, next to the residuals of each part."""
     cameras = [rrb.Spatial2DView(origin=f"/cameras/{name}", name=name) for name in VIEWS]
     plots = rrb.Vertical(
         rrb.TimeSeriesView(origin="/residual/worst_um", name="A mark has to go  [µm]"),

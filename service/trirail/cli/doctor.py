@@ -1,4 +1,4 @@
-"""Check a machine and its network for a configuration: each check is a function of what trirail.cli.probes has read."""
+"""Checks of a machine and its network for a configuration. Each check is a function of data from trirail.cli.probes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from trirail.wire.vocabulary import Role
 
 
 def network(config: Config, machine: Machine) -> list[Check]:
-    """Return for each endpoint the users that can command the robot, and the findings on certificates and users."""
+    """Return the users that can command the robot at each endpoint, and the findings on certificates and users."""
     remedies = {
         ReachableBy.MACHINE: "where others log in too: unixsock-stream/PATH lets in the socket's owner and group alone",
         ReachableBy.NETWORK: "trirail keys init makes certificates for [zenoh.tls]",
@@ -46,7 +46,7 @@ def network(config: Config, machine: Machine) -> list[Check]:
 
 
 def _connection_limits(config: Config, machine: Machine) -> list[Check]:
-    """Check that the firewall limits the connections of one address, as far as its rules can be read."""
+    """Check that the firewall limits the number of connections per address, as far as its rules can be read."""
     ports = {address[1] for each in config.zenoh.listen if (address := tcp_address(each)) is not None}
     if machine.limited_ports is None or not ports:
         return []
@@ -58,7 +58,7 @@ def _connection_limits(config: Config, machine: Machine) -> list[Check]:
 
 
 def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertificate] | None) -> list[Check]:
-    """Return the users with a role but no certificate, as far as the authority's folder is on this machine."""
+    """Return the users that have a role but no certificate, if the authority's folder is on this machine."""
     if issued is None:
         return []
     known = {each.name: each for each in issued}
@@ -79,7 +79,7 @@ def without_certificate(users: Mapping[str, Role], issued: Sequence[IssuedCertif
 
 
 def routers(links: Sequence[tuple[str, str]]) -> list[Check]:
-    """Check the routers through which users connect; without them the robot serves local users only."""
+    """Check the routers through which users connect; without routers, the robot serves local users only."""
     remedy = "start the router there, or correct zenoh.connect, zenoh.router and certificates"
     return [
         Check("router", "warning", f"{endpoint}: {why}", remedy)
@@ -90,7 +90,7 @@ def routers(links: Sequence[tuple[str, str]]) -> list[Check]:
 
 
 def metrics(config: Config) -> list[Check]:
-    """Check who can read the metrics, if they are on."""
+    """Check which users can read the metrics, if metrics are on."""
     telemetry = config.telemetry
     if not telemetry.metrics_port:
         return []
@@ -104,24 +104,24 @@ def metrics(config: Config) -> list[Check]:
 
 
 RELIABLE_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "riscv_clocksource")
-"""Clock sources that are read without leaving the processor, or its virtual machine."""
+"""Clock sources that can be read without leaving the processor or its virtual machine."""
 MAX_CLOCK_RESOLUTION_S = 1e-6
-"""A clock of a coarser resolution cannot wake anybody in time [s]."""
+"""Coarsest clock resolution that can wake the loop in time [s]."""
 PERFORMANCE = "performance"
-"""The governor that keeps a processor at its full frequency: cpufreq of the kernel."""
+"""Governor of the kernel's cpufreq that keeps a processor at its full frequency."""
 
 
 READS: Final = (
     "loop", "can", "zenoh", "watchdogs", "correction", "drives.protocol",
     "telemetry.metrics_port", "telemetry.metrics_address",
 )  # fmt: skip
-"""Keys of a configuration on which the machine's checks depend."""
+"""Keys of a configuration on which the checks of the machine depend."""
 
 
 def run_checks(path: Path, findings: Findings, read: Callable[[Config], Machine]) -> list[Check]:
-    """Return each mistake of a file, and every check that does not depend on the wrong keys.
+    """Return each mistake in a file, and the results of all checks that do not depend on the wrong keys.
 
-    `read` reads the machine; it is not called if a key that it needs is wrong.
+    `read` reads the properties of the machine. It is not called if a key that it needs is wrong.
     """
     wrong = [mistake.key for mistake in findings.mistakes]
     checks = failed_checks(path, findings.mistakes)
@@ -137,7 +137,7 @@ def run_checks(path: Path, findings: Findings, read: Callable[[Config], Machine]
 
 
 def examine(config: Config, machine: Machine, impossible: Sequence[str] = ()) -> list[Check]:
-    """Return every check, in order; of the configuration those that read no `impossible` key."""
+    """Return all checks in order, without the checks of the configuration that read an `impossible` key."""
     simulated = config.can.interface in {"simulated", "unix"}
     return [
         kernel(machine, simulated=simulated),
@@ -156,7 +156,7 @@ def examine(config: Config, machine: Machine, impossible: Sequence[str] = ()) ->
 
 
 def kernel(machine: Machine, *, simulated: bool) -> Check:
-    """PREEMPT_RT bounds how late a tick can be; simulated drives do not mind."""
+    """Check for PREEMPT_RT, which bounds the lateness of ticks. Simulated drives do not need it."""
     if machine.preempt_rt:
         return Check("kernel", "ok", f"{machine.release}, PREEMPT_RT")
     release = f"{machine.release}, without PREEMPT_RT"
@@ -166,7 +166,7 @@ def kernel(machine: Machine, *, simulated: bool) -> Check:
 
 
 def rights(lacking: tuple[str, ...], realtime: str) -> Check:
-    """Check whether the loop gets the rights that loop.realtime requests."""
+    """Check that the loop gets the rights that loop.realtime requests."""
     if not lacking:
         return Check("rights", "ok", "SCHED_FIFO, locked memory, a processor of its own")
     if realtime == "off":
@@ -177,7 +177,7 @@ def rights(lacking: tuple[str, ...], realtime: str) -> Check:
 
 
 def clock(source: str | None, resolution: float) -> Check:
-    """Check the clock of the loop's ticks."""
+    """Check the clock that times the loop's ticks."""
     if resolution > MAX_CLOCK_RESOLUTION_S:
         reading = f"{source or 'unknown source'}, resolution {resolution * 1e3:g} ms"
         return Check("clock", "failure", reading, "boot a kernel with high-resolution timers (CONFIG_HIGH_RES_TIMERS)")
@@ -190,7 +190,7 @@ def clock(source: str | None, resolution: float) -> Check:
 
 
 def governor(governors: Mapping[int, str]) -> Check:
-    """Check the frequency governors: a processor that sleeps or slows down wakes late."""
+    """Check the frequency governors, because a processor that sleeps or slows down wakes up late."""
     if not governors:
         return Check("governor", "ok", "no processor has frequency scaling to be seen")
     others = sorted({name for name in governors.values() if name != PERFORMANCE})
@@ -213,14 +213,14 @@ def isolation(cpu: int, isolated: tuple[int, ...], *, simulated: bool) -> Check:
 
 
 def correction(config: Config) -> list[Check]:
-    """Report the correction of as-built errors, if one is on."""
+    """Report the correction of as-built errors, if it is on."""
     section = config.correction
     words = as_built.summary(section.map, section.as_built, section.backlash)
     return [] if words is None else [Check("correction", "ok", notation.correction(words, config.geometry.labels))]
 
 
 def can_interface(config: Config, machine: Machine) -> list[Check]:
-    """Check SocketCAN and the interface by the kernel's reports."""
+    """Check SocketCAN and the CAN interface using the kernel's reports."""
     section = config.can
     if section.interface in {"simulated", "unix"}:
         return [Check("CAN", "ok", f"{section.interface}: no hardware is used")]
@@ -259,7 +259,7 @@ def _link(config: Config, machine: Machine) -> list[Check]:
 
 
 def _traffic(config: Config, passed: BusTraffic | None) -> list[Check]:
-    """Report the present traffic of all nodes on the bus; the service itself counts only its own drives' frames."""
+    """Report the current traffic of all nodes on the bus; the service counts only the frames of its own drives."""
     if passed is None:
         return []
     share = bits_of(passed.frames, passed.data) / passed.seconds / config.can.bitrate
@@ -281,7 +281,7 @@ def _bitrate(name: str, bitrate: int, data: dict[str, Any], up: str) -> Check:
 
 
 def _state(name: str, data: dict[str, Any], up: str) -> Check:
-    """The controller's state, ISO 11898-1: a node that sees too many errors leaves the bus."""
+    """Check the state of the CAN controller. A node that detects too many errors leaves the bus (ISO 11898-1)."""
     state = str(data.get("state", "unknown")).lower()
     errors = data.get("berr_counter", {})
     counted = f"; errors sent {errors['tx']}, received {errors['rx']}" if errors else ""
@@ -295,7 +295,7 @@ def _state(name: str, data: dict[str, Any], up: str) -> Check:
 
 
 def _queue(name: str, length: int | None, most_sent: int) -> Check:
-    """The kernel's queue must take two cycles' frames, for a late one and the next on time come together."""
+    """Check that the kernel's queue can hold the frames of two cycles, since a late cycle may meet the next one."""
     wanted = 2 * most_sent
     if length is None or length >= wanted:
         return Check(f"{name} queue", "ok", f"{length or 'unknown number of'} frames")
@@ -304,13 +304,17 @@ def _queue(name: str, length: int | None, most_sent: int) -> Check:
 
 
 def _coalescing(name: str, gathered: ReceiveCoalescing | None, up: str) -> list[Check]:
-    """A position that waits for frames after it is late, and the last of a cycle may wait for the next cycle."""
+    """Check that receive coalescing does not delay frames.
+
+    With coalescing, a position that waits for later frames arrives late, and the last position of a cycle may have to
+    wait for the next cycle.
+    """
     if gathered is None:
         return []
     waits = [f"{gathered.frames} frames"] if gathered.frames > 1 else []
     waits += [f"{gathered.microseconds} µs"] if gathered.microseconds else []
     if not waits:
         return [Check(f"{name} coalescing", "ok", "each frame is handed over as it comes")]
-    # ethtool's way to say off: no time, and one frame (Linux, mcp251xfd_ring_alloc).
+    # ethtool reports "off" as no time and one frame (Linux, mcp251xfd_ring_alloc).
     remedy = f"ip link set {name} down && ethtool -C {name} rx-usecs-irq 0 rx-frames-irq 1 && {up}"
     return [Check(f"{name} coalescing", "warning", f"frames are handed over after {' or '.join(waits)}", remedy)]

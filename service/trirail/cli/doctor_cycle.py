@@ -1,4 +1,4 @@
-"""Judgement of cycles that only exchange frames: the rates at which this machine can run a loop."""
+"""Evaluation of cycles that only exchange frames: the rates at which this machine can run a loop."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
 from trirail.wire.state import Percentiles
 
 MAX_PERIOD_SHARE = 0.5
-"""Share of a period within which 999 of 1000 bare cycles must end; the rest is for the service's own arithmetic."""
+"""Share of a period within which 999 of 1000 bare cycles must end. The rest is for the service's own computations."""
 RATES = (100, 250, 500, 1000, 2000)
-"""Rates that are judged besides the configured one [Hz]."""
+"""Rates that are evaluated in addition to the configured one [Hz]."""
 
 
 class HeldRate(Struct, frozen=True):
-    """Result of the measurement for programs; times in microseconds."""
+    """Result of the measurement in a form for programs; times are in microseconds."""
 
     rate_hz: int
     cycles: int
@@ -25,18 +25,18 @@ class HeldRate(Struct, frozen=True):
     cycle_us: Percentiles
     """Time from SYNC to the setpoints."""
     over_us: Percentiles
-    """Time from the deadline to the end of the cycle: the sum of both for each cycle."""
+    """Time from the deadline to the end of the cycle, which is the sum of lateness and cycle time for each cycle."""
     missed: int
-    """Missed ticks."""
+    """Number of missed ticks."""
     missed_in_a_row: int
     answers_missing: int
-    """Positions that were not received, of three per cycle."""
+    """Number of positions that were not received, out of three per cycle."""
     up_to_hz: int | None
     """Highest rate that the machine can run; None if it can run none."""
 
 
 def compute_held_rate(cycles: Cycles) -> HeldRate:
-    """Compute percentiles and the highest possible rate from measured cycles."""
+    """Compute the percentiles and the highest possible rate from measured cycles."""
     over, rate = compute_percentiles(cycles.lateness + cycles.work), 1_000_000_000 // cycles.period
     missed = [int(each) for each in cycles.missed]
     held = [each for each in {*RATES, rate} if over.p999 <= MAX_PERIOD_SHARE * 1e6 / each]
@@ -54,7 +54,7 @@ def compute_held_rate(cycles: Cycles) -> HeldRate:
 
 
 def cycle(cycles: Cycles | str, config: Config) -> Check:
-    """Check whether the machine keeps the configured period."""
+    """Check whether the machine can keep the configured period."""
     if isinstance(cycles, str):
         if cycles:
             return Check("cycle", "warning", f"not measured: {cycles}", "end that service, ask again")

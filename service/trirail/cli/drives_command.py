@@ -1,4 +1,4 @@
-"""`trirail drives`: drives on the bus, changes that their set-up would make, and their parameters in files."""
+"""`trirail drives`: show the drives on the bus and the changes of their set-up, and keep their parameters in files."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ app = App(name="drives", help="Show the drives; save, compare, restore their par
 UNTESTED_NOTE = (
     "no make of drive was tried on hardware yet: go on with trirail commission, the hand on the emergency stop"
 )
-"""Note about untested drives, also in the first line of the makers' example files."""
+"""Note about untested drives, which is also in the first line of the example files for manufacturers' drives."""
 Axis = Literal["A", "B", "C"]
 _MAX_NAMED: Final = 8
-"""Greatest number of objects named in one line; --json and the file have all."""
+"""Maximum number of objects named in one line. The output of --json and the file contain all of them."""
 
 
 @app.default
 def drives(config: ConfigFile = None, /, *, apply: Annotated[bool, Flag] = False, json: Json = False) -> int:
     """Show each drive: identity, modes, units, and the changes of its set-up with their reasons.
 
-    Without --apply it only reads. No drive gets power, and none stores anything. Stop the service first.
+    Without --apply, the command only reads. No drive gets power, and no drive stores anything. Stop the service first.
 
     Parameters
     ----------
@@ -82,16 +82,16 @@ def save(
     drive: Annotated[tuple[Axis, ...], Parameter(negative="", consume_multiple=False)] = ("A", "B", "C"),
     json: Json = False,
 ) -> int:
-    """Read every parameter of the drives into a file each, drive-A.dcf (CiA 306) and so on. Never over one that exists.
+    """Save all parameters of each drive to a file, such as drive-A.dcf (CiA 306). Existing files are never overwritten.
 
-    Objects that no drive stores are left out: read-only ones, controlwords, targets, actual values, commands.
+    Objects that no drive stores are left out: read-only objects, controlwords, targets, actual values and commands.
 
     Parameters
     ----------
     folder
-        Where to write; the folder one is in, if absent.
+        Folder for the files. If absent, the current folder.
     drive
-        Which drive; may be repeated. All three if absent.
+        Drive to read; may be repeated. If absent, all three drives.
     """
     from trirail_drivers.cia402 import parameter_file
 
@@ -143,16 +143,16 @@ def compare(
     drive: Axis | None = None,
     json: Json = False,
 ) -> int:
-    """Show which parameters two files, or a file and the drive, do not have alike; exit 0 if none, 1 if any.
+    """Show the parameters that differ between two files, or between a file and the drive; exit 1 if any differ, else 0.
 
     Parameters
     ----------
     file
-        DCF of trirail drives save or another program, or a TOML file of an earlier version.
+        DCF written by trirail drives save or another program, or a TOML file of an earlier version.
     other
-        Another one; the drive itself if absent.
+        File to compare with. If absent, the drive itself.
     drive
-        Which drive; the one with the file's node id if absent.
+        Drive to compare. If absent, the drive with the node id in the file.
     """
     from trirail_drivers.cia402 import parameter_file
 
@@ -199,20 +199,20 @@ def restore(
 ) -> int:
     """Restore a drive's parameters from a file, and read them back; exit 1 if any still differs.
 
-    Only without power and with no service or other master on the bus. Parameters of the set-up, node id and bitrate
-    do not change. A file of another product is refused.
+    The drive must be without power, and no service or other master may be on the bus. Parameters of the set-up, the
+    node id and the bitrate do not change. A file for another product is refused.
 
     Parameters
     ----------
     file
-        DCF of trirail drives save or another program, or a TOML file of an earlier version.
+        DCF written by trirail drives save or another program, or a TOML file of an earlier version.
     drive
-        Which drive; the one with the file's node id if absent.
+        Drive to restore. If absent, the drive with the node id in the file.
     replace
-        Also where the drive has another revision, serial number or node id, as one that takes a broken one's place,
-        and where the file does not say of which product it is.
+        Accept a drive with another revision, serial number or node id, such as the replacement of a broken drive, and a
+        file that does not name its product.
     store
-        Have the drive keep them without supply (object 1010h), once all of them are there.
+        Make the drive store the parameters permanently (object 1010h) after all of them have been written.
     """
     from trirail_drivers.connection.opening import open_bus
 
@@ -249,7 +249,7 @@ def _load_config(config: Path | None) -> tuple[Config, Protocol]:
 
 
 def _load_file(file: Path, drive: Axis | None, settings: Config) -> tuple[str, SavedParameters]:
-    """Return what a file has, and the drive that is meant: by name, or by the node id of the file."""
+    """Return the contents of a file and the drive that they are for, selected by name or by the node id in the file."""
     from trirail_drivers.cia402 import parameter_file
 
     nodes: dict[str, int] = {name: getattr(settings.drives, name).node for name in ("A", "B", "C")}
@@ -266,7 +266,7 @@ def _load_file(file: Path, drive: Axis | None, settings: Config) -> tuple[str, S
 
 
 def _read(settings: Config, protocol: Protocol, names: Sequence[str]) -> dict[str, SavedParameters | DriveError]:
-    """Return what drives hold, or why one could not be read."""
+    """Return the parameters of drives, or the reason why a drive could not be read."""
     from trirail_drivers.connection.opening import open_bus
 
     if protocol.save is None:

@@ -1,4 +1,4 @@
-"""`trirail fleet`: live table of all robots that a user may see; those that need attention are first."""
+"""`trirail fleet`: live table of all robots that a user may see; robots that need attention are listed first."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from trirail.client.fleet import Fleet, Member
 
 SNAPSHOT_S = 2.5
-"""Duration of receiving with --json [s]; each robot sends at least once a second."""
+"""Time for which --json receives summaries [s]. Each robot sends at least one per second."""
 REFRESH_S = 0.5
-"""Interval of drawing the table [s]."""
+"""Interval at which the table is redrawn [s]."""
 
 
 def fleet(*, service: Service = HERE) -> int:
     """Show all robots at --connect, usually a router, until Ctrl-C; those that need attention are first.
 
-    A robot is silent if its loop has sent nothing for 3 s. Into a file or pipe, it prints a line for each change of a
-    robot. With --json, it prints once after 2.5 s.
+    A robot is silent if its loop has sent nothing for 3 s. If the output is a file or pipe, the command prints a line
+    whenever a robot changes. With --json, it prints once after 2.5 s.
     """
     never = threading.Event()
     from trirail.client.fleet import Fleet
@@ -50,7 +50,7 @@ def fleet(*, service: Service = HERE) -> int:
 
 
 def _print_changes(seen: Fleet, never: threading.Event) -> None:
-    """Print a line for each robot, and again whenever that has changed."""
+    """Print a line for each robot, and print the line again whenever it changes."""
     printed: dict[str, str] = {}
     while not never.wait(REFRESH_S):
         for member in seen.members():
@@ -76,7 +76,7 @@ def _as_json(member: Member, now: float) -> dict[str, object]:
 
 
 def table(members: Sequence[Member], now: float) -> Table:
-    """Draw the robots, a line each."""
+    """Return a table with one row per robot."""
     from trirail.client.fleet import Attention
 
     drawn = Table("robot", "mode", "needs", "goal", "lateness p99.9", "missed", "version", box=None, pad_edge=False)

@@ -1,4 +1,4 @@
-"""Arrangement of `trirail --help`: groups of commands in the order of use, with examples of each command."""
+"""Arrangement of `trirail --help`: groups of commands in the order of use, with examples for each command."""
 
 from __future__ import annotations
 
@@ -118,17 +118,17 @@ GROUPS: Final[Mapping[str, Mapping[str, Examples]]] = {
         "workspace": ("trirail workspace", "trirail workspace --plot workspace.png --phi -20deg 0 20deg"),
     },
 }
-"""The commands by group, with lines that can be typed."""
+"""Commands by group, each with example command lines."""
 ADVANCED_COMMANDS: Final = (
     *("keys", "router", "completion", "acquire", "release", "goal", "fleet", "replay"),
     *GROUPS["Mathematics"],
 )
-"""Those that a new user does not need: `trirail help all` shows them too."""
+"""Commands that a new user does not need; only `trirail help all` shows them."""
 MORE: Final = "`trirail help all` shows the seldom needed commands too, `trirail help COMMAND` what one takes."
 
 
 def arrange(app: App) -> None:
-    """Put the commands of the command line into their groups, each with its examples; new ones into a last one."""
+    """Assign each command to its group and add its examples; commands without a group go into a last group."""
     for name, commands in GROUPS.items():
         group = Group.create_ordered(name)
         for position, (command, examples) in enumerate(commands.items()):
@@ -141,7 +141,7 @@ def arrange(app: App) -> None:
 
 
 def _arrange_others(app: App) -> None:
-    """Put the commands that no group names into a last one: a new command shows in the help without an entry here."""
+    """Put commands without a group into a last group, so that a new command needs no entry here to be in the help."""
     listed = {"help", *(command for commands in GROUPS.values() for command in commands)}
     others = [name for name in app if name not in listed and not name.startswith("-")]
     for position, command in enumerate(others):
@@ -150,7 +150,7 @@ def _arrange_others(app: App) -> None:
 
 @contextmanager
 def show_all(app: App) -> Iterator[None]:
-    """Have the page of all commands show every one, while the context lasts."""
+    """Show every command on the page of all commands until the context ends."""
     for command in ADVANCED_COMMANDS:
         app[command].show = True
     app.help_epilogue = None

@@ -1,12 +1,12 @@
-"""The folder of an authority: its certificate and key, the robot's, and one folder for each user to take away.
+"""The folder of an authority: its own certificate and key, those of the robot, and a folder to hand over to each user.
 
-    ca.pem  ca-key.pem    the authority: its key can make any user, so keep it off the robot
-    cert.pem  key.pem     the robot's own; with ca.pem and revoked.txt they are all that [zenoh.tls] reads here
-    revoked.txt           users that have no role any more, whatever [zenoh.users] says
+    ca.pem  ca-key.pem    the authority; its key can create any user, so keep it off the robot
+    cert.pem  key.pem     the robot; [zenoh.tls] reads only these two files, ca.pem and revoked.txt
+    revoked.txt           users that no longer have a role, regardless of [zenoh.users]
     users/<user>/         ca.pem, cert.pem, key.pem for the user; delete the key here after you have handed it over
 
-Only their owner can read private keys. No file or folder is ever incomplete: each is written beside its place and
-renamed. A renewed certificate has the same key.
+Private keys can be read by their owner only. No file or folder is ever incomplete, because each is written under a
+temporary name and then renamed. A renewed certificate has the same key as before.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ PRIVATE, PUBLIC = 0o600, 0o644
 
 
 class IssuedCertificate(NamedTuple):
-    """A certificate that the authority has made, or a folder in which there is none."""
+    """A certificate that the authority has issued, or a folder that contains none."""
 
     name: str
     is_robot: bool
-    """Whether it is that of the authority's own robot."""
+    """Whether the certificate belongs to the authority's own robot."""
     serves: bool
-    """Whether it is any robot's, or a router's."""
+    """Whether the certificate belongs to any robot or router."""
     expires: datetime | None
-    """None where there is no certificate."""
+    """Expiry date; None if there is no certificate."""
     folder: Path
 
     def trouble(self, now: datetime | None = None) -> str:
-        """Say why it opens no session; "" where it does."""
+        """Return the reason why the certificate cannot open a session, or "" if it can."""
         if self.expires is None:
             return f"no {CERTIFICATE}: delete {self.folder}, then trirail keys add {self.name} --role ROLE"
         expired = self.expires < (now or datetime.now(UTC))
@@ -52,13 +52,13 @@ class IssuedCertificate(NamedTuple):
 
 
 class KeyFolder:
-    """An authority's files. Every call raises ServiceError, with the file and what would be right."""
+    """The files of an authority. If a method fails, it raises ServiceError with the file and the remedy."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def create(self, robot: str, addresses: Sequence[str], days: float) -> Credentials:
-        """Make a new authority, and the certificate of its robot for the addresses at which clients find it."""
+        """Create a new authority, and a certificate for its robot at the addresses where clients find the robot."""
         if self.folder.exists():
             raise ServiceError(f"{self.folder} exists already: name another folder, or renew what is in it")
         by = authority(robot)
@@ -69,9 +69,9 @@ class KeyFolder:
         return Credentials.read(self.folder)
 
     def add(self, user: str, days: float, addresses: Sequence[str] = ()) -> Credentials:
-        """Make a user's folder; with addresses that of a further robot, which clients find there.
+        """Create the folder of a user or, with addresses, of a further robot that clients find at these addresses.
 
-        A name that was revoked is never given again: the old certificate would be good too.
+        A revoked name is never issued again, because the old certificate would become valid as well.
         """
         folder = self.folder / USERS / user
         if user in revoked(self.folder):
@@ -87,7 +87,7 @@ class KeyFolder:
         return Credentials.read(folder)
 
     def renew(self, name: str, days: float) -> IssuedCertificate:
-        """Make a new certificate for the key of a user, or of the robot."""
+        """Create a new certificate for the existing key of a user or of the robot."""
         there = self._find(name)
         file = there.folder / CERTIFICATE
         try:
@@ -98,7 +98,7 @@ class KeyFolder:
         return self._find(name)
 
     def revoke(self, user: str) -> None:
-        """Revoke a user's role, and delete the user's folder."""
+        """Revoke a user's role and delete the user's folder."""
         there = self._find(user)
         if there.is_robot:
             raise ServiceError(f"{user} is the robot itself: a new authority makes its certificate worthless")
@@ -108,7 +108,7 @@ class KeyFolder:
             rmtree(there.folder)
 
     def issued(self) -> list[IssuedCertificate]:
-        """Return what has been issued and not been revoked: the robot's first, then those of users, by name."""
+        """Return the certificates that were issued and not revoked: the robot's first, then the users' by name."""
         folder = self.folder / USERS
         users = sorted(each for each in folder.iterdir() if each.name[0] != ".") if folder.exists() else []
         return [self._robot(), *(_issued(each, is_robot=False) for each in users)]
@@ -148,7 +148,7 @@ def _write_pair(folder: Path, pair: Pair) -> None:
 
 @contextmanager
 def _atomic_folder(folder: Path) -> Iterator[Path]:
-    """Give a folder to write to, that nobody else can open; it gets its name when the context ends without an error."""
+    """Yield a private folder to write to, and rename it to `folder` if the context ends without an error."""
     with _as_service_error():
         folder.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -172,7 +172,7 @@ def _read(file: Path) -> bytes:
 
 @contextmanager
 def _as_service_error() -> Iterator[None]:
-    """Say what the system says of a file in one line."""
+    """Convert system errors about a file to a ServiceError with a message of one line."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""`trirail keys`: certificates by which robot and users know each other, for [zenoh.tls] of the configuration."""
+"""`trirail keys`: certificates that identify the robot and its users to each other, for [zenoh.tls]."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Addresses = Annotated[
 ]
 HERE = Path("keys")
 LOCAL = ("localhost", "127.0.0.1", "::1")
-"""Addresses that every robot's certificate has: those of its own machine."""
+"""Addresses of the robot's own machine, which every robot's certificate contains."""
 MAX_DAYS = 3650.0
-"""For how many days a certificate is made at most: the authority itself is good for no longer."""
+"""Maximum validity of a certificate in days, which is the validity of the authority itself."""
 
 
 def _check_hosts(addresses: tuple[str, ...]) -> None:
@@ -65,12 +65,12 @@ def init(
     robot
         Name of the robot, as in its configuration.
     address
-        Host names and IP addresses at which clients find the robot; those of its own machine and its host name are
-        always among them.
+        Host names and IP addresses at which clients find the robot. The addresses of this machine and its host name
+        are always included.
     days
-        How long the robot's certificate is good.
+        Validity of the robot's certificate in days.
     folder
-        Folder to make, beside the configuration.
+        Folder to create, beside the configuration.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -102,12 +102,12 @@ def add(
     Parameters
     ----------
     user
-        Name of the user, which goals and commands carry.
+        Name of the user, which is part of the user's goals and commands.
     role
-        Role of the user: a viewer sees everything and may stop, an operator also moves the robot, a maintainer also
-        resets and homes. It takes effect when it is in the configuration.
+        Role of the user: a viewer sees everything and may stop the robot, an operator may also move it, a maintainer
+        may also reset and home it. The role takes effect when it is in the configuration.
     days
-        How long the certificate is good.
+        Validity of the certificate in days.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -133,16 +133,17 @@ def further(
     folder: AuthorityFolder = HERE,
     json: Json = False,
 ) -> int:
-    """Make the certificate of a further robot of this authority, as one that dials a router has it.
+    """Make the certificate of a further robot of this authority, such as a robot that connects to a router.
 
     Parameters
     ----------
     name
         Name of the robot, as in its configuration.
     address
-        Host names and IP addresses at which clients find it without the router, beside those of its own machine.
+        Host names and IP addresses at which clients find the robot without the router, in addition to those of its own
+        machine.
     days
-        How long the certificate is good.
+        Validity of the certificate in days.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -160,7 +161,7 @@ def further(
 @app.default
 @app.command(name="list")
 def show(*, folder: AuthorityFolder = HERE, json: Json = False) -> int:
-    """List the certificates with their expiry, and the revoked users; roles are in the configuration."""
+    """List the certificates with their expiry dates, and the revoked users; roles are in the configuration."""
     from trirail.cli.key_folder import KeyFolder
     from trirail.wire.credentials import revoked
 
@@ -188,15 +189,15 @@ def show(*, folder: AuthorityFolder = HERE, json: Json = False) -> int:
 def renew(name: str, /, *, days: Days = 365.0, folder: AuthorityFolder = HERE, json: Json = False) -> int:
     """Make a new certificate for the key of a user, or of the robot by its name.
 
-    A user's certificate takes effect with the user's next session, the robot's with the next start of the service:
-    restart it while the robot is at rest.
+    A user's certificate takes effect with the user's next session. The robot's certificate takes effect with the next
+    start of the service; restart the service while the robot is at rest.
 
     Parameters
     ----------
     name
-        That of the user, or of the robot.
+        Name of the user or of the robot.
     days
-        How long it is good from now.
+        Validity of the certificate in days from now.
     """
     from trirail.cli.key_folder import KeyFolder
 
@@ -211,14 +212,16 @@ def renew(name: str, /, *, days: Days = 365.0, folder: AuthorityFolder = HERE, j
 
 @app.command
 def revoke(user: str, /, *, folder: Folder = HERE, json: Json = False) -> int:
-    """Take a user's role away, for good: it counts when the service starts again. Do that while the robot stands.
+    """Revoke a user's role permanently.
+
+    The change takes effect when the service is restarted; do this while the robot is at rest.
 
     Parameters
     ----------
     user
-        The name, which is never given again.
+        Name of the user, which is never issued again.
     folder
-        That of the authority; its revoked.txt must be where the robot reads it.
+        Folder of the authority. Its revoked.txt must be where the robot reads it.
     """
     from trirail.cli.key_folder import KeyFolder
 

@@ -1,4 +1,4 @@
-"""The robot's state as people read it: once, live, and beside a jog."""
+"""Display of the robot's state for people: once, live, or during a jog."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ if TYPE_CHECKING:
     from trirail.config import Limits
 
 NEAR_SHARE = 0.05
-"""A position is near a limit in the last such share of its range, a rate in that below its limit."""
+"""Share of its range within which a position counts as near a limit. A rate counts as near its limit if it is less than
+this share of the limit below it."""
 _ALONG = (("x", "mm", "mm/s", 3), ("y", "mm", "mm/s", 3), ("φ", "°", "°/s", 4))
 
 
 def show(state: State, info: Info) -> None:
-    """Print a state, with what as-built errors are corrected by, and what drives do without."""
+    """Print a state, the correction of as-built errors, and the protections that drives lack."""
     grid = table(state, info.robot, info.labels, limits_of(info))
     if info.correction is not None:
         grid.add_row("corrected", plain(notation.correction(info.correction, info.labels)))
@@ -41,8 +42,8 @@ def show(state: State, info: Info) -> None:
 
 
 def watch(robot: Robot, *, json_lines: bool) -> None:
-    """Show the state live, or as lines of JSON, until Ctrl-C; raises ServiceError where nobody answers any more."""
-    info = robot.info()  # fails immediately if there is no service, where the states would only be silent
+    """Show the state live, or as lines of JSON, until Ctrl-C. Raises ServiceError if the service stops answering."""
+    info = robot.info()  # fails immediately without a service, whereas states would only be silent
     limits = limits_of(info)
     with contextlib.suppress(KeyboardInterrupt):
         if json_lines:
@@ -58,7 +59,7 @@ def watch(robot: Robot, *, json_lines: bool) -> None:
 
 
 def _print_once_a_second(robot: Robot) -> None:
-    """Print a line of the state once a second, for a file or pipe, in which a table cannot be redrawn."""
+    """Print the state as a line once a second, for a file or pipe, where a table cannot be redrawn."""
     due = -math.inf
     for state in robot.states(SERVICE_TIMEOUT_S):
         if time.monotonic() >= due:
@@ -69,7 +70,7 @@ def _print_once_a_second(robot: Robot) -> None:
 
 
 def show_jog(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True) -> None:
-    """Show where a jog leads, until it ends or its time is over."""
+    """Show the pose during a jog until the jog ends or its time has elapsed."""
     labels = robot.info().labels
     ends = math.inf if seconds is None else time.monotonic() + seconds
     with Live(console=out, refresh_per_second=10, transient=True) as live:
@@ -82,7 +83,7 @@ def show_jog(robot: Robot, jog: Jog, seconds: float | None, *, show: bool = True
 
 
 def limits_of(info: Info) -> Limits:
-    """Return the limits in a service's information. Raises ServiceError if they cannot be decoded."""
+    """Return the limits from a service's information. Raises ServiceError if they cannot be decoded."""
     from trirail.config import Limits  # numba, with the kinematics
 
     try:
@@ -92,7 +93,7 @@ def limits_of(info: Info) -> Limits:
 
 
 def table(state: State, robot: str, labels: Labels, limits: Limits | None = None) -> Table:
-    """Return a state as a table: faults, current goal, measured and commanded values, near limits, loop."""
+    """Return a state as a table: faults, current goal, measured and commanded values, nearby limits, loop."""
     grid = Table.grid(padding=(0, 2))
     grid.add_row("robot", f"[bold]{plain(robot)}[/]  {_mode(state)}  t {state.t:.2f} s")
     for fault in state.faults:
@@ -121,7 +122,7 @@ def table(state: State, robot: str, labels: Labels, limits: Limits | None = None
 
 
 def near_limits(state: State, limits: Limits, labels: Labels) -> Iterator[str]:
-    """Yield a line for each limit that a measured position, commanded rate or following error is near, or beyond."""
+    """Yield a line for each measured position, commanded rate or following error that is near or beyond its limit."""
     slider, platform = limits.slider, limits.platform
     measured = zip(labels, state.sliders.position, slider.positions, state.sliders.following_error, strict=True)
     for name, at, travel, error in measured:
@@ -184,7 +185,7 @@ def _add_sliders(grid: Table, state: State, labels: Labels) -> None:
 
 
 def _missing(protections: Sequence[MissingProtection], labels: Labels) -> None:
-    """Print what drives do without, a line for what is so of several."""
+    """Print the protections that drives lack; drives that lack the same one share a line."""
     drives: dict[str, list[str]] = {}
     for each in protections:
         drives.setdefault(f"{each.object}, {each.means}", []).append(each.drive)

@@ -26,19 +26,20 @@ class ReceiveCoalescing(Struct, frozen=True):
     """Receive coalescing of a network interface: `ethtool -c`."""
 
     frames: int
-    """Frames after which an interrupt is raised; 1, or 0 if the driver does not count them, is immediately."""
+    """Number of frames after which an interrupt is raised. It is raised immediately if the number is 1, or if it is 0
+    because the driver does not count frames."""
     microseconds: int
-    """Time after which an interrupt is raised [µs]; 0 is immediately."""
+    """Time after which an interrupt is raised [µs]; 0 raises it immediately."""
 
 
 class Machine(Struct, frozen=True):
-    """Properties of the machine; None for unknown ones."""
+    """Properties of the machine; a property is None if it is unknown."""
 
     release: str
     preempt_rt: bool
     af_can: bool
     lacking: tuple[str, ...]
-    """Real-time rights that the loop would lack, each with its remedy: trirail.processes.realtime.acquire."""
+    """Real-time rights that the loop would lack, each with its remedy, from trirail.processes.realtime.acquire."""
     clock_source: str | None
     resolution: float
     """Resolution of the monotonic clock [s]."""

@@ -1,4 +1,4 @@
-"""Marks for `trirail align`: from a program's lines, a folder of pictures or cameras by OpenCV, and their options."""
+"""Sources of marks for `trirail align`, and their options: a program, a folder of pictures, or cameras via OpenCV."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ LINE = dict[str, tuple[float, float]]
 prepare(LINE)
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PICTURE_TIMEOUT_S, WRITE_TIMEOUT_S, POLL_S = 30.0, 1.0, 0.02
-"""Longest wait for a line or a newer picture, longest time to write a picture, and polling interval [s]."""
+"""Maximum wait for a line or a newer picture, maximum time to write a picture, and polling interval [s]."""
 EXIT_TIMEOUT_S = 5.0
-"""Longest time until a program exits after SIGTERM [s]."""
+"""Maximum time that a program may take to exit after SIGTERM [s]."""
 INSTALL = "pip install 'trirail[vision]'"
 BUFFERED_S, MAX_BUFFERED = 0.002, 16
-"""Time below which a picture came from the driver's buffer [s], and the maximum number of buffered pictures."""
+"""Reading time below which a picture counts as buffered by the driver [s], and maximum number of buffered pictures."""
 
 
 class MarkWindow(NamedTuple):
-    """Part of a picture in which a mark is searched [pixel]; the whole picture if the width is 0."""
+    """Part of a picture in which to search for a mark [pixel]; the whole picture if the width is 0."""
 
     picture: str
     u: int = 0
@@ -58,17 +58,18 @@ class Source(NamedTuple):
 
     look: Look
     views: Mapping[str, str] | None = None
-    """Names of views by those of marks; None if unknown, or if each mark has its own camera."""
+    """Name of the view of each mark; None if unknown, or if each mark has its own camera."""
 
 
 @contextlib.contextmanager
 def program(command: str) -> Iterator[Source]:
     """Run a program that prints a line of JSON, {"mark": [u, v], …} [pixel], for each line that it reads.
 
-    Raises TrirailError if it cannot be run, exits, prints anything else, or prints nothing within PICTURE_TIMEOUT_S.
+    Raises TrirailError if the program cannot be run, exits, prints anything else, or prints nothing within
+    PICTURE_TIMEOUT_S.
     """
     try:
-        # In a group of its own: Ctrl-C is for this program, which ends that one.
+        # The program gets its own process group: Ctrl-C goes to trirail, which ends the program.
         process = subprocess.Popen(
             shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0
         )
@@ -116,12 +117,12 @@ def folder(
     windows: Mapping[str, MarkWindow] = NO_WINDOWS,
     family: CodeFamily | None = None,
 ) -> Iterator[Source]:
-    """Find marks in the newest pictures of a folder, such as mark left in left.png.
+    """Find marks in the newest pictures of a folder, such as the mark left in left.png.
 
-    With `windows`, each mark is searched in its window instead; with a `family`, the codes in all pictures are found
-    and named by their numbers. The pictures are overwritten by another program: each look except the first waits until
-    all of them have been written again, since older ones may show the robot in motion. Raises TrirailError, also if
-    that takes longer than PICTURE_TIMEOUT_S.
+    With `windows`, each mark is searched for in its window instead. With a `family`, the codes in all pictures are
+    found and named by their numbers. Another program overwrites the pictures. Each look except the first waits until
+    all pictures have been written again, because older ones may show the robot in motion. Raises TrirailError if a look
+    fails or if this wait exceeds PICTURE_TIMEOUT_S.
     """
     cv2 = _opencv()
     if not path.is_dir():
@@ -169,7 +170,7 @@ def folder(
 
 
 class Codes:
-    """Codes in the pictures of one look, named by their numbers; a code must not be in two pictures."""
+    """Codes in the pictures of one look, named by their numbers. A code must not appear in two pictures."""
 
     def __init__(self, family: CodeFamily) -> None:
         self._family = family
@@ -196,10 +197,11 @@ def cameras(
     windows: Mapping[str, MarkWindow] = NO_WINDOWS,
     family: CodeFamily | None = None,
 ) -> Iterator[Source]:
-    """Open cameras through OpenCV, {mark: device}, a number or an address, and find a mark in a picture of each.
+    """Open cameras through OpenCV and find a mark in a picture of each.
 
-    With a `family`, any number of codes is found in each picture and named by their numbers. The marks of one device
-    are found in one picture, each in its window. Raises TrirailError.
+    `devices` maps each mark to a device, given by its number or address. With a `family`, any number of codes is found
+    in each picture, and the codes are named by their numbers. Marks of the same device are found in one picture, each
+    in its window. Raises TrirailError if a camera or a mark fails.
     """
     cv2 = _opencv()
     shown = Counter(devices.values())
@@ -241,10 +243,11 @@ def cameras(
 
 
 def newest(capture: Any, frame_count: int, clock: Callable[[], float] = time.monotonic) -> Any:
-    """Return a picture whose exposure started after the call, of a film the second next; None if there is none.
+    """Return a picture whose exposure started after the call, or None if there is none.
 
-    A camera's driver buffers unread pictures and returns them without delay. The first picture that is not from the
-    buffer may have been started before the call.
+    From a film, the function returns the picture after the next one.
+    A camera's driver buffers unread pictures and returns them without delay. The exposure of the first picture that is
+    not from the buffer may have started before the call.
     """
     film = capture.get(frame_count) > 0
     for _ in range(0 if film else MAX_BUFFERED):
@@ -286,27 +289,27 @@ def _opencv() -> Any:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class MarkSource:
-    """Source of the marks, one of --program, --pictures and --camera, and settings of their detection."""
+    """Source of the marks, which is one of --program, --pictures and --camera, and settings for their detection."""
 
     program: str | None = None
     'A program that prints a line of JSON, {"mark": [u, v], …} in pixels, for each line that it reads.'
     pictures: Path | None = None
-    "A folder with the newest picture for each mark, as left.png."
+    "A folder with the newest picture for each mark, such as left.png."
     camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    "MARK=DEVICE, a camera's number or address for OpenCV, as left=0; again for another mark."
+    "MARK=DEVICE, a camera's number or address for OpenCV, such as left=0; may be repeated for other marks."
     window: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    """MARK=U,V,WIDTH,HEIGHT, the part of its picture in which a mark is, in pixels, where one picture shows several;
-    with --pictures as MARK=PICTURE:U,V,WIDTH,HEIGHT."""
+    """MARK=U,V,WIDTH,HEIGHT, the part of the picture that contains the mark, in pixels, if one picture shows several
+    marks; with --pictures, MARK=PICTURE:U,V,WIDTH,HEIGHT."""
     shape: Literal["cross", "disc", "corner", "code"] = "cross"
-    "Shape of the marks in pictures; codes are named by their numbers, wherever they are."
+    "Shape of the marks in pictures; codes are named by their numbers, regardless of their position."
     family: CodeFamily = "4x4_50"
     "Family of the codes, ArUco or AprilTag."
     size: float = 100.0
-    "Its size in pixels: a disc's diameter, a cross's bars, a corner's sides."
+    "Size of a mark in pixels: the diameter of a disc, the bars of a cross, or the sides of a corner."
     turn: float = 0.0
-    "Its rotation in the picture, from u to v, in degrees."
+    "Rotation of a mark in the picture, from u to v, in degrees."
     looks: int = 1
-    "Pictures of a measurement, or at each place."
+    "Number of pictures per measurement, or at each place."
     wait: float = 0.0
     "Latency of the cameras [s]."
     speed: notation.Share = 1.0

@@ -1,4 +1,4 @@
-"""Commands that need no service: kinematics and workspace of a configuration's robot."""
+"""Commands that do not need a service: kinematics and workspace of the robot in a configuration."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from trirail.workspace.workspace import Extent
 
 SLICE_STEPS_DEG = (1, 2, 5, 10, 15, 20, 30, 45)
-"""From one slice to the next, if no angles are asked for [°]."""
+"""Possible steps between slices if no angles are given [°]."""
 CM2 = 1e4
-"""Areas are shown in cm²: a stage has some, a large robot a thousand."""
+"""Number of cm² in a m². Areas are shown in cm²: a stage has a few of them, a large robot about a thousand."""
 MAX_SLICES = 8
 """Maximum number of slices."""
 
@@ -37,10 +37,10 @@ def ik(
     deg: Annotated[bool, Flag] = False,
     offline: Offline = DEFAULT,
 ) -> int:
-    """Solve the inverse kinematics: where sliders and passive joints are at a pose, and how they move.
+    """Solve the inverse kinematics: the positions and rates of sliders and passive joints at a pose.
 
-    A pose that the robot cannot reach, or nearer to a singularity than configured, is an error. What only the
-    limits of the platform's window or of the drives forbid is solved, with a warning.
+    A pose that the robot cannot reach, or that is closer to a singularity than configured, is an error. If only the
+    limits of the platform or of the drives forbid the pose, the command solves it and prints a warning.
 
     Parameters
     ----------
@@ -90,9 +90,9 @@ def ik(
 
 
 def fk(a: notation.Length, b: notation.Length, c: notation.Length, /, *, offline: Offline = DEFAULT) -> int:
-    """Solve the forward kinematics: the pose at which the sliders stand as given.
+    """Solve the forward kinematics: the pose that belongs to the given slider positions.
 
-    Sliders beyond their travel, and a pose that the robot cannot reach, are an error.
+    Slider positions beyond the travel are an error, and so is a pose that the robot cannot reach.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def fk(a: notation.Length, b: notation.Length, c: notation.Length, /, *, offline
 
 
 def robot_of(offline: Offline) -> tuple[Config, Geometry]:
-    """Load the configuration that is asked for; return it and its robot. Raises ConfigError."""
+    """Load the requested configuration; return it and its robot's geometry. Raises ConfigError if it is invalid."""
     from trirail.config import SIM, corrected_geometry, load
 
     config = load(offline.config or SIM)
@@ -129,7 +129,7 @@ def robot_of(offline: Offline) -> tuple[Config, Geometry]:
 
 
 def _check_reach(config: Config, robot: Geometry, pose: Array) -> None:
-    """Raise KinematicsError if the robot itself cannot be at a pose; it says all that is wrong."""
+    """Raise KinematicsError if the robot itself cannot reach a pose; the message lists all violated limits."""
     from trirail.workspace.violations import violations
 
     exceeded = violations(robot, config.limits, pose)
@@ -174,15 +174,16 @@ def workspace(
 ) -> int:
     """Measure the workspace that the robot reaches, and the part that the service permits.
 
-    The ends of sliders and platform edges, and the singularity margin, bound the robot's reach. The service permits
-    the part within the window of limits.platform.
+    The travel of sliders and platform edges and the singularity margin bound the robot's reach. The service permits
+    the part of it within limits.platform.
 
     Parameters
     ----------
     plot
-        Picture to draw: slices over phi with the conditioning as colour. Its suffix is its format: .png, .svg, .pdf.
+        Picture of slices at several phi to draw, coloured by conditioning. The suffix selects the format: .png, .svg or
+        .pdf.
     phi
-        Angles of the slices [rad]; round numbers of degrees if absent.
+        Angles of the slices [rad]. If absent, round numbers of degrees.
     deg
         Angles without a unit are in degrees.
     """
@@ -223,7 +224,7 @@ def workspace(
 
 
 def _round_angles(low: float, high: float) -> list[float]:
-    """Return the multiples [rad] of a round number of degrees in a range, few enough to look at together."""
+    """Return the multiples [rad] of a round number of degrees in a range, few enough to be viewed together."""
     for step in SLICE_STEPS_DEG:
         first, last = math.ceil(math.degrees(low) / step), math.floor(math.degrees(high) / step)
         if last - first < MAX_SLICES:

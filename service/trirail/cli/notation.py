@@ -1,6 +1,6 @@
-"""Quantities on the command line: how they are taken, by trirail.wire.units, and how they are printed.
+"""Parsing and formatting of quantities on the command line; trirail.wire.units does the parsing.
 
-What `written` prints is taken by `quantity` again, to its printed digits.
+`quantity` accepts the output of `written` and returns the value to its printed digits.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ prepare(Override)
 
 _NEGATIVE: Final = re.compile(r"-[0-9.]")
 LOWEST_SHARE: Final = 1e-3
-"""Least `speed` of a goal."""
+"""Lowest `speed` of a goal."""
 TOOL: Final = "--tool"
-"""The option that takes a point of the platform, or its name."""
+"""Option that accepts a point of the platform or its name."""
 
 
 def written(value: float, unit: str, digits: int, width: int = 0) -> str:
-    """Write an SI value in a unit, with `digits` decimals, in a column of a `width`."""
+    """Format an SI value in a unit, with `digits` decimals, in a column of width `width`."""
     space = "" if unit == "°" else " "
     return f"{number(value / float(SIZES[unit]), digits):>{width}}{space}{unit}"
 
 
 def number(value: float, digits: int) -> str:
-    """Write a number without the sign of a rounded zero."""
+    """Format a number; a value that rounds to zero has no sign."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def pose(values: Sequence[float], width: int = 0) -> str:
-    """Write a pose, [m, m, rad], on a line, its numbers in columns of a `width`."""
+    """Format a pose [m, m, rad] on one line, with its numbers in columns of width `width`."""
     x, y, phi = values
     return f"x {written(x, 'mm', 3, width)}   y {written(y, 'mm', 3, width)}   φ {written(phi, '°', 4, width)}"
 
@@ -74,8 +74,8 @@ def correction(info: CorrectionInfo, labels: Labels) -> str:
 def numbers(words: Sequence[str]) -> list[str]:
     """Return the words of a command line, prepared for parsing.
 
-    A negative number with a unit, such as -5mm, is no option: none begins with a digit. The two lengths of a point
-    after --tool are joined to one word, U,V. Words after -- stay as they are.
+    A negative number with a unit, such as -5mm, is not an option, because no option begins with a digit. The two
+    lengths of a point after --tool are joined to one word, U,V. Words after -- are not changed.
     """
     end = words.index("--") if "--" in words else len(words)
     read: list[str] = []
@@ -89,7 +89,7 @@ def numbers(words: Sequence[str]) -> list[str]:
 
 
 def is_length(word: str) -> bool:
-    """Whether a word of the command line is a length."""
+    """Return whether a word of the command line is a length."""
     try:
         quantity(word, LENGTH)
     except ValueError:
@@ -98,7 +98,7 @@ def is_length(word: str) -> bool:
 
 
 def share(text: str) -> float:
-    """Return a share of full speed, from a number or a percentage. Raises ValueError with what would be right."""
+    """Parse a share of full speed from a number or a percentage. Raises ValueError with the allowed values."""
     try:
         value = quantity(text, PERCENTAGE) / (100.0 if text.strip().endswith("%") else 1.0)
     except ValueError:
@@ -112,7 +112,7 @@ def share(text: str) -> float:
 
 
 def percent(text: str) -> float:
-    """Return an override [%], from a number or a percentage. Raises ValueError with what would be right."""
+    """Parse an override [%] from a number or a percentage. Raises ValueError with the allowed values."""
     try:
         value = quantity(text, PERCENTAGE)
         converted({"percent": value}, Override)
@@ -124,7 +124,7 @@ def percent(text: str) -> float:
 
 
 def positive(text: str, dimension: Dimension) -> float:
-    """Return a quantity that is not negative. Raises ValueError with what would be right."""
+    """Parse a quantity that must not be negative. Raises ValueError with examples of allowed values."""
     value = quantity(text, dimension)
     if value < 0.0:
         raise ValueError(
@@ -134,7 +134,7 @@ def positive(text: str, dimension: Dimension) -> float:
 
 
 def radians(text: str, deg: bool, dimension: Dimension = ANGLE) -> float:
-    """Return what an angle, or its rate, is in radians; a bare number is one of degrees where `deg` says so."""
+    """Return an angle or its rate in radians; a bare number is in degrees if `deg` is set."""
     return quantity(text, dimension, next(iter(dimension.units)).replace("rad", "deg") if deg else None)
 
 
@@ -142,7 +142,7 @@ AT_REST: Final = (0.0, 0.0, "0")
 
 
 def _one(read: Callable[[str], object]) -> Parameter:
-    """Return what has one word of the command line read."""
+    """Return a parameter that converts one word of the command line with `read`."""
 
     def convert(_: Any, tokens: Sequence[Token]) -> object:
         return read(tokens[0].value)
@@ -151,7 +151,7 @@ def _one(read: Callable[[str], object]) -> Parameter:
 
 
 def _angle(text: str, dimension: Dimension = ANGLE) -> str:
-    """Return an angle as it is, once it is one: how a bare number is meant is known with --deg."""
+    """Return the text of an angle after checking it; --deg determines the unit of a bare number later."""
     quantity(text, dimension)
     return text
 
@@ -161,7 +161,7 @@ def _angles(_: Any, tokens: Sequence[Token]) -> tuple[str, ...]:
 
 
 def _tool(text: str) -> tuple[float, float] | str:
-    """Return a point of the platform, from U,V, or the name of one."""
+    """Parse a point of the platform from U,V, or return its name."""
     u, comma, v = text.partition(",")
     if comma:
         return quantity(u, LENGTH), quantity(v, LENGTH)
@@ -173,7 +173,7 @@ def _tool(text: str) -> tuple[float, float] | str:
 
 
 def _three(along: Dimension, turning: Dimension) -> Parameter:
-    """Return what has three words read, two along x and y and one about φ."""
+    """Return a parameter that converts three words: two along x and y, and one about φ."""
 
     def convert(_: Any, tokens: Sequence[Token]) -> tuple[float, float, str]:
         x, y, phi = (token.value for token in tokens)
@@ -183,27 +183,27 @@ def _three(along: Dimension, turning: Dimension) -> Parameter:
 
 
 Length = Annotated[float, _one(lambda text: quantity(text, LENGTH))]
-"""A length of the command line [m]."""
+"""Length on the command line [m]."""
 Velocity = Annotated[float, _one(lambda text: quantity(text, VELOCITY))]
-"""A velocity of the command line [m/s]."""
+"""Velocity on the command line [m/s]."""
 AngularVelocity = Annotated[float, _one(lambda text: quantity(text, ANGULAR_VELOCITY))]
-"""An angular velocity of the command line [rad/s]."""
+"""Angular velocity on the command line [rad/s]."""
 Distance = Annotated[float, _one(lambda text: positive(text, LENGTH))]
-"""A length that is not negative [m]."""
+"""Non-negative length [m]."""
 Time = Annotated[float, _one(lambda text: positive(text, TIME))]
-"""A time that is not negative [s]."""
+"""Non-negative time [s]."""
 Percent = Annotated[float, _one(percent)]
 """An override [%]."""
 Share = Annotated[float, _one(share)]
 """A share of full speed."""
 ToolPoint = Annotated[tuple[float, float] | str, _one(_tool)]
-"""A point of the platform in its own frame [m], or the name of one in [frames.tool]."""
+"""Point of the platform in the platform's frame [m], or the name of a point in [frames.tool]."""
 Angle = Annotated[str, _one(_angle)]
-"""An angle of the command line, to be read by `radians`."""
+"""Angle on the command line; `radians` converts it."""
 Angles = Annotated[
     tuple[str, ...], Parameter(converter=_angles, consume_multiple=True, negative="", show_default=False)
 ]
-"""Angles, as many as there are."""
+"""Any number of angles."""
 PoseWay = Annotated[tuple[float, float, str], _three(LENGTH, ANGLE)]
 """A displacement in x, y [m] and φ."""
 PoseVelocity = Annotated[tuple[float, float, str], _three(VELOCITY, ANGULAR_VELOCITY)]
@@ -213,14 +213,15 @@ PoseAcceleration = Annotated[tuple[float, float, str], _three(ACCELERATION, ANGU
 
 
 OF_THREE: Final = ("goto", "move", "sliders", "jog", "ik", "fk")
-"""Commands that take three numbers, or poses of three."""
+"""Commands that take three numbers, or poses of three numbers."""
 _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?[^\d,;]*", re.IGNORECASE)
 
 
 def spread(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line with 10mm,20mm,5deg as three, and without commas behind numbers.
+    """Split words such as 10mm,20mm,5deg into three, and remove commas after numbers.
 
-    Two numbers in one word stay one: 10,5 may be meant for a decimal comma, of which its reader tells.
+    A word with two numbers, such as 10,5, is not split, because the comma may be meant as a decimal comma. The parser
+    of the word reports this.
     """
     if not words or words[0] not in OF_THREE:
         return list(words)

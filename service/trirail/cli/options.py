@@ -1,4 +1,4 @@
-"""Options shared by several commands: service or robot, and output format."""
+"""Options that several commands share: the service or robot, and the output format."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from trirail.client.client import Robot
 
 Flag = Parameter(negative="", show_default=False)
-"""An option without a value, that has no opposite."""
+"""Option that has neither a value nor a negative form."""
 Json = Annotated[bool, Flag, Parameter(help="Print one JSON object instead of words.")]
 ConfigFile = Annotated[Path | None, Parameter(help="Configuration file; the simulated robot if absent.")]
 Wait = Annotated[bool, Flag, Parameter(help="Show the progress; exit 0 only when the robot has arrived.")]
 
 
 def described(kind: type[GoalKind], field: str, as_typed: str = "") -> Parameter:
-    """Return the help of an option: the description of its field in a kind of goal, and the notation."""
+    """Return the help of an option, which is the description of its field in a kind of goal and the notation."""
     words = field_description(kind, field)
     return Parameter(help=f"{words[0].upper()}{words[1:]}{as_typed}.")
 
@@ -36,26 +36,26 @@ Speed = Annotated[notation.Share, described(PoseGoal, "speed", "; or as 5%")]
 
 
 def robots(context: CompletionContext) -> list[str]:
-    """Return the names of the robots that answer where the command line says, for the shell to complete."""
+    """Return the names of the robots that answer at the address on the command line, for completion by the shell."""
     from trirail.client.connection import robots_at
 
     return robots_at(context["connect"].value)
 
 
 def poses(context: CompletionContext) -> list[str]:
-    """Return the names of the poses of the robot that the command line means."""
+    """Return the names of the poses of the robot that the command line selects."""
     with _robot(context) as robot:
         return list(robot.poses())
 
 
 def taught_poses(context: CompletionContext) -> list[str]:
-    """Return those of them that were taught."""
+    """Return the names of the taught poses of that robot."""
     with _robot(context) as robot:
         return [name for name, pose in robot.poses().items() if pose.taught]
 
 
 def tool_names(context: CompletionContext) -> list[str]:
-    """Return the names of its tools."""
+    """Return the names of the tools of that robot."""
     return _frames(context, "tool")
 
 
@@ -65,7 +65,7 @@ def frame_names(context: CompletionContext) -> list[str]:
 
 
 def axes_names(context: CompletionContext) -> list[str]:
-    """Return the names of the frames along whose axes a move may be."""
+    """Return the names of the frames whose axes a move can follow."""
     return ["base", "platform", *_frames(context, "work")]
 
 
@@ -83,12 +83,12 @@ def _robot(context: CompletionContext) -> Robot:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Address:
-    """Address of services, and output format."""
+    """Address of the services, and output format."""
 
     connect: Annotated[str, Parameter(env_var="TRIRAIL_CONNECT")] = DEFAULT_LOCATOR
     "Zenoh locator of the service or of a router."
     tls: Annotated[Path | None, Parameter(env_var="TRIRAIL_TLS")] = None
-    "Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT; ~/.config/trirail/ROBOT if absent."
+    "Folder with ca.pem, cert.pem and key.pem, for a locator tls/HOST:PORT. If absent, ~/.config/trirail/ROBOT."
     json: Json = False
 
 
@@ -113,7 +113,7 @@ class Services(Address):
     """Services to connect to, all at one address."""
 
     robot: Annotated[tuple[str, ...], Parameter(env_var="TRIRAIL_ROBOT", completer=robots, negative="")] = ("demo",)
-    "Name of the robot, as in its configuration; again for another one."
+    "Name of the robot, as in its configuration; may be repeated for several robots."
 
 
 HERE, ALL_HERE = Service(), Services()
@@ -126,7 +126,7 @@ class Offline:
 
     config: ConfigFile = None
     json: Annotated[bool, Flag] = False
-    "Print one JSON object, in metres and radians, instead of words."
+    "Print one JSON object, in metres and radians, instead of text."
 
 
 DEFAULT = Offline()

@@ -1,4 +1,4 @@
-"""`trirail panel`: the operator's page, served on this machine's loopback for as long as the command lasts."""
+"""`trirail panel`: serve the operator's page on this machine's loopback until the command ends."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from trirail.cli.robot_commands import show
 from trirail.errors import ConfigError, ServiceError
 
 RETRY_S = 1.0
-"""Time between two attempts to reach a service that is not up yet."""
+"""Time between two attempts to reach a service that is not running yet [s]."""
 TOKEN_BYTES = 16
 TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
-"""Characters of a token: those of a URL, and enough of them not to be guessed."""
+"""Pattern of a token: characters that are allowed in a URL, and enough of them that a token cannot be guessed."""
 
 
 def panel(
@@ -34,20 +34,20 @@ def panel(
 ) -> int:
     """Serve the operator's page to browsers on this machine.
 
-    The page shows the robot live, jogs, stops and commands it. The command waits for a service that is not up yet, and
-    ends by Ctrl-C.
+    The page shows the robot live, and can jog, stop and command it. The command waits for a service that is not running
+    yet. Press Ctrl-C to end it.
 
-    The address that is printed lets anybody move the robot. It is another one each time, unless --port and --token
+    Anyone who knows the printed address can move the robot. The address changes each time, unless --port and --token
     fix it.
 
     Parameters
     ----------
     port
-        Port of the loopback, 0 for any that is free; 9880 if absent, or any where that is taken.
+        Port on the loopback, 0 for any free port. If absent, 9880, or any free port if 9880 is in use.
     token
-        File with the secret part of the address; it is made, for you alone, where there is none.
+        File with the secret part of the address. If there is no such file, it is created and only you can read it.
     open_
-        Open it in the browser.
+        Open the page in the browser.
     """
     from trirail.client.async_client import AsyncRobot
     from trirail.panel.server import Panel
@@ -72,7 +72,7 @@ def panel(
 
 
 def wait_for_robot(service: Service) -> None:
-    """Wait for a service that is not up yet."""
+    """Wait until the service is running."""
     is_announced = False
     while True:
         try:
@@ -87,9 +87,9 @@ def wait_for_robot(service: Service) -> None:
 
 
 def read_token(file: Path) -> str:
-    """Return the token of a file, and make the file, readable for its owner alone, where there is none.
+    """Return the token in a file. If there is no such file, create it so that only its owner can read it.
 
-    Raises ConfigError where others may read it, or where it holds no token.
+    Raises ConfigError if others can read the file or if it does not contain a token.
     """
     try:
         with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as made:

@@ -32,7 +32,7 @@ from trirail.wire.state import State
 from trirail.wire.text import printable
 
 _ARROWS = {"A": "up", "B": "down", "C": "right", "D": "left"}
-# An arrow comes as ESC [ A, or ESC O A where the terminal is in application mode, with modifiers as ESC [ 1 ; 2 A.
+# An arrow key is sent as ESC [ A, in application mode as ESC O A, and with modifiers as ESC [ 1 ; 2 A.
 _KEY = re.compile(r"\x1b[\[O](?P<parameters>[0-9;]*)(?P<final>[@-~])|(?P<escape>\x1b)|(?P<character>.)", re.DOTALL)
 
 
@@ -55,9 +55,9 @@ KEY_TIMEOUT_S = 0.15
 """Time without a repeat after which a key counts as released [s]. A terminal does not report releases; it repeats a
 held key every 30 to 50 ms, after a pause before the first repeat."""
 REDRAW_S = 0.1
-"""Interval of redrawing [s]."""
+"""Interval at which the display is redrawn [s]."""
 STALL_S = 0.5
-"""Pause of this program after which the buffered keys are discarded as stale [s]."""
+"""Length of a pause in this program after which buffered keys are discarded as stale [s]."""
 STATE_TIMEOUT_S = 1.0
 """Time without a state after which the service counts as silent [s]."""
 AXES = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0), "a": (0, 0, 1), "d": (0, 0, -1)}
@@ -66,7 +66,10 @@ HELP = "← → x   ↑ ↓ y   a d φ   + − speed   Space stop   q leave"
 
 
 class Pendant:
-    """Effects of keys: jog a tool while one is held, choose the speed, stop. `top` is the platform's velocity limit."""
+    """Actions of keys: jog a tool while a key is held, choose the speed, stop.
+
+    `top` is the platform's velocity limit.
+    """
 
     def __init__(self, robot: Robot, top: Velocity, tool: Tool | None = None) -> None:
         self._robot = robot
@@ -76,9 +79,9 @@ class Pendant:
         self._until = -math.inf
         self._choice = USUAL
         self.said = HELP
-        """Last message for the operator, one line."""
+        """Last message for the operator, in one line."""
         self.over = False
-        """Whether the operator has pressed the key to leave."""
+        """Whether the operator has pressed the key that ends the pendant."""
 
     @property
     def speed(self) -> Velocity:
@@ -87,7 +90,7 @@ class Pendant:
         return x, y, phi
 
     def press(self, key: str, now: float) -> None:
-        """Handle a key, pressed or repeated by the terminal, at a time of the monotonic clock."""
+        """Handle a key that was pressed or that the terminal repeated; `now` is the time on the monotonic clock."""
         if key in AXES:
             self.hold(AXES[key], now)
             return
@@ -117,7 +120,7 @@ class Pendant:
             self._jog.release()
 
     def close(self) -> None:
-        """Release the held key, and accept no others."""
+        """Release the held key, and ignore all later keys."""
         self._jog.close()
 
     def _stop(self) -> None:
@@ -158,10 +161,10 @@ class _StateReader:
 
 
 def run(robot: Robot, tool: Tool | None = None) -> int:
-    """Serve the operator at the terminal until they leave or the terminal closes; return the exit code.
+    """Run the pendant until the operator leaves or the terminal closes; return the exit code.
 
-    Keys move the `tool`, or the platform's centre without one. Raises ServiceError if standard input is not a terminal
-    or the service does not answer.
+    Keys move the `tool` or, if there is none, the platform's centre. Raises ServiceError if standard input is not a
+    terminal or the service does not answer.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ServiceError("a jog by keys needs a terminal; without one: trirail jog VX VY W --seconds S")
@@ -215,12 +218,15 @@ def _shown(pendant: Pendant, state: State | None) -> Text:
 
 
 class _TerminalClosed(Exception):
-    """The terminal has closed, or the program was asked to exit."""
+    """The terminal was closed, or the program was asked to exit."""
 
 
 @contextmanager
 def _raw(pendant: Pendant) -> Iterator[None]:
-    """Read keys without buffer and echo; release the key and restore the terminal when suspended and at the end."""
+    """Switch the terminal to unbuffered input without echo.
+
+    When the program is suspended and when the context ends, the held key is released and the terminal is restored.
+    """
     descriptor = sys.stdin.fileno()
     before = termios.tcgetattr(descriptor)
 

@@ -1,4 +1,4 @@
-"""Probes of the machine for trirail.cli.doctor: kernel, rights, clock, CAN interface, duration of a cycle."""
+"""Probes of the machine for trirail.cli.doctor: kernel, rights, clock, CAN interface and duration of a cycle."""
 
 from __future__ import annotations
 
@@ -33,19 +33,20 @@ from trirail.processes.session_guard import Guard
 SYSTEM = Path("/sys")
 PROCESSES = Path("/proc")
 _SIOCETHTOOL, _GCOALESCE, _COALESCE = 0x8946, 0x0E, 23
-"""A request of linux/sockios.h, a command of linux/ethtool.h, and the 32-bit words of its struct ethtool_coalesce."""
+"""Request from linux/sockios.h, command from linux/ethtool.h, and number of 32-bit words in struct ethtool_coalesce."""
 MEASUREMENT_S = 10.0
 """Duration of the measurement of cycles [s]."""
 COMMAND_TIMEOUT_S = 5.0
-"""Timeout of a command that reads the machine [s]."""
+"""Time-out of a command that reads properties of the machine [s]."""
 COUNTING_S = 1.0
-"""Duration of counting frames where cycles are not measured [s]."""
+"""Time for which frames are counted if cycles are not measured [s]."""
 
 
 def machine(config: Config, *, quick: bool = False, progress: Callable[[float], None] | None = None) -> Machine:
-    """Run all probes; `quick` measures no cycles, `progress` receives the share of measured cycles.
+    """Run all probes; `quick` skips the measurement of cycles, and `progress` receives the share of measured cycles.
 
-    This process has the loop's real-time rights only during the probes, to leave the processor's other users alone.
+    This process has the loop's real-time rights only during the probes, so that it does not disturb other programs on
+    the processor afterwards.
     """
     cpu = realtime.processor(config.loop)
     running = loop_on(cpu)
@@ -88,7 +89,7 @@ def machine(config: Config, *, quick: bool = False, progress: Callable[[float], 
 
 
 def guard(config: Config) -> Guard | str:
-    """Read the certificates, or say why they cannot be used."""
+    """Read the certificates, or return the reason why they cannot be used."""
     try:
         return Guard(config)
     except ServiceError as error:
@@ -96,7 +97,10 @@ def guard(config: Config) -> Guard | str:
 
 
 def limited_ports() -> tuple[int, ...] | None:
-    """Read at which ports the rules of configs/trirail.nft limit connections; None without nft or the right to ask."""
+    """Return the ports at which the rules of configs/trirail.nft limit connections.
+
+    Returns None if the rules cannot be read, for example because nft or the right to use it is missing.
+    """
     try:
         listed = subprocess.run(
             ("nft", "--json", "list", "tables"), capture_output=True, check=True, timeout=COMMAND_TIMEOUT_S
@@ -113,7 +117,7 @@ def limited_ports() -> tuple[int, ...] | None:
 
 
 def issued(config: Config) -> tuple[IssuedCertificate, ...] | None:
-    """Read which certificates there are, where the authority's folder is that of [zenoh.tls]."""
+    """Return the issued certificates if the folder in [zenoh.tls] is the authority's folder."""
     if config.zenoh.tls is None:
         return None
     folder = Path(config.zenoh.tls.directory)
@@ -124,7 +128,7 @@ def issued(config: Config) -> tuple[IssuedCertificate, ...] | None:
 
 
 def processors(text: str) -> tuple[int, ...]:
-    """Read the kernel's way to write a set of processors: "2-4,7"."""
+    """Parse a set of processors in the kernel's notation, such as "2-4,7"."""
     numbers: list[int] = []
     for part in filter(None, text.split(",")):
         first, _, last = part.partition("-")
@@ -133,7 +137,10 @@ def processors(text: str) -> tuple[int, ...]:
 
 
 def link(name: str) -> dict[str, Any] | None:
-    """Return the kernel's report of a network interface; None if there is none. Raises ServiceError without `ip`."""
+    """Return the kernel's report on a network interface, or None if there is none.
+
+    Raises ServiceError if the program `ip` is missing.
+    """
     if not (SYSTEM / "class/net" / name).exists():
         return None
     command = ("ip", "-details", "-json", "link", "show", "dev", name)
@@ -150,7 +157,10 @@ def link(name: str) -> dict[str, Any] | None:
 
 
 def read_coalescing(name: str) -> ReceiveCoalescing | None:
-    """Return the receive coalescing of a network interface; None where its driver does not tell (linux/ethtool.h)."""
+    """Return the receive coalescing of a network interface, or None if its driver does not report it.
+
+    The request is defined in linux/ethtool.h.
+    """
     settings = (ctypes.c_uint32 * _COALESCE)(_GCOALESCE)
     request = struct.pack("16sP", name.encode(), ctypes.addressof(settings))
     try:
@@ -163,7 +173,7 @@ def read_coalescing(name: str) -> ReceiveCoalescing | None:
 
 
 def read_counters(name: str) -> BusTraffic | None:
-    """Return the counters of a network interface since its creation; None where the kernel has none."""
+    """Return the counters of a network interface since its creation, or None if the kernel has none."""
     at = time.monotonic()
     statistics = SYSTEM / "class/net" / name / "statistics"
     texts = [_text(statistics / file) for file in ("rx_packets", "tx_packets", "rx_bytes", "tx_bytes")] if name else []
@@ -174,7 +184,7 @@ def read_counters(name: str) -> BusTraffic | None:
 
 
 def traffic_between(before: BusTraffic | None, after: BusTraffic | None) -> BusTraffic | None:
-    """Return the traffic between two counts; None without both."""
+    """Return the traffic between two counts, or None if either is missing."""
     if before is None or after is None:
         return None
     return BusTraffic(after.seconds - before.seconds, after.frames - before.frames, after.data - before.data)
@@ -188,9 +198,9 @@ def governors() -> dict[int, str]:
 
 
 def loop_on(cpu: int) -> int | None:
-    """Return the process id of a service's loop that may run on a processor; None where there is none to be seen."""
+    """Return the process id of a service's loop that may run on a processor, or None if no such loop is visible."""
     for process in PROCESSES.glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended meanwhile, or is hidden
+        with contextlib.suppress(OSError):  # the process has ended, or is hidden
             if (process / "cmdline").read_bytes().rstrip(b"\0").decode(errors="replace") != title("loop"):
                 continue
             allowed = re.search(r"^Cpus_allowed_list:\s*(\S+)", (process / "status").read_text(), re.MULTILINE)
@@ -201,7 +211,7 @@ def loop_on(cpu: int) -> int | None:
 
 @contextlib.contextmanager
 def _rights_of(loop: LoopTable) -> Iterator[tuple[str, ...]]:
-    """Have the loop's rights and its processor meanwhile; which of them it would lack."""
+    """Acquire the loop's rights and processor until the context ends; yield the rights that the loop would lack."""
     allowed, policy, priority = os.sched_getaffinity(0), os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         yield realtime.acquire(structs.replace(loop, realtime=_available_rights(loop)))
@@ -224,7 +234,7 @@ def _has_can() -> bool:
 
 
 def _text(path: Path) -> str | None:
-    """The content of one of the kernel's files, None where there is none."""
+    """Return the content of one of the kernel's files, or None if it cannot be read."""
     try:
         return path.read_text().strip()
     except OSError:

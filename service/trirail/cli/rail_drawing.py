@@ -1,4 +1,4 @@
-"""Draws a rail with the sliders' travel on it, and how far a stop from full velocity at its end would go."""
+"""Drawing of a rail with the sliders' travel and the distance of a stop from full velocity at the end of the travel."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from trirail.cli import terminal
 from trirail.diagnosis import Stops
 
 _RAIL_COLUMNS: Final = 60
-"""Characters in which a rail is drawn."""
+"""Number of characters in the drawing of a rail."""
 
 
 def draw_lines(stops: Stops) -> list[str]:
-    """Return the lines of the drawing: to scale, but each part at least one character long."""
+    """Return the lines of the drawing, which is to scale except that each part is at least one character long."""
     low, high = stops.rail or stops.travel
     low, high = min(low, stops.travel[0]), max(high, stops.travel[1])
 
@@ -34,7 +34,7 @@ def draw_lines(stops: Stops) -> list[str]:
 
 
 def show(stops: Stops) -> None:
-    """Print the drawing, and the numbers as a table."""
+    """Print the drawing and a table of the numbers."""
     terminal.print_line("")
     for line in draw_lines(stops):
         terminal.print_line(line)

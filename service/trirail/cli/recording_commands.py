@@ -1,4 +1,4 @@
-"""Commands on recorded sessions, that need no service: a replay, and a report."""
+"""Commands for recorded sessions, which do not need a service: replay, report and export."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from trirail.telemetry.recording import Recording
 
 Recordings = Annotated[Path, Parameter(required=True)]
-"""One recording at least."""
+"""At least one recording."""
 
 
 def replay(
@@ -31,17 +31,17 @@ def replay(
     config: Path | None = None,
     json: Json = False,
 ) -> int:
-    """Give a recorded session to the control once more, cycle by cycle, and compare the setpoints.
+    """Run a recorded session through the control again, cycle by cycle, and compare the setpoints.
 
-    With the recorded configuration and the recorded answers of the drives they come out the same to the last
-    bit: exit 1 if they do not, and the software is the same.
+    With the recorded configuration and the recorded answers of the drives, the setpoints are identical to the last bit.
+    The exit code is 1 if they differ although the software is the same.
 
     Parameters
     ----------
     file
-        Recording, or all files of one that was rotated.
+        Recording, or all files of a rotated recording.
     config
-        Configuration to try instead of the recorded one; the drives are then simulated ones.
+        Configuration to try instead of the recorded one; the drives are then simulated.
     """
     from trirail.analysis.replay import replay_session
     from trirail.config import load
@@ -65,16 +65,16 @@ def replay(
 def report(*file: Recordings, plot: Path | None = None, json: Annotated[bool, Flag] = False) -> int:
     """Summarise a recorded session.
 
-    Goals and outcomes, tracking error, timing, faults, missing data.
+    The report contains the goals and their outcomes, the tracking error, the timing, faults, and missing data.
 
     Parameters
     ----------
     file
-        Recording, or all files of one that was rotated.
+        Recording, or all files of a rotated recording.
     plot
-        Picture to draw. Its suffix is its format: .png, .svg, .pdf.
+        Picture to draw. The suffix selects the format: .png, .svg or .pdf.
     json
-        Print one JSON object, in SI units, instead of words.
+        Print one JSON object, in SI units, instead of text.
     """
     from trirail.analysis.summary import summarise
 
@@ -110,29 +110,29 @@ def export(
 ) -> int:
     """Write a recorded session as a table, CSV, Parquet or numpy, or as MCAP.
 
-    A row per cycle, in SI units. MCAP has messages of ROS 2, for Foxglove, PlotJuggler and ros2 bag.
+    The table has one row per cycle, in SI units. MCAP contains ROS 2 messages for Foxglove, PlotJuggler and ros2 bag.
 
     Parameters
     ----------
     file
-        Recording, or all files of one that was rotated.
+        Recording, or all files of a rotated recording.
     out
-        File to write, never over one that exists; its suffix is its format: .csv, .parquet, .npy, .mcap. Beside the
-        recording, as CSV, if absent.
+        File to write; an existing file is never overwritten. The suffix selects the format: .csv, .parquet, .npy or
+        .mcap. If absent, a CSV file beside the recording.
     begin
-        First time, since the start of the service's loop, as report shows times: 12.5s.
+        First time to write, since the start of the service's loop, as shown by report: 12.5s.
     end
-        Last time.
+        Last time to write.
     every
-        A row every so often, the first of each such time: 10ms.
+        Write one row per interval, the first in each: 10ms.
     columns
-        Names of columns, or words of names, with commas between: pose,error. All if absent.
+        Names of columns, or words in their names, separated by commas: pose,error. If absent, all columns.
     goal
-        From when a goal of this id was given until it ended.
+        Write only the time from when the goal with this id was given until it ended.
     switches
-        One row per switch of an output on a path instead, with the cycle and both poses.
+        Write instead one row per switch of an output on a path, with the cycle and both poses.
     format
-        Format of the file; that of the suffix of --out if absent.
+        Format of the file. If absent, the suffix of --out selects it.
     """
     path = out or file[0].with_suffix(f".{format or 'csv'}")
     if format is not None and path.suffix != f".{format}":
@@ -161,9 +161,9 @@ def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json =
     Parameters
     ----------
     config
-        Configuration of the robot; that of the simulated one if absent.
+        Configuration of the robot. If absent, the configuration of the simulated robot.
     out
-        File to write, never over one that exists; standard output if absent.
+        File to write; an existing file is never overwritten. If absent, standard output.
     """
     from trirail.analysis.urdf import document
     from trirail.config import SIM, geometry, load
@@ -281,7 +281,7 @@ def _print_summary(summed: Summary) -> None:
 
 
 def _print_goals(goals: list[GoalSummary]) -> None:
-    """Print a goal on a line, none of them cut where the terminal is narrow."""
+    """Print one line per goal, without truncating it in a narrow terminal."""
     longest = max(len(goal.id) for goal in goals)
     for goal in goals:
         took = "" if goal.ended is None else f"{goal.ended - goal.given:.3f} s"
@@ -295,7 +295,7 @@ def _print_goals(goals: list[GoalSummary]) -> None:
 
 
 class _Lines:
-    """Lines with a name before each, that are not cut where the terminal is narrow."""
+    """Lines that each begin with a name and are not truncated in a narrow terminal."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[str, str]] = []

@@ -1,4 +1,4 @@
-"""A live view drawn on this machine, from the records, events and state that services publish through Zenoh."""
+"""Live view that is drawn on this machine from the records, events and states that services publish through Zenoh."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from trirail.wire.records import unpack
 from trirail.wire.state import Info, State
 
 HISTORY_MB = 256.0
-"""Memory for what viewers that connect late are shown of the past; nothing else runs in this process [1e6 bytes]."""
+"""Memory for the history shown to viewers that connect late [1e6 bytes]. Nothing else runs in this process."""
 FIRST_RECORDS_TIMEOUT_S = 5.0
 """Time-out for the first records [s]."""
 MISSING = "missing data: {} cycles on the way here, {} batches in this view (viewer too slow)"
 
 
 class RemoteView:
-    """Draws robots for viewers on this machine while it is open: one alone, or several side by side.
+    """Live view of one robot, or of several side by side, for viewers on this machine while the context is open.
 
-    Raises ServiceError where no records come of one of them.
+    Raises ServiceError if no records arrive from one of the robots.
     """
 
     def __init__(self, robots: Sequence[Info], connect: str, credentials: Credentials | None = None) -> None:
         self._session = zenoh_session.open_client(connect, credentials)
         self.robots: list[RemoteRobot] = []
-        """Those that are drawn, in the order of `robots`."""
+        """Robots that are drawn, in the order of the argument `robots`."""
         try:
             for info in robots:
                 root = f"/{info.robot}" if len(robots) > 1 else ""
@@ -65,7 +65,7 @@ class RemoteView:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Draw no more."""
+        """Stop drawing."""
         self._session.close()  # type: ignore[no-untyped-call]
         for robot in self.robots:
             robot.end()
@@ -75,13 +75,13 @@ class RemoteView:
 class RemoteRobot:
     """Received data of one robot, and its drawing. Raises ServiceError if no records arrive.
 
-    Wall-clock times are this machine's at the first record, so they are late by the network's delay.
+    Wall-clock times are based on this machine's clock at the first record, so they are late by the network delay.
     """
 
     def __init__(self, info: Info, session: zenoh.Session, name: str, root: str) -> None:
         self._queue: queue.SimpleQueue[Event | State | bytes | None] = queue.SimpleQueue()
         self.lost = 0
-        """Cycles that were lost on the way here."""
+        """Number of cycles that were lost between the service and this program."""
         self._cycle: int | None = None
         self._bus_load: float | None = None
         self._session = session
@@ -93,14 +93,14 @@ class RemoteRobot:
         self._thread = threading.Thread(target=self._run, name=f"records of {info.robot}", daemon=True)
 
     def draw(self, relay: Relay) -> None:
-        """Draw from now on, in a thread."""
+        """Start drawing in a thread."""
         self.streams.attach(relay, LIVE_HZ)
         self._missing = MissingDataReport(self.streams, MISSING, lambda: (self.lost, relay.skipped))
         self._records(self._first_records)
         self._thread.start()
 
     def end(self) -> None:
-        """Draw what has come, and no more."""
+        """Draw the data that has arrived, then stop drawing."""
         self._queue.put(None)
         self._thread.join()
 
@@ -119,7 +119,7 @@ class RemoteRobot:
         ]
 
     def _first(self, info: Info) -> bytes:
-        """Return the first records; what came before them comes again afterwards."""
+        """Return the first records; put earlier items back into the queue, after these records."""
         deadline = time.monotonic() + FIRST_RECORDS_TIMEOUT_S
         before: list[Event | State | None] = []
         while (left := deadline - time.monotonic()) > 0.0:
@@ -153,7 +153,7 @@ class RemoteRobot:
         self._cycle = int(cycles[-1])
         self.streams.records(batch)
         self._missing.check()
-        self.streams.save()  # those of the past come in one go: each alone would be a batch to skip
+        self.streams.save()  # past data arrives together; in separate batches it would be skipped
 
     def _state(self, state: State) -> None:
         goal, target = (state.goal.id, state.goal.target) if state.goal else (None, None)

@@ -1,4 +1,7 @@
-"""Commands to a running service: goals, commands, state and events. Each reports a service that does not answer."""
+"""Commands to a running service: goals, commands, state and events.
+
+Each command reports an error if the service does not answer.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +68,8 @@ def goto(
     Parameters
     ----------
     x
-        Position of the platform's centre [m], or with a unit: 20mm, -0.8in. Alone, the name of a pose.
+        Position of the platform's centre along x [m], or with a unit: 20mm, -0.8in. Without Y and PHI, the name of a
+        pose.
     y
         Position along y.
     phi
@@ -135,7 +139,7 @@ def goal(content: str, /, *, wait: Wait = False, service: Service = HERE) -> int
     Parameters
     ----------
     content
-        Kind and fields of the goal, as in messages, in SI units and radians.
+        Kind and fields of the goal as in messages, in SI units and radians.
     """
     request: Goal = boundary.decode(content.encode(), Goal, "not a goal")
     with service.open() as robot:
@@ -154,16 +158,16 @@ def sliders(
 ) -> int:
     """Move the sliders to positions.
 
-    Also the way out of a pose that goto refuses.
+    Use this command also to leave a pose from which goto is refused.
 
     Parameters
     ----------
     a
         Position of slider A [m], or with a unit: 20mm.
     b
-        Of slider B.
+        Position of slider B.
     c
-        Of slider C.
+        Position of slider C.
     """
     with service.open() as robot:
         title = _sliders(robot.info().labels, a, b, c)
@@ -183,18 +187,18 @@ def jog(
 ) -> int:
     """Move at a velocity until Ctrl-C, or while keys are held.
 
-    With --seconds it ends after that time; without a velocity it moves while you hold a key.
+    With --seconds, the motion ends after that time. Without a velocity, the robot moves while you hold a key.
 
     Parameters
     ----------
     vx
         Velocity of the platform's centre along x [m/s], or with a unit: 5mm/s.
     vy
-        Along y.
+        Velocity along y.
     w
-        Rate of the platform's angle [rad/s], or with a unit: 2deg/s.
+        Angular velocity of the platform [rad/s], or with a unit: 2deg/s.
     seconds
-        How long [s].
+        Duration of the motion [s].
     """
     if vx is None:
         from trirail.cli import pendant
@@ -229,14 +233,14 @@ def follow(
     wait: Wait = False,
     service: Service = HERE,
 ) -> int:
-    """Follow a timed trajectory from where the robot stands.
+    """Follow a timed trajectory from the robot's current pose.
 
     Parameters
     ----------
     file
         CSV with columns t, x, y, phi (and vx, vy, w, and ax, ay, e), or JSON with a list of points.
     go_there
-        Go to its first point before, by an ordinary goal, if the robot is not there.
+        If the robot is not at the first point, move there first with an ordinary goal.
     """
     from trirail.client.trajectory import check_arrived, first_pose, read
 
@@ -250,14 +254,15 @@ def follow(
 
 
 def teach(name: str, /, *, service: Service = HERE) -> int:
-    """Keep where the robot stands as a pose of a name, for goto.
+    """Save the current pose under a name, for goto.
 
-    Where it is measured to stand, with power or moved by hand.
+    The saved pose is the measured pose, whether the robot has power or was moved by hand.
 
     Parameters
     ----------
     name
-        Letters, digits, - and _, but no number or quantity; a pose that was taught by that name before is replaced.
+        Name of letters, digits, - and _, which must not be a number or quantity. A pose that was taught under this name
+        before is replaced.
     """
     check_new_pose(name)
     with service.open() as robot:
@@ -272,7 +277,7 @@ def forget(name: Annotated[str, Parameter(completer=taught_poses)], /, *, servic
     Parameters
     ----------
     name
-        One of those that `trirail poses` lists as taught.
+        Name of a pose that `trirail poses` lists as taught.
     """
     with service.open() as robot:
         pose = robot.forget(name)
@@ -281,7 +286,7 @@ def forget(name: Annotated[str, Parameter(completer=taught_poses)], /, *, servic
 
 
 def poses(*, service: Service = HERE) -> int:
-    """List the poses that have names."""
+    """List the named poses."""
     with service.open() as robot:
         named_poses = robot.poses()
     if service.json:
@@ -298,12 +303,12 @@ def poses(*, service: Service = HERE) -> int:
 
 
 def override(percent: notation.Percent, /, *, service: Service = HERE) -> int:
-    """Send the one command that takes a number.
+    """Set the speed override.
 
     Parameters
     ----------
     percent
-        Share of full speed, 50 or 50%.
+        Share of full speed, such as 50 or 50%.
     """
     with service.open() as robot:
         robot.override(percent)
@@ -317,9 +322,9 @@ def output(name: str, value: Literal["on", "off"], /, *, service: Service = HERE
     Parameters
     ----------
     name
-        Name of an output of the configuration.
+        Name of an output in the configuration.
     value
-        New value.
+        New value of the output.
     """
     with service.open() as robot:
         robot.set_output(name, value == "on")
@@ -328,7 +333,7 @@ def output(name: str, value: Literal["on", "off"], /, *, service: Service = HERE
 
 
 WAKE_INTERVAL_S = 0.2
-"""Interval of checking for signals while waiting [s]: the kernel may deliver one to another thread."""
+"""Interval of checking for signals while waiting [s]. The kernel may deliver a signal to another thread."""
 
 
 def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.0, service: Service = HERE) -> int:
@@ -337,9 +342,9 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.
     Parameters
     ----------
     force
-        Take it over from its holder; needs the role in [control] takeover, a maintainer's by default.
+        Take the lease over from its holder. This needs the role in [control] takeover, by default maintainer.
     timeout
-        After how long without a sign of life from here it ends, with a controlled stop: 0.1 to 10 s.
+        Time without a sign of life from this command after which the lease ends with a controlled stop: 0.1 to 10 s.
     """
     if not SHORTEST_LEASE <= timeout <= LONGEST_LEASE:
         allowed = f"{SHORTEST_LEASE:g} to {LONGEST_LEASE:g} s would be right"
@@ -358,7 +363,7 @@ def acquire(*, force: Annotated[bool, Flag] = False, timeout: notation.Time = 1.
 
 
 def status(*, service: Service = HERE) -> int:
-    """Print the present state."""
+    """Print the current state."""
     with service.open() as robot:
         state, info = robot.state(), robot.info()
     if service.json:
@@ -377,7 +382,7 @@ def watch(*, service: Service = HERE) -> int:
 
 
 HISTORY_TIMEOUT_S = 1.0
-"""Time without another event after which the past events are complete [s]; a thousand take a tenth of that."""
+"""Time without another event after which the past events count as complete [s]. A thousand take a tenth of this."""
 
 
 def events(
@@ -386,19 +391,19 @@ def events(
     follow: Annotated[bool, Flag] = False,
     service: Service = HERE,
 ) -> int:
-    """Print past events and those to come, until Ctrl-C.
+    """Print past events and new ones, until Ctrl-C.
 
-    With --last only past ones.
+    With --last, print only past events.
 
     Parameters
     ----------
     last
-        Print this number of the newest past events, and end; 0 for all.
+        Print this number of the newest past events, then end; 0 for all.
     follow
         Continue with new events after --last.
     """
     with service.open() as robot:
-        now = robot.state().t  # fails immediately if there is no service, where the events would only be silent
+        now = robot.state().t  # fails immediately without a service, whereas events would only be silent
         seen = 0
         if last is not None:
             until_now = itertools.takewhile(
@@ -422,11 +427,14 @@ def _show_event(service: Service, event: Event) -> None:
 
 
 COMMANDS = (goto, move, goal, sliders, jog, follow, teach, forget, poses, status, watch, events)
-"""Those with parameters of their own, in the order in which the help lists them; the others by `command_line_of`."""
+"""Commands with their own parameters, in the order of the help; `command_line_of` creates the others."""
 
 
 def command_line_of(name: Command) -> Callable[..., int]:
-    """Return the command of the command line that sends one; each required field of its content is an argument."""
+    """Return the function of the command line that sends a command.
+
+    Each required field of the command's content is an argument.
+    """
 
     def send_command(*values: object, service: Service = HERE) -> int:
         with service.open() as robot:
@@ -450,12 +458,12 @@ def command_line_of(name: Command) -> Callable[..., int]:
 
 
 def _plain_type(kind: Any) -> Any:
-    """Return the type of a field without its constraints, which are checked where the content is made."""
+    """Return the type of a field without its constraints, which are checked when the content is created."""
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 
 def confirmed(service: Service, name: Command, reply: CommandReply) -> None:
-    """Print that a command has been carried out."""
+    """Print that a command was carried out."""
     show(
         service,
         msgspec.to_builtins(reply),
@@ -468,7 +476,7 @@ def _sliders(labels: Labels, *positions: float) -> str:
 
 
 def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title: str) -> int:
-    """Say that a goal is accepted, or follow it to its end."""
+    """Print that a goal was accepted or, with `wait`, follow it to its end."""
     if not wait:
         words = f"goal {goal.id}: {goal.expected}{terminal.notes(goal.reply)}"
         show(service, msgspec.to_builtins(goal.reply), words)
@@ -481,7 +489,7 @@ def _follow(service: Service, robot: Robot, goal: GoalHandle, wait: bool, title:
 
 
 def show(service: Address, content: object, words: str) -> None:
-    """Print the result of a command: words, or with --json its content."""
+    """Print the result of a command as text or, with --json, as its content."""
     if service.json:
         terminal.json(content)
     else:

@@ -1,4 +1,4 @@
-"""A router between robots and users: its file, and the configuration of Zenoh's own program that follows from it."""
+"""A router between robots and users: its configuration file, and the configuration of zenohd that follows from it."""
 
 from __future__ import annotations
 
@@ -23,22 +23,26 @@ class RouterConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """A router's configuration file."""
 
     zenoh: Zenoh
-    """Section as in a robot's file: listening address, certificates, users of all its robots; `connect` is a router."""
+    """Section as in a robot's file: listening address, certificates, and users of all robots behind this router.
+    `connect` names another router."""
     robots: Annotated[tuple[UserName, ...], Meta(max_length=10_000)] = ()
-    """The robots that may dial it, each by the common name of its certificate, which is its name in every key."""
+    """Robots that may connect to the router, each by the common name of its certificate. This is also its name in every
+    key."""
     routers: Annotated[dict[UserName, tuple[UserName, ...]], Meta(max_length=1000)] = {}
-    """Routers that may dial it, by the common names of their certificates, each with the robots behind it."""
+    """Routers that may connect to this router, by the common names of their certificates, each with the robots behind
+    it."""
     state_hz: Annotated[float, Meta(gt=0.0, le=200.0)] = 5.0
-    """Maximum rate of each robot's states to a user [Hz]."""
+    """Maximum rate at which the states of each robot are sent to a user [Hz]."""
 
     @property
     def behind(self) -> dict[str, tuple[str, ...]]:
-        """Names of robots and routers that may connect, each with the robots behind it: a robot itself."""
+        """Names of the robots and routers that may connect, each with the robots behind it; for a robot, the robot
+        itself."""
         return {robot: (robot,) for robot in self.robots} | self.routers
 
     @property
     def all_robots(self) -> list[str]:
-        """Every robot, behind it or behind another router."""
+        """All robots that connect to this router, directly or through another router."""
         return [robot for robots in self.behind.values() for robot in robots]
 
 
@@ -46,7 +50,7 @@ prepare(RouterConfig)
 
 
 def load(path: Path) -> RouterConfig:
-    """Read a router's configuration. Raises ConfigError."""
+    """Read the configuration file of a router. Raises ConfigError if it is invalid."""
     try:
         config = _parsed(files.text(path))
         check_reach(config.zenoh)
@@ -71,7 +75,7 @@ def _parsed(text: str) -> RouterConfig:
 
 
 def settings(config: RouterConfig) -> dict[str, Any]:
-    """Return the configuration of zenohd. Raises ServiceError for certificates that are no good."""
+    """Return the configuration of zenohd. Raises ServiceError if the certificates cannot be used."""
     thinned = {zenoh_session.key(robot, "state"): config.state_hz for robot in config.all_robots}
     listen, connect = config.zenoh.listen, config.zenoh.connect
     if config.zenoh.tls is None:

@@ -1,4 +1,4 @@
-"""`trirail router`: the configuration of a router between robots and users, for zenohd, Zenoh's own program."""
+"""`trirail router`: print the configuration of a router between robots and users, for Zenoh's own program zenohd."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from trirail.cli import terminal
 
 
 def router(config: Path, /) -> int:
-    """Print the configuration of a router that robots dial, [zenoh] connect, and users connect to.
+    """Print the configuration of a router to which robots ([zenoh] connect) and users connect.
 
-    It is for zenohd, Zenoh's own program, of the same version as the service's Zenoh.
+    The output is for Zenoh's own program, zenohd, in the same version as the service's Zenoh.
 
     Parameters
     ----------
     config
-        File with the router's robots, where it listens, certificates and users.
+        File with the router's robots, listening addresses, certificates and users.
     """
     from trirail.cli import router as routers
 

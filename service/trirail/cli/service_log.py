@@ -1,4 +1,4 @@
-"""The service's own output: what happens to the robot and to the processes, a line each, as text or as JSON."""
+"""The service's own log output: one line per event of the robot or the processes, as text or as JSON."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Form = Literal["text", "json"]
 BURST: Final = 100
 """Maximum number of lines in a burst."""
 RATE: Final = 1.0
-"""Lines per second after a burst: a flood of goals must not fill the disk. Errors are always written."""
+"""Lines per second after a burst, so that a flood of goals cannot fill the disk. Errors are always written."""
 PRIORITIES: Final[Mapping[str, int]] = {"info": 6, "warning": 4, "error": 3}
-"""Priority of each level, which journald reads at the begin of a line: sd-daemon(3)."""
+"""Priority of each level, which journald reads at the beginning of a line: sd-daemon(3)."""
 
 
 class Log:
@@ -44,12 +44,12 @@ class Log:
         self._left_out = 0
 
     def log(self, words: str, level: Level = "info") -> None:
-        """Write what the service says of itself."""
+        """Write a message of the service about itself."""
         now = self._clock()
         self._write(now, level, words, {"time": now, "kind": "service", "level": level, "message": words})
 
     def event(self, event: Event) -> None:
-        """Write an event once: a restarted gateway sends past events again."""
+        """Write an event, but only once, because a restarted gateway sends past events again."""
         if event.seq <= self._newest:
             return
         self._newest = event.seq
@@ -76,12 +76,12 @@ class Log:
             line = f"{wall_clock(moment)}  {level:7}  {printable(words)}"
             if self._to_journal:
                 line = f"<{PRIORITIES[level]}>{line}"
-        with suppress(OSError):  # a full disk, or a reader that has gone, stops no robot
+        with suppress(OSError):  # a full disk or a closed pipe must not stop the robot
             self._out.write(f"{line}\n")
             self._out.flush()
 
     def close(self) -> None:
-        """Leave out what cannot be written, which the interpreter would try again at its end."""
+        """Flush the output; discard lines that cannot be written, which the interpreter would try to write at exit."""
         try:
             self._out.flush()
         except OSError:

@@ -1,4 +1,4 @@
-"""`trirail sessions`: which sessions were recorded, by robot, time, fault, user and outcome."""
+"""`trirail sessions`: list recorded sessions, selected by robot, time, fault, user and outcome."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from trirail.telemetry.sessions import RecordedSession
 
 FOLDER = Path("recordings")
-"""Default folder of recordings, for a service that was started in the current folder."""
+"""Default folder for recordings, which is correct for a service that was started in the current folder."""
 
 
 def _moment(_: Any, tokens: Sequence[Token]) -> datetime:
@@ -38,7 +38,7 @@ def _moment(_: Any, tokens: Sequence[Token]) -> datetime:
 
 
 Moment = Annotated[datetime, Parameter(converter=_moment, n_tokens=1)]
-"""A day, or a time of one, as the clock on the wall shows it."""
+"""A day, or a time on a day, in local time."""
 
 
 def sessions(
@@ -57,30 +57,30 @@ def sessions(
 ) -> int:
     """List recorded sessions, the newest last, running ones too.
 
-    Times, outcomes of goals by user, faults, reasons of black boxes.
+    The list shows times, the outcomes of goals by user, faults, and the reasons for black boxes.
 
-    A recording without a usable .json beside it, as after a kill, is read first.
+    A recording without a usable .json file beside it, for example after the service was killed, is read first.
 
     Parameters
     ----------
     folder
-        Folder of recordings, [telemetry] directory; recordings/ here if absent.
+        Folder of recordings, as in [telemetry] directory. If absent, recordings/ in the current folder.
     robot
-        Only those of this robot.
+        Only sessions of this robot.
     since
-        Only those that ended at this time or later: 2026-01-31 or 2026-01-31T12:00:00, local time.
+        Only sessions that ended at this time or later: 2026-01-31 or 2026-01-31T12:00:00, local time.
     until
-        Only those that began by this time.
+        Only sessions that began at this time or earlier.
     fault
-        Only those with a fault whose cause, code or message contains this: emcy, 0x8700, "drive A".
+        Only sessions with a fault whose cause, code or message contains this text: emcy, 0x8700, "drive A".
     user
-        Only those in which this user sent a goal or command.
+        Only sessions in which this user sent a goal or command.
     outcome
-        Only those with a goal of this outcome; with --user, a goal of that user.
+        Only sessions with a goal of this outcome; with --user, a goal of that user.
     last
-        Maximum number of sessions, the newest; 0 for all.
+        Maximum number of sessions to list, the newest ones; 0 for all.
     rebuild
-        Read every recording, and write the .json beside it again.
+        Read every recording, and write the .json file beside it again.
     """
     from trirail.telemetry.sessions import SessionFilter, fault_codes, find, recorded
 
@@ -103,17 +103,17 @@ def sessions(
 
 
 def _check_code(words: str | None) -> None:
-    """Refuse what begins as a code and can be none: they have 16 bits or, an ODrive's, 32."""
+    """Refuse text that begins like a code but cannot be one. Codes have 16 bits or, on an ODrive, 32."""
     if words and words[:2].lower() == "0x" and re.fullmatch(r"[0-9a-fA-F]{0,8}", words[2:]) is None:
         raise ValueError(f"{quoted(words)!r} is no code such as 0x8700")
 
 
 REPORT_INTERVAL_S = 1.0
-"""Interval of printing the progress of reading recordings [s]."""
+"""Interval at which the progress of reading recordings is printed [s]."""
 
 
 class _ReadingReport:
-    """Prints which recording is read, where that takes long."""
+    """Progress report that prints the recording being read if reading takes long."""
 
     def __init__(self) -> None:
         self._due = time.monotonic() + REPORT_INTERVAL_S

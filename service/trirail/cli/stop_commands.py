@@ -1,4 +1,4 @@
-"""`trirail stop`, `quick-stop`, `disable`: they wait for no session, which a flooded port may not give."""
+"""`trirail stop`, `quick-stop`, `disable`: they do not wait for a session, which a flooded port may not provide."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from trirail.wire.vocabulary import Command
 
 
 def stopping(name: Command) -> Callable[..., int]:
-    """Return the command of the command line that sends one of trirail.wire.stop_protocol.STOPS."""
+    """Return the function of the command line that sends one of trirail.wire.stop_protocol.STOPS."""
 
     def stop(*, service: Service = HERE) -> int:
         from trirail.client.new_stop import NewStop
@@ -25,7 +25,7 @@ def stopping(name: Command) -> Callable[..., int]:
             asked.opening.join()
             raise
         confirmed(service, name, reply)
-        if asked.opening.is_alive():  # it may take seconds, and the interpreter cannot end beneath Zenoh's code
+        if asked.opening.is_alive():  # it may take seconds, and the interpreter cannot end while Zenoh's code runs
             sys.stdout.flush()
             os._exit(0)
         return 0

@@ -1,4 +1,4 @@
-"""Tab completion of bash, zsh and fish: `trirail completion`, and the names that a running service knows."""
+"""Tab completion for bash, zsh and fish: `trirail completion`, and the names that a running service knows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Shell = Literal["bash", "zsh", "fish"]
 
 
 def script(app: App, shell: Shell | None, *, install: bool) -> int:
-    """Print the script for a shell, that in use if none is named, or install it for this user."""
+    """Print the script for a shell, or install it for this user. If no shell is named, use the current one."""
     from cyclopts.completion.detect import ShellDetectionError
 
     try:

@@ -1,4 +1,4 @@
-"""Output of the commands, for people, and with --json for programs."""
+"""Output of the commands: text for people or, with --json, JSON for programs."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ COLOURS = {mode.value: palette.code(colour) for mode, colour in palette.MODES.it
 LEVELS = {"info": "green", "warning": "yellow", "error": "bold red"}
 VERDICTS = {"ok": "green", "warning": "yellow", "failure": "bold red"}
 SERVICE_TIMEOUT_S = 3.0
-"""Silence after which the service counts as gone [s]."""
+"""Time without an answer after which the service counts as gone [s]."""
 
 
 def plain(words: str) -> str:
-    """Return external text for the console, without markup, control characters and line breaks."""
+    """Return external text for the console, without markup, control characters or line breaks."""
     return escape(printable(words))
 
 
 def counted(number: int, what: str) -> str:
-    """Return a number of things: 1 robot, 2 robots."""
+    """Return a number and its noun, in the plural if necessary: 1 robot, 2 robots."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
@@ -57,7 +57,7 @@ def print_line(words: str) -> None:
 
 @contextlib.contextmanager
 def drawing(file: Path) -> Iterator[None]:
-    """Convert errors of drawing a picture to a file. Raises TrirailError with the reason."""
+    """Convert errors that occur while a picture is drawn to a file into a TrirailError with the reason."""
     try:
         yield
     except ImportError as error:
@@ -72,13 +72,13 @@ def print_error(words: str) -> None:
 
 
 def json(content: object) -> None:
-    """Print one JSON object on a line of its own, and flush it."""
+    """Print one JSON object on its own line, and flush the output."""
     sys.stdout.write(json_printable(msgspec.json.encode(content).decode()) + "\n")
     sys.stdout.flush()
 
 
 def print_error_json(error: TrirailError) -> None:
-    """Print an error as one JSON object, with the code of a refusal and the value that a limit forbids."""
+    """Print an error as one JSON object, with the code of a refusal and the value that exceeds a limit."""
     content = {"ok": False, "error": type(error).__name__, "message": str(error)}
     if isinstance(error, RefusedError):
         content["code"] = error.code
@@ -87,7 +87,7 @@ def print_error_json(error: TrirailError) -> None:
 
 
 def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
-    """Print that the service is up, with its addresses and missing rights."""
+    """Print that the service is running, with its addresses and missing rights."""
     from trirail.config import metrics_url
 
     loop, recorder = ready["loop"], ready["recorder"]
@@ -109,7 +109,7 @@ def up(config: Config, ready: dict[str, dict[str, Any]]) -> None:
 
 
 def _reach(config: Config) -> list[str]:
-    """Return the options by which a command on this machine reaches the service; none for the default service."""
+    """Return the options with which a command on this machine reaches the service; no options for the default one."""
     options = []
     if (robot := config.robot.name) != HERE.robot:
         options += ["--robot", robot]
@@ -124,12 +124,12 @@ MIN_SLOWDOWN = 1.001
 
 
 def slowed(reply: GoalReply) -> str:
-    """Return how much an accepted goal is slowed, in words; "" if it is not."""
+    """Return the slowdown of an accepted goal in words, or "" if it is not slowed down."""
     return f"slowed {reply.slowed:.4g} times: it would be beyond the limits" if reply.slowed > MIN_SLOWDOWN else ""
 
 
 def notes(reply: GoalReply) -> str:
-    """Return remarks on an accepted goal in parentheses; "" if it is executed as requested."""
+    """Return remarks on an accepted goal in parentheses, or "" if it is executed as requested."""
     remarks = [words] if (words := slowed(reply)) else []
     if reply.stops_first:
         remarks.append("stops on the old path first")
@@ -140,7 +140,7 @@ def notes(reply: GoalReply) -> str:
 
 @contextlib.contextmanager
 def measuring(title: str, *, show: bool = True) -> Iterator[Callable[[float], None]]:
-    """Show the progress of a measurement on standard error if that is a terminal, without a drawing thread."""
+    """Show the progress of a measurement on standard error if it is a terminal, without a drawing thread."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
     show = show and err.is_terminal
     with Progress(*columns, console=err, transient=True, auto_refresh=False, disable=not show) as progress:
@@ -149,7 +149,7 @@ def measuring(title: str, *, show: bool = True) -> Iterator[Callable[[float], No
 
 
 def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> Result:
-    """Wait for the end of a goal and show its progress. Ctrl-C stops it; a second Ctrl-C raises ServiceError."""
+    """Wait for the end of a goal and show its progress. Ctrl-C stops the goal; a second Ctrl-C raises ServiceError."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -185,12 +185,12 @@ def follow(robot: Robot, goal: GoalHandle, title: str, *, show: bool = True) -> 
 
 
 def _cancel(goal: GoalHandle) -> None:
-    with contextlib.suppress(TrirailError):  # it has ended, or the service does not answer
+    with contextlib.suppress(TrirailError):  # the goal has ended, or the service does not answer
         goal.cancel()
 
 
 def left(state: State, goal: GoalState) -> str:
-    """Return the remaining time of the active goal in words, or that the robot settles."""
+    """Return the remaining time of the active goal in words, or the text that the robot is settling."""
     if goal.progress >= 1.0:
         return "settling"
     if state.mode == Mode.HOLDING:
@@ -214,12 +214,12 @@ def print_checks(checks: Sequence[Check]) -> None:
 
 
 def percentiles(values: Percentiles) -> str:
-    """Write percentiles on a line."""
+    """Format percentiles on one line."""
     return f"p50 {values.p50:.0f}  p99 {values.p99:.0f}  p99.9 {values.p999:.0f}  max {values.max:.0f} µs"
 
 
 def table(first: str, *others: str) -> Table:
-    """Return an empty table with these headings, numbers to the right; a column without one holds units."""
+    """Return an empty table with these headings and right-aligned numbers; a column without a heading holds units."""
     made = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="bold")
     made.add_column(first)
     for name in others:

@@ -1,4 +1,4 @@
-"""`trirail view`: Rerun's viewer, or a browser, on a service's live view, on records from afar, or on a file."""
+"""`trirail view`: show a service's live view, records of a remote service, or a file in Rerun's viewer or a browser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from trirail.wire.credentials import credentials_for
 from trirail.wire.endpoints import is_local
 
 WEB_PORT = 9090
-"""The web viewer's port, where it is free."""
+"""Preferred port of the web viewer, used if it is free."""
 START_TIMEOUT_S = 20.0
 """Time-out for the start of the web viewer [s]."""
 
@@ -43,7 +43,7 @@ def run(
 ) -> int:
     """Open a viewer and wait until it is closed, or for Ctrl-C or SIGTERM; return the exit code.
 
-    Raises ServiceError where there is no display, no service, no live view, or no such file.
+    Raises ServiceError if there is no display, no service, no live view, or no such file.
     """
     if file is not None and not file.is_file():
         raise ServiceError(f"{file} is not a file; recordings are .rrd files in the service's telemetry.directory")
@@ -64,13 +64,16 @@ def run(
 
 
 def has_display() -> bool:
-    """Whether a window can be opened."""
+    """Return whether a window can be opened."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 @contextlib.contextmanager
 def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | None, records: bool) -> Iterator[str]:
-    """Yield the file, or the address of the live view: the service's own, or one that is drawn here from records."""
+    """Yield the file or the address of the live view.
+
+    The live view is the service's own, or is drawn on this machine from records.
+    """
     if file is not None:
         yield str(file)
         return
@@ -102,7 +105,7 @@ def _source(file: Path | None, robots: Sequence[str], connect: str, tls: Path | 
 
 
 def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
-    """Serve the web viewer on this machine's loopback alone until it ends."""
+    """Serve the web viewer on this machine's loopback only, until the viewer ends."""
     port, data_port = _web_port(), free_port()
     address = source if "://" in source else f"rerun+http://{LOOPBACK}:{data_port}/proxy"
     url = f"http://{LOOPBACK}:{port}/?url={quote(address, safe='')}&hide_welcome_screen=1"
@@ -122,9 +125,9 @@ def _browse(source: str, say: Callable[[dict[str, str], str], None]) -> None:
 
 @contextlib.contextmanager
 def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run Rerun's viewer, which would listen on every network if it were not told otherwise; end it in any case.
+    """Run Rerun's viewer, restricted to this machine because it would otherwise listen on every network.
 
-    Raises ServiceError if it has failed by itself.
+    The viewer is always terminated when the context ends. Raises ServiceError if the viewer fails by itself.
     """
     command = python("-m", "rerun_cli", "--bind", LOOPBACK, "--hide-welcome-screen", *arguments)
     with tempfile.TemporaryFile() as log, _settings() as environment:
@@ -133,18 +136,21 @@ def _rerun(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
             yield viewer
             log.seek(0)
             last = log.read().decode(errors="replace").strip().rpartition("\n")[2]
-            # Where it cannot open its window it says so, and its exit code is 0 all the same.
+            # If the viewer cannot open its window, it prints a message but still exits with 0.
             if viewer.poll() or (viewer.poll() == 0 and last.startswith("Error: ")):
                 raise ServiceError(f"the viewer failed: {last}; trirail view --web needs no graphics driver here")
         finally:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(viewer.pid, signal.SIGTERM)  # `python -m rerun_cli` does not pass signals on
+                os.killpg(viewer.pid, signal.SIGTERM)  # `python -m rerun_cli` does not forward signals
             viewer.wait()
 
 
 @contextlib.contextmanager
 def _settings() -> Iterator[dict[str, str]]:
-    """Yield an environment in which Rerun's programs send no analytics: 0.41 reads that in a file, and no variable."""
+    """Yield an environment in which Rerun's programs send no analytics.
+
+    Rerun 0.41 reads this setting from a file and not from a variable.
+    """
     with files.temporary_folder() as folder:
         file = folder / "rerun" / "analytics.json"
         file.parent.mkdir()

@@ -1,4 +1,4 @@
-"""Configuration files: keys (`tables`), loading (`loading`), and checks (`impossible`, `explained`)."""
+"""Configuration files: their keys (`tables`), loading (`loading`) and checks (`impossible`, `explained`)."""
 
 from trirail.config.digital import Input, Output
 from trirail.config.explained import Mistake, overlap, wrong_values

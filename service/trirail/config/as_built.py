@@ -1,6 +1,7 @@
-"""Map of as-built errors, the differences of a robot from its [geometry]: its file, and its check against the limits.
+"""Map of as-built errors: reading and writing its file, and checking it against the limits.
 
-The file is TOML, made by `tools/calibrate.py --map`: date, geometry and range of the measurement, and the nodes of
+As-built errors are the differences between a robot and its [geometry]. The file is in TOML and is written by
+`tools/calibrate.py --map`. It contains the date, geometry and range of the measurement, and the nodes of
 trirail.kinematics.correction.
 """
 
@@ -31,15 +32,16 @@ from trirail.wire.decoding import converted, prepare
 from trirail.wire.state import CorrectionInfo
 
 RESERVE = (0.02, 0.02, 0.07)
-"""Share of the sliders' limits of velocity, acceleration and jerk that plans leave free (motion.feasibility.PLANNED).
-Paths are sampled with the correction; its effect between two samples must fit into this share everywhere."""
+"""Share of the sliders' velocity, acceleration and jerk limits that plans leave free (motion.feasibility.PLANNED).
+Paths are sampled with the correction applied. The effect of the correction between two samples must fit into this share
+everywhere."""
 QUANTITIES = (("velocity", "m/s"), ("acceleration", "m/s²"), ("jerk", "m/s³"))
 MAKE = "python tools/calibrate.py --map"
 SAMPLES_PER_CELL = 4
-"""Samples of the map's effect per cell, along each axis."""
+"""Number of samples of the map's effect per cell along each axis."""
 TRAVEL_MARGIN_M = 0.03
-"""Distance beyond the sliders' travel up to which the map is sampled [m]: no reachable pose between samples is
-missed."""
+"""Distance beyond the sliders' travel up to which the map is sampled [m]. It ensures that no reachable pose between two
+samples is missed."""
 COORDINATES = (("x", "m"), ("y", "m"), ("phi", "rad"))
 
 Error = Annotated[float, Meta(ge=-0.02, le=0.02)]
@@ -52,25 +54,29 @@ Words = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
 class AsBuilt(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [correction.as_built]: contents of the file of `map`. Recordings have it; people name a file instead."""
+    """Section [correction.as_built]: contents of the file that `map` names.
+
+    Recordings contain this section; configuration files written by people name the file instead.
+    """
 
     made: Words
     """Date of the measurement."""
     geometry: Annotated[str, Meta(pattern=r"^[0-9a-f]{8}$")]
-    """Checksum of the [geometry] of the measurement, from `geometry_of`."""
+    """Checksum of the [geometry] used for the measurement, from `geometry_of`."""
     low: tuple[Place, Place, Place]
-    """Lower bounds x, y [m] and phi [rad] of the map."""
+    """Lower bounds of the map in x, y [m] and phi [rad]."""
     high: tuple[Place, Place, Place]
-    """Upper bounds x, y [m] and phi [rad] of the map."""
+    """Upper bounds of the map in x, y [m] and phi [rad]."""
     nodes: Annotated[tuple[Face, ...], Meta(min_length=4, max_length=11)]
-    """Coefficients of uniform cubic B-splines over x, y, phi: corrections of a pose's x, y [m] and phi [rad]."""
+    """Coefficients of uniform cubic B-splines over x, y and phi. The splines give the corrections of a pose in x, y [m]
+    and phi [rad]."""
 
 
 prepare(AsBuilt)
 
 
 def geometry_of(robot: Geometry) -> str:
-    """Return a checksum of a geometry, of eight digits, to a nanometre and a nanoradian."""
+    """Return an eight-digit checksum of a geometry rounded to nanometres and nanoradians."""
     numbers = np.round([np.hstack([*leg.keys().values()]) for leg in robot.each], 9) + 0.0
     kind = b"" if robot.kind == "3-PRP" else robot.kind.encode()  # the first maps were made before 3-PPR existed
     return f"{zlib.crc32(numbers.tobytes() + kind):08x}"
@@ -85,13 +91,13 @@ def correction(as_built: AsBuilt) -> Correction:
 
 
 def measured_today(errors: Correction, robot: Geometry) -> AsBuilt:
-    """Return the map of a correction that was measured today on a robot with this [geometry]."""
+    """Return the map for a correction that was measured today on a robot with this [geometry]."""
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     return AsBuilt(today, geometry_of(robot), errors.low, errors.high, errors.nodes.tolist())
 
 
 def read(path: Path) -> AsBuilt:
-    """Read a map's file. Raises ConfigError with the file and the problem in one line."""
+    """Read a map from its file. Raises ConfigError, with the file and the problem in one line."""
     try:
         return parse(files.text(path))
     except FileError as error:
@@ -101,7 +107,7 @@ def read(path: Path) -> AsBuilt:
 
 
 def parse(text: str) -> AsBuilt:
-    """Parse a map. Raises ConfigError."""
+    """Parse a map from text. Raises ConfigError if the text is invalid."""
     try:
         return converted(tomllib.loads(text), AsBuilt)
     except RecursionError as error:
@@ -114,7 +120,7 @@ def parse(text: str) -> AsBuilt:
 
 
 def format_map(as_built: AsBuilt) -> str:
-    """Return the text of a map's file, exact to the last digit: `parse` returns an equal map."""
+    """Return a map as the text of its file. Numbers are exact to the last digit, so `parse` returns an equal map."""
     rows = [
         " [\n" + "".join(f"  {[list(node) for node in row]},\n" for row in face) + " ],\n" for face in as_built.nodes
     ]
@@ -129,7 +135,7 @@ def format_map(as_built: AsBuilt) -> str:
 
 
 def summary(file: str | None, as_built: AsBuilt | None, backlash: Triple) -> CorrectionInfo | None:
-    """Return the summary of a correction for people; None without a correction."""
+    """Return a human-readable summary of a correction, or None if there is no correction."""
     if as_built is None:
         return CorrectionInfo("", "", (0.0, 0.0, 0.0), backlash) if any(backlash) else None
     x, y, phi = correction(as_built).greatest.tolist()
@@ -137,18 +143,18 @@ def summary(file: str | None, as_built: AsBuilt | None, backlash: Triple) -> Cor
 
 
 def check(as_built: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, sliders: Sequence[Triple]) -> None:
-    """Refuse a map of another robot, one that does not cover the limits, or one that could break a limit anywhere.
+    """Check that a map belongs to this robot, covers its limits, and cannot cause a limit to be exceeded anywhere.
 
-    Raises ConfigError.
+    Raises ConfigError if any of these conditions is not met.
 
     Parameters
     ----------
     robot
-        Geometry without the correction.
+        Geometry of the robot without the correction.
     platform
-        Limits of velocity, acceleration and jerk of x, y, phi, (3, 3) [m, rad, s].
+        Velocity, acceleration and jerk limits of x, y and phi, shape (3, 3) [m, rad, s].
     sliders
-        The same limits of the sliders A, B, C.
+        Velocity, acceleration and jerk limits of the sliders A, B and C.
     """
     errors = correction(as_built)
     if as_built.geometry != geometry_of(robot):
@@ -182,8 +188,9 @@ def check(as_built: AsBuilt, robot: Geometry, room: Room, platform: ArrayLike, s
 def _added_rates(errors: Correction, robot: Geometry, room: Room, rates: Array) -> tuple[Array, Array]:
     """Return sample poses, (N, 3), and upper bounds of the slider rates that the correction adds there, (3, N, 3).
 
-    With s(pose), the slider positions with the correction less those without, and its partial derivatives s_i by
-    differences, |ds/dt| <= sum |s_i| v_i, and so on for higher orders. Infinite where a derivative is undefined.
+    Let s(pose) be the slider positions with the correction minus those without it, and s_i the partial derivatives of
+    s, computed by finite differences. Then |ds/dt| <= sum |s_i| v_i; higher orders are bounded in the same way. A bound
+    is infinite where a derivative is undefined.
     """
     axes = [
         np.linspace(low, high, SAMPLES_PER_CELL * n + 1)

@@ -1,4 +1,4 @@
-"""Sections [outputs] and [inputs] of a configuration file: digital outputs and inputs of the drives, by name."""
+"""Sections [outputs] and [inputs] of a configuration file: named digital outputs and inputs of the drives."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from trirail.wire.marks import OutputName
 __all__ = ["Input", "Output", "OutputName", "digital_io", "digital_rules"]
 
 FIRST_BIT = 16
-"""First bit that CiA 402-2 leaves to the maker, in 60FDh and 60FEh."""
+"""First bit in 60FDh and 60FEh that CiA 402-2 leaves to the manufacturer."""
 LAST_BIT = 31
 
 
@@ -28,14 +28,15 @@ class Output(Struct, frozen=True, forbid_unknown_fields=True):
     drive: Literal["A", "B", "C"]
     """Drive that has the output."""
     bit: Annotated[int, Meta(ge=0, le=LAST_BIT)]
-    """Its bit of object 60FEh, from the maker's manual: 16 to 31, since CiA 402 reserves the others; bit 0 sets the
-    brake."""
+    """Bit of the output in object 60FEh, from the manufacturer's manual: 16 to 31, because CiA 402 reserves the others.
+    Bit 0 sets the brake."""
     safe: bool = False
-    """Value while the robot is disabled or in fault, and at the end of the service."""
+    """Value while the robot is disabled or in fault, and when the service ends."""
     delay: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.0
-    """Switching delay of the device at the output, as a valve's [s]: on a path it switches earlier by it."""
+    """Switching delay of the device at the output, such as a valve [s]. On a path, the output switches earlier by this
+    time."""
     always: bool = False
-    """Whether it may also be set while the robot is disabled or in fault."""
+    """Whether the output may also be set while the robot is disabled or in fault."""
 
 
 class Input(Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,8 +45,8 @@ class Input(Struct, frozen=True, forbid_unknown_fields=True):
     drive: Literal["A", "B", "C"]
     """Drive that has the input."""
     bit: Annotated[int, Meta(ge=0, le=LAST_BIT)]
-    """Its bit of object 60FDh, from the maker's manual: 16 to 31, since CiA 402 reserves the others; bits 0 to 3 are
-    limit switches, home switch and interlock."""
+    """Bit of the input in object 60FDh, from the manufacturer's manual: 16 to 31, because CiA 402 reserves the others.
+    Bits 0 to 3 are the limit switches, the home switch and the interlock."""
 
 
 _RESERVED = {0: "sets the brake"}
@@ -87,7 +88,7 @@ def _check_bit(key: str, bit: int, index: str, reserved: Mapping[int, str]) -> N
 
 
 def _check_single(kind: str, name: str, pins: Mapping[str, Output | Input]) -> None:
-    """Refuse an output or input that is another name for an earlier one of its kind."""
+    """Refuse an output or input that has the same drive and bit as an earlier one of its kind."""
     pin = pins[name]
     for other, each in itertools.takewhile(lambda item: item[0] != name, pins.items()):
         if (each.drive, each.bit) == (pin.drive, pin.bit):

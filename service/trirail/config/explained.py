@@ -1,4 +1,4 @@
-"""Messages about wrong values of a file: the key, its value, the allowed values, and a suggestion."""
+"""Messages about wrong values in a file. Each gives the key, its value, the allowed values and a suggestion."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from trirail.quantities import meant
 from trirail.wire.decoding import converted
 
 Place = tuple[str | int, ...]
-"""Position in nested tables and arrays: names and indices."""
+"""Position of a value in nested tables and arrays, as names and indices."""
 
 
 def leaves(value: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
-    """Yield every value that is not a table or array, with its position in the file."""
+    """Yield each value that is neither a table nor an array, with its position in the file."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from leaves(inner, (*place, name))
@@ -34,16 +34,19 @@ def leaves(value: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
 
 
 class Mistake(NamedTuple):
-    """Mistake in a configuration file."""
+    """A mistake in a configuration file."""
 
     key: str
-    """Key with the mistake."""
+    """Key that has the mistake."""
     text: str
     """Message with the key, its value and the allowed values."""
 
 
 def overlap(keys: Iterable[str], others: Iterable[str]) -> bool:
-    """Whether one of the keys is, holds, or is in, one of the others: limits holds limits.slider.position[0]."""
+    """Return whether any of the keys equals, contains or is contained in any of the others.
+
+    For example, limits contains limits.slider.position[0].
+    """
     beside = tuple(others)
     return any(one == other or _holds(one, other) or _holds(other, one) for one in keys for other in beside)
 
@@ -62,12 +65,12 @@ class _WrongValue(NamedTuple):
 
 
 def wrong_values(raw: dict[str, Any], kind: type[msgspec.Struct]) -> list[Mistake]:
-    """Return a mistake for every value of nested tables that `kind`, the type of the file, does not accept."""
+    """Return a mistake for each value in nested tables that `kind`, the type of the file, does not accept."""
     return [Mistake(_key(wrong.place), wrong.text) for wrong in _wrong_values(raw, mi.type_info(kind), ())]
 
 
 def repaired(raw: dict[str, Any]) -> tuple[Config, list[Mistake]]:
-    """Return the configuration in tables, with a valid value in place of each wrong one, and the mistakes."""
+    """Return a configuration in which a valid value replaces each wrong one, and the list of mistakes."""
     tables, mistakes = copy.deepcopy(raw), list[Mistake]()
     while wrong := list(_wrong_values(tables, mi.type_info(Config), ())):
         for place, text, kind in wrong:
@@ -76,13 +79,13 @@ def repaired(raw: dict[str, Any]) -> tuple[Config, list[Mistake]]:
                 del table[place[-1]]
             else:
                 table[place[-1]] = _stand_in(kind)
-            if not overlap((key,), (each.key for each in mistakes)):  # else the stand-ins do not go together
+            if not overlap((key,), (each.key for each in mistakes)):  # else the stand-ins may conflict
                 mistakes.append(Mistake(key, text))
     return converted(tables, Config), mistakes
 
 
 def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_WrongValue]:
-    """Yield the parts of a value, or the value itself, that a type does not accept."""
+    """Yield the parts of a value that a type does not accept, or the value itself if it is wrong as a whole."""
     if isinstance(value, float) and not math.isfinite(value):
         yield _WrongValue(place, f"{_key(place)} = {value}: it must be a finite number", kind)
         return
@@ -93,7 +96,8 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
         case mi.UnionType(types=types), _:
             of_each = [list(_wrong_values(value, part, place)) for part in types]
             if all(of_each):
-                # The type whose shape the value has says where in it; else none is nearer than another.
+                # If the value has the shape of one of the types, the errors are those within that type. Otherwise no type
+                # is closer than another.
                 inside = (errors for errors in of_each if all(wrong.place != place for wrong in errors))
                 yield from next(inside, [_unexpected(value, kind, place)])
         case mi.StructType(), dict():
@@ -109,7 +113,7 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
 
 
 def _wrong_fields(table: dict[str, Any], kind: mi.StructType, place: Place) -> Iterator[_WrongValue]:
-    """Yield wrong keys and values of a table; if there are none, values that contradict each other."""
+    """Yield the wrong keys and values of a table or, if there are none, values that contradict each other."""
     word = "key" if place else "section"
     fields = {field.encode_name: field for field in kind.fields}
     wrong_fields: list[_WrongValue] = []
@@ -137,7 +141,7 @@ def _wrong_fields(table: dict[str, Any], kind: mi.StructType, place: Place) -> I
 
 
 def _wrong_names(table: dict[str, Any], kind: mi.DictType, place: Place) -> Iterator[_WrongValue]:
-    """Yield wrong names and values of a table whose keys are names."""
+    """Yield the wrong names and values of a table whose keys are names."""
     for name, value in table.items():
         if _accepts(kind.key_type, name):
             yield from _wrong_values(value, kind.value_type, (*place, name))
@@ -147,7 +151,7 @@ def _wrong_names(table: dict[str, Any], kind: mi.DictType, place: Place) -> Iter
 
 
 def _accepts(kind: mi.Type, value: object) -> bool:
-    """Whether a type accepts a value; tables, and arrays of the right length, are checked elsewhere."""
+    """Return whether a type accepts a value. Tables and arrays of the right length are checked elsewhere."""
     match kind:
         case mi.NoneType():
             return value is None
@@ -188,13 +192,13 @@ def _fits(length: int, kind: mi.StrType | mi.VarTupleType) -> bool:
 
 
 def _unexpected(value: object, kind: mi.Type, place: Place) -> _WrongValue:
-    """Say what stands at a place, and what its type takes."""
+    """Return a message with the value at a position and the values that its type accepts."""
     text = f"{_key(place)} = {value!r}: expected {expected(kind)}{_other_unit(value, kind)}"
     return _WrongValue(place, text, kind)
 
 
 def expected(kind: mi.Type) -> str:
-    """Return in words which values a type takes."""
+    """Return a description of the values that a type accepts."""
     match kind:
         case mi.Metadata(extra_json_schema={"description": words}):
             return str(words)
@@ -224,7 +228,7 @@ def expected(kind: mi.Type) -> str:
 
 
 def bounds(kind: mi.IntType | mi.FloatType) -> str:
-    """Return the bounds of a number in words, as they follow what it is."""
+    """Return the bounds of a number in words that can follow the name of its type."""
     digits = 10 if isinstance(kind, mi.IntType) else 6
     if kind.ge is not None and kind.le is not None:
         return f", {kind.ge:.{digits}g} to {kind.le:.{digits}g}"
@@ -239,7 +243,7 @@ _UNITS: Final = (
 
 
 def _other_unit(value: object, kind: mi.Type) -> str:
-    """Ask whether a number that is out of its bounds was meant in degrees, or in millimetres."""
+    """Return a question whether an out-of-range number was meant to be in degrees or millimetres."""
     for number, limit, unit, words in _UNITS:
         if number in (kind, *getattr(kind, "types", ())) and isinstance(value, int | float):
             likely = meant(value, limit, unit)
@@ -248,11 +252,11 @@ def _other_unit(value: object, kind: mi.Type) -> str:
 
 
 _POSSIBLE: Final[tuple[object, ...]] = (1, 0.5, 0, 10, 1000, 50_000, True, "x", "605A", "counts/s")
-"""Candidate values: every key that is not a table or array accepts one of them."""
+"""Candidate values. Every key that is neither a table nor an array accepts at least one of them."""
 
 
 def _stand_in(kind: mi.Type) -> object:
-    """Return a value of a type."""
+    """Return any value that a type accepts."""
     match kind:
         case mi.Metadata(type=inner):
             return _stand_in(inner)
@@ -265,7 +269,7 @@ def _stand_in(kind: mi.Type) -> object:
         case mi.TupleType(item_types=types):
             return [_stand_in(each) for each in types]
         case mi.VarTupleType(item_type=inner):
-            return [_stand_in(inner)] * max(2, kind.min_length or 0)  # two are a range, of limits.slider.position
+            return [_stand_in(inner)] * max(2, kind.min_length or 0)  # two form a range, as in limits.slider.position
         case mi.LiteralType(values=values):
             return values[0]
         case mi.EnumType(cls=cls):
@@ -274,12 +278,12 @@ def _stand_in(kind: mi.Type) -> object:
 
 
 def _at(place: Place, raw: Any) -> Any:
-    """The value that was given at a place."""
+    """Return the value at a position in the file."""
     for part in place:
         raw = raw[part]
     return raw
 
 
 def _key(place: Place) -> str:
-    """A place as people write it: limits.platform.x[0]."""
+    """Return a position in the notation that people use, such as limits.platform.x[0]."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")

@@ -1,4 +1,4 @@
-"""Checks of a configuration's values that are well-formed but impossible."""
+"""Checks for values of a configuration that are well-formed but impossible."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from trirail.wire.text import QUANTITY_RULE, is_quantity
 
 
 def check_as_built(errors: AsBuilt, robot: Geometry, limits: Limits) -> None:
-    """Refuse a map of another robot, or one that could break a limit anywhere. Raises ConfigError."""
+    """Raise ConfigError if a map belongs to another robot or could cause a limit to be exceeded anywhere."""
     platform, slider = limits.platform, limits.slider
     rates = platform.velocity, platform.acceleration, platform.jerk
     as_built.check(errors, robot, room(limits), rates, (slider.velocities, slider.accelerations, slider.jerks))
 
 
 MAX_RANGE_SIZES = 10.0
-"""Plausible maximum of a range, in multiples of the robot's size."""
+"""Largest plausible value of a range, in multiples of the robot's size."""
 MM = FAMILIAR_UNITS["m"][0]
 _WINDOWS = (
     *((f"sliders[{i}]", "m") for i in range(3)),
     *((f"pose[{i}]", unit) for i, unit in enumerate(("m", "m", "rad"))),
 )
-"""Windows of [limits.in_position], each with its unit."""
+"""Keys of the windows in [limits.in_position], each with its unit."""
 
 
 def check(config: Config) -> None:
@@ -50,9 +50,9 @@ def check(config: Config) -> None:
 
 
 def mistakes(config: Config, impossible: Sequence[str] = ()) -> tuple[list[Mistake], list[str]]:
-    """Return all mistakes, and the keys that were not checked because their checks read an `impossible` key.
+    """Return all mistakes, and the keys that were not checked because their checks depend on an `impossible` key.
 
-    The files that the configuration names are read.
+    The checks read the files that the configuration names.
     """
     from trirail_drivers.connection import settings_checks
 
@@ -67,13 +67,13 @@ def mistakes(config: Config, impossible: Sequence[str] = ()) -> tuple[list[Mista
             rule.check()
         except TrirailError as error:
             by_text.setdefault(str(error), Mistake(rule.key, str(error)))
-            if not rule.reads:  # wrong by itself, whatever the other keys are
+            if not rule.reads:  # wrong regardless of the other keys
                 wrong.append(rule.key)
     return list(by_text.values()), list(unchecked)
 
 
 def rules(config: Config) -> Iterator[Rule]:
-    """Yield all checks; each relies on those before it."""
+    """Yield all checks in order; each check assumes that the previous ones have passed."""
     from trirail_drivers.connection import settings_checks
 
     platform, slider = config.limits.platform, config.limits.slider
@@ -113,7 +113,7 @@ def _check_range(key: str, low: float, high: float) -> None:
 
 
 def _check_metres(config: Config, key: str, low: float, high: float) -> None:
-    """Refuse a range that is far larger than the robot, but plausible in millimetres."""
+    """Refuse a range that is far larger than the robot but would be plausible in millimetres."""
     size = _size(config)
     widest = max(low, high, key=abs)
     if abs(widest) > MAX_RANGE_SIZES * size and meant(widest, MAX_RANGE_SIZES * size, "m") is not None:
@@ -124,7 +124,7 @@ def _check_metres(config: Config, key: str, low: float, high: float) -> None:
 
 
 def _size(config: Config) -> float:
-    """Return the maximum distance of a part of the robot from the origin of its frame [m]."""
+    """Return the greatest distance of any part of the robot from the origin of its frame [m]."""
     legs = config.geometry.leg or ()
     points = [point for leg in legs for point in (leg.anchor, leg.edge_point, leg.pivot) if point is not None]
     homes = [leg.home for leg in legs]
@@ -135,7 +135,7 @@ def _check_singular_angles(config: Config) -> None:
     platform = config.limits.platform
     corrected = corrected_geometry(config)
     errors = corrected.correction
-    x, y, phi = np.zeros(3) if errors is None else errors.bound  # the legs receive poses that far beyond
+    x, y, phi = np.zeros(3) if errors is None else errors.bound  # the legs receive poses this far beyond the limits
     (low, high), margin = (platform.phi[0] - phi, platform.phi[1] + phi), config.limits.singularity_margin
     # On a robot as built the singular angles move with the centre: linearly in x and y, so the corners bound them.
     beside = [(low - more, high + more) for (low, high), more in ((platform.x, x), (platform.y, y))]
@@ -177,7 +177,7 @@ def _check_rate(config: Config) -> None:
 
 
 def _required(config: Config) -> Requirements:
-    """Return the robot's requirements for its drives, without in-position windows if its geometry is singular."""
+    """Return what the robot requires of its drives, without in-position windows if its geometry is singular."""
     slider = config.limits.slider
     simulated, starts = config.can.interface == "simulated", config.can.simulated.start
     places = [(*ends, at) if simulated else ends for ends, at in zip(slider.positions, starts, strict=True)]
@@ -201,7 +201,7 @@ def _windows(config: Config) -> Iterator[Window]:
 
 
 def _check_correction(config: Config) -> None:
-    """Refuse a map of another robot, or one that could break a limit."""
+    """Refuse a map that belongs to another robot or could cause a limit to be exceeded."""
     table = config.correction
     if table.as_built is None:
         if table.map is not None:
@@ -216,7 +216,7 @@ def _check_correction(config: Config) -> None:
 
 
 def _check_pose(config: Config, name: str) -> None:
-    """Refuse a named pose outside the limits."""
+    """Refuse a named pose that is outside the limits."""
     platform, slider, pose = config.limits.platform, config.limits.slider, config.poses[name]
     if is_quantity(name):
         raise ConfigError(f"poses.{name}: {name} {QUANTITY_RULE}")

@@ -20,12 +20,12 @@ from trirail.wire.decoding import prepare
 
 _PACKAGED = Path(__file__).parents[1] / "configs"
 SIM = (_PACKAGED if _PACKAGED.exists() else Path(__file__).parents[3] / "configs") / "sim.toml"
-"""Default configuration: simulated drives, no hardware, no rights, no other program."""
+"""Default configuration. Its drives are simulated, so it needs no hardware, no special rights and no other program."""
 prepare(Config, Limits, FramesTable)
 
 
 def load(path: Path) -> Config:
-    """Read a configuration file. Raises ConfigError with file, key, value and allowed values."""
+    """Read a configuration file. Raises ConfigError, which names the file, key, value and allowed values."""
     try:
         config, wrong = _read(path)
         _refuse(wrong)
@@ -36,7 +36,7 @@ def load(path: Path) -> Config:
 
 
 def parse(text: str) -> Config:
-    """Parse a configuration in TOML. Raises ConfigError."""
+    """Parse a configuration in TOML. Raises ConfigError if it is invalid."""
     config, wrong = repaired(toml_tables(text))
     _refuse(wrong)
     check(config)
@@ -44,17 +44,17 @@ def parse(text: str) -> Config:
 
 
 class Findings(NamedTuple):
-    """Contents of a file, and all its mistakes."""
+    """Contents of a configuration file and all its mistakes."""
 
     config: Config
-    """Configuration with possible values in place of the mistakes."""
+    """Configuration in which possible values replace the wrong ones."""
     mistakes: list[Mistake]
     unchecked: list[str]
-    """Keys whose checks depend on a mistake, and were not run."""
+    """Keys that were not checked because their checks depend on a wrong value."""
 
 
 def everything(path: Path) -> Findings:
-    """Read a configuration file and find all its mistakes; `load` ends at the first.
+    """Read a configuration file and find all its mistakes, whereas `load` stops at the first.
 
     Raises ConfigError if the file is not TOML.
     """
@@ -72,7 +72,10 @@ def _refuse(wrong: list[Mistake]) -> None:
 
 
 def _read(path: Path) -> tuple[Config, list[Mistake]]:
-    """Read a file, and return its mistakes beside a configuration without them. Raises ConfigError."""
+    """Read a file; return a configuration without its mistakes, and the mistakes.
+
+    Raises ConfigError if the file cannot be read or is not TOML.
+    """
     try:
         text = files.text(path)
     except FileError as error:
@@ -83,7 +86,7 @@ def _read(path: Path) -> tuple[Config, list[Mistake]]:
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """Parse TOML. Raises ConfigError."""
+    """Parse TOML into tables. Raises ConfigError if it is invalid."""
     try:
         raw = tomllib.loads(text)
         for _ in leaves(raw):
@@ -96,7 +99,10 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def _resolve_paths(path: Path, config: Config, wrong: list[Mistake]) -> Config:
-    """Return the configuration with paths relative to its file resolved, and with its map of as-built errors loaded."""
+    """Return the configuration with its relative paths resolved and its map of as-built errors loaded.
+
+    Paths are relative to the configuration file.
+    """
     drives = config.drives
     for name, drive in zip(NAMES, drives.each, strict=True):
         named = {key: getattr(drive, key) for key in ("eds", "endpoints")}
@@ -110,7 +116,7 @@ def _resolve_paths(path: Path, config: Config, wrong: list[Mistake]) -> Config:
         except ConfigError as error:
             wrong.append(Mistake("correction.map", f"correction.map: {error}"))
     telemetry = config.telemetry
-    if not path.resolve().is_relative_to(SIM.parent):  # recordings never go beside the shipped files
+    if not path.resolve().is_relative_to(SIM.parent):  # recordings are never written next to the shipped files
         telemetry = msgspec.structs.replace(telemetry, directory=str(path.parent / telemetry.directory))
     zenoh = config.zenoh.beside(path.parent)
     return msgspec.structs.replace(config, drives=drives, zenoh=zenoh, correction=correction, telemetry=telemetry)

@@ -1,4 +1,4 @@
-"""Checks of addresses, certificates and ports that are well-formed but impossible or unsafe."""
+"""Checks for addresses, certificates and ports that are well-formed but impossible or unsafe."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trirail.wire.endpoints import ReachableBy, fault_of, reach, same_port, tcp_
 
 
 def network_rules(config: Config) -> Iterator[Rule]:
-    """Yield the checks of all addresses: reachable, and only for the intended users."""
+    """Yield the checks that all addresses can be reached, and only by the intended users."""
     yield from reach_rules(config.zenoh)
     reads = "telemetry.metrics_port", "zenoh"
     yield Rule("telemetry.metrics_address", reads, partial(_check_metrics, config))
@@ -33,13 +33,13 @@ def network_rules(config: Config) -> Iterator[Rule]:
 
 
 def _check_port(key: str, address: tuple[str, int], other: str, second: tuple[str, int]) -> None:
-    """Refuse a port with two listeners."""
+    """Refuse a port that two listeners would share."""
     if same_port(address, second):
         raise ConfigError(f"{other}: port {second[1]} is also that of {key}; use different ports")
 
 
 def _check_metrics(config: Config) -> None:
-    """Refuse a metrics address that is no IP address, or that opens the metrics to a network by accident."""
+    """Refuse a metrics address that is not an IP address or that opens the metrics to a network by accident."""
     address, zenoh = config.telemetry.metrics_address, config.zenoh
     key = f"telemetry.metrics_address = {address!r}"
     try:
@@ -54,13 +54,13 @@ def _check_metrics(config: Config) -> None:
 
 
 def check_reach(zenoh: Zenoh) -> None:
-    """Refuse endpoints that are open by accident, and certificates or users without effect. Raises ConfigError."""
+    """Raise ConfigError for endpoints that are open by accident, or for certificates or users that have no effect."""
     for rule in reach_rules(zenoh):
         rule.check()
 
 
 def reach_rules(zenoh: Zenoh) -> Iterator[Rule]:
-    """Yield the checks for endpoints that are open by accident, and for certificates or users without effect."""
+    """Yield the checks for endpoints that are open by accident and for certificates or users that have no effect."""
     yield Rule("zenoh.connect", ("zenoh.tls", "zenoh.router"), partial(_check_connect, zenoh))
     yield Rule("zenoh.router", ("zenoh.tls", "zenoh.connect", "zenoh.users"), partial(_check_router, zenoh))
     yield Rule("zenoh.users", ("zenoh.tls",), partial(_check_users, zenoh))

@@ -1,4 +1,4 @@
-"""Keys of a configuration: section, type, range, default and meaning."""
+"""Keys of a configuration file, each with its section, type, range, default and meaning."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Angle = Annotated[float, Meta(ge=-2.0 * math.pi, le=2.0 * math.pi)]
 Jerk = Annotated[float, Meta(ge=1e-3, le=1e6)]
 """Jerk [m/s³] or [rad/s³]."""
 BASE, PLATFORM = "base", "platform"
-"""Frames that every robot has."""
+"""Names of the frames that every robot has."""
 FrameName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 UserName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-"""The <user> of Zenoh keys."""
+"""Name of a user, the <user> in Zenoh keys."""
 PoseName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Label = Annotated[str, Meta(pattern=r"^[^\W\d_][^\W_]{0,3}\Z")]
-"""One to four letters and digits of any script, a letter first."""
+"""One to four letters and digits of any script, starting with a letter."""
 Point = tuple[Coordinate, Coordinate]
 Range = tuple[Coordinate, Coordinate]
 
@@ -43,62 +43,64 @@ class RobotTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [robot]."""
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-    """The <robot> of every Zenoh key; letters, digits, - and _."""
+    """Name of the robot, the <robot> in every Zenoh key: letters, digits, - and _."""
 
 
 class LegTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """One leg of a measured robot: [[geometry.leg]], in metres and radians."""
+    """Section [[geometry.leg]]: one leg of a measured robot, in metres and radians."""
 
     anchor: Point
-    """Point on the rail, x and y in the base frame [m]."""
+    """Point on the rail: x and y in the base frame [m]."""
     rail_angle: Angle
-    """Direction of the rail, with rising slider position, from the base's x axis [rad]."""
+    """Direction in which the slider position increases along the rail, measured from the base's x axis [rad]."""
     home: Coordinate
-    """Distance from the anchor to the slider's zero, along the rail [m]."""
+    """Distance along the rail from the anchor to the slider's zero [m]."""
     edge_point: Point | None = None
-    """3-PRP: point of the platform at the slider's pin when the cross slide is at zero, in its own frame [m]."""
+    """3-PRP: point of the platform that is at the slider's pin when the cross slide is at zero, in the platform's frame
+    [m]."""
     edge_angle: Angle | None = None
-    """3-PRP: direction of the platform's edge that slides in the pin, in the platform's frame [rad]."""
+    """3-PRP: direction of the platform's edge that slides through the pin, in the platform's frame [rad]."""
     pivot: Point | None = None
     """3-PPR: pivot of the platform on the cross slide, in the platform's frame [m]."""
     slide_angle: Angle | None = None
-    """3-PPR: direction of the cross slide in the base frame [rad]; at right angles to the rail when absent."""
+    """3-PPR: direction of the cross slide in the base frame [rad]. If absent, it is at right angles to the rail."""
 
 
 class GeometryTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [geometry]: the paper's symmetric robot by `l0`, or three measured legs."""
+    """Section [geometry]: either `l0` for the paper's symmetric robot, or three measured legs."""
 
     kind: Literal["3-PRP", "3-PPR"] = "3-PRP"
-    """Mechanism: pivot on the driven carriage, below a cross slide that turns with the platform (3-PRP, alignment
-    stages of kind 1), or pivot on a cross slide that keeps its direction (3-PPR, kind 2)."""
+    """Mechanism. In 3-PRP (alignment stages of kind 1), the pivot is on the driven carriage, below a cross slide that
+    turns with the platform. In 3-PPR (kind 2), the pivot is on a cross slide that keeps its direction."""
     l0: Annotated[float, Meta(ge=0.001, le=100.0)] | None = None
-    """Distance from the centre to the start of each rail of the symmetric robot [m]; instead of three legs."""
+    """Distance from the centre to the start of each rail of the symmetric robot [m]. It replaces the three legs."""
     leg: tuple[LegTable, LegTable, LegTable] | None = None
     labels: tuple[Label, Label, Label] = NAMES
-    """Display names of the sliders A, B, C, for example U, V, W: one to four letters and digits."""
+    """Display names of the sliders A, B and C, for example U, V and W: one to four letters and digits each."""
 
 
 class PlatformLimits(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [limits.platform]: limits of x, y [m] and phi [rad]."""
+    """Section [limits.platform]: limits for x, y [m] and phi [rad]."""
 
     velocity: tuple[Velocity, Velocity, Velocity]
-    """Maximum velocities of x, y [m/s] and phi [rad/s]."""
+    """Maximum velocities in x, y [m/s] and phi [rad/s]."""
     acceleration: tuple[Acceleration, Acceleration, Acceleration]
-    """Maximum accelerations of x, y [m/s²] and phi [rad/s²]."""
+    """Maximum accelerations in x, y [m/s²] and phi [rad/s²]."""
     jerk: tuple[Jerk, Jerk, Jerk]
-    """Maximum jerks of x, y [m/s³] and phi [rad/s³]."""
+    """Maximum jerks in x, y [m/s³] and phi [rad/s³]."""
     x: Range
     """Minimum and maximum x of the platform's centre [m]."""
     y: Range
     """Minimum and maximum y of the platform's centre [m]."""
     phi: tuple[Angle, Angle]
-    """Minimum and maximum angle of the platform [rad], at least singularity_margin from every singular angle."""
+    """Minimum and maximum angle of the platform [rad]. Both must be at least singularity_margin away from every
+    singular angle."""
 
 
 _THREE = Meta(min_length=3, max_length=3)
 _PER_SLIDER = Meta(description="one number for all sliders, or three: of A, B, C")
-# msgspec 0.22 stores bounds of a number and the length of a fixed array in the same place: a union of both crashes the
-# interpreter. These types are therefore arrays of any length, with the length as a constraint.
+# msgspec 0.22 stores the bounds of a number and the length of a fixed array in the same place, so a union of the two
+# crashes the interpreter. These types are therefore arrays of any length, and a constraint checks the length.
 EachVelocity = Annotated[Velocity | Annotated[tuple[Velocity, ...], _THREE], _PER_SLIDER]
 EachAcceleration = Annotated[Acceleration | Annotated[tuple[Acceleration, ...], _THREE], _PER_SLIDER]
 EachJerk = Annotated[Jerk | Annotated[tuple[Jerk, ...], _THREE], _PER_SLIDER]
@@ -109,7 +111,7 @@ EachRange = Annotated[
 
 
 class ShapeError(ValueError):
-    """An array has none of the shapes that its `field` may have; the field's type cannot tell."""
+    """An array has none of the shapes that its `field` accepts; the type of the field cannot express this."""
 
     def __init__(self, field: str) -> None:
         super().__init__(f"{field} has none of its shapes")
@@ -120,9 +122,9 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [limits.slider]."""
 
     position: EachRange
-    """Travel of lambda_10 [m]."""
+    """Minimum and maximum slider position lambda_10 [m]."""
     passive: Range
-    """Travel of the cross slides, which have no drive [m]; in 3-PRP they are the platform's edges."""
+    """Travel of the cross slides, which have no drive [m]. In 3-PRP, the cross slides are the platform's edges."""
     velocity: EachVelocity
     """Maximum velocity of each slider [m/s]."""
     acceleration: EachAcceleration
@@ -130,7 +132,7 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
     jerk: EachJerk
     """Maximum jerk of each slider [m/s³]."""
     following_error: Distance
-    """Following error above which all drives stop [m]; less than `[drives] following_error`."""
+    """Following error above which all drives stop [m]. It must be less than `[drives] following_error`."""
 
     def __post_init__(self) -> None:
         pairs = sum(isinstance(each, tuple) for each in self.position)
@@ -138,7 +140,7 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
             raise ShapeError("position")
 
     def keys(self, limit: str) -> tuple[str, str, str]:
-        """Return the key of each slider's limit, with an index if each slider has its own."""
+        """Return the key of each slider's limit, with an index if each slider has its own limit."""
         value = getattr(self, limit)
         own = isinstance(value, tuple) and len(value) == len(NAMES)
         a, b, c = (f"limits.slider.{limit}[{k}]" if own else f"limits.slider.{limit}" for k in range(3))
@@ -166,7 +168,7 @@ class SliderLimits(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def fastest(self) -> float:
-        """Maximum velocity of all sliders [m/s]."""
+        """Highest of the sliders' maximum velocities [m/s]."""
         return max(self.velocities)
 
 
@@ -180,16 +182,16 @@ Window = Annotated[float, Meta(ge=1e-9, le=1.0)]
 
 
 class InPosition(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [limits.in_position]: a goal is `done` when sliders and pose stay in these windows for the dwell."""
+    """Section [limits.in_position]: windows in which sliders and pose must stay for `dwell` before a goal is `done`."""
 
     sliders: tuple[Window, Window, Window] = (1e-4, 1e-4, 1e-4)
-    """Maximum position error of the sliders A, B, C [m]; at least three counts of their drives."""
+    """Maximum position errors of the sliders A, B and C [m]. Each must be at least three counts of its drive."""
     pose: tuple[Window, Window, Window] = (1e-4, 1e-4, 1e-3)
-    """Maximum error of the measured pose, in x, y [m] and phi [rad]."""
+    """Maximum errors of the measured pose in x, y [m] and phi [rad]."""
     dwell: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.02
-    """Time for which all of them must stay inside [s]."""
+    """Time for which all errors must stay within their windows [s]."""
     timeout: Annotated[float, Meta(ge=0.01, le=60.0)] = 2.0
-    """Time-out after the end of the path, dwell included [s]; then the goal ends `unsettled`."""
+    """Time-out after the end of the path, including the dwell [s]. When it expires, the goal ends as `unsettled`."""
 
 
 class Limits(Struct, frozen=True, forbid_unknown_fields=True):
@@ -199,32 +201,32 @@ class Limits(Struct, frozen=True, forbid_unknown_fields=True):
     slider: SliderLimits
     in_position: InPosition = InPosition()
     singularity_margin: Annotated[float, Meta(ge=0.001, le=1.5)] = 0.1
-    """Minimum distance of phi from a singular angle [rad]."""
+    """Minimum distance of phi from any singular angle [rad]."""
 
 
 class MotionTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [motion]."""
 
     queue: Annotated[int, Meta(ge=0, le=100)] = 8
-    """Maximum number of goals with a `blend` that wait for the active goal."""
+    """Maximum number of goals with a `blend` that can wait for the active goal."""
 
 
 class ControlTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [control]: use of the lease, in addition to roles."""
+    """Section [control]: rules for the lease, which apply in addition to roles."""
 
     lease: LeasePolicy = "optional"
-    """Whether moving the robot requires the lease. While a user holds it, the robot moves for that user only."""
+    """Whether moving the robot requires the lease. While a user holds the lease, the robot moves for that user only."""
     takeover: Role = Role.MAINTAINER
-    """Lowest role that may take the lease over from its holder."""
+    """Lowest role that may take over the lease from its holder."""
 
 
 class FramesTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [frames]: points and frames that goals may name."""
 
     tool: dict[FrameName, Point] = msgspec.field(default_factory=dict)
-    """Points of the platform by name, x and y in its own frame, whose origin is the centre [m]."""
+    """Named points of the platform: x and y in the platform's frame, whose origin is the centre [m]."""
     work: dict[FrameName, tuple[Coordinate, Coordinate, Angle]] = msgspec.field(default_factory=dict)
-    """Frames by name: x, y [m] of the origin and the angle [rad], in the base frame."""
+    """Named frames: x, y [m] of the origin and the angle [rad], in the base frame."""
 
 
 Play = Annotated[float, Meta(ge=0.0, le=0.001)]
@@ -232,12 +234,13 @@ Play = Annotated[float, Meta(ge=0.0, le=0.001)]
 
 
 class CorrectionTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [correction]: differences of the robot from [geometry]; none if it is absent."""
+    """Section [correction]: differences between the robot and its [geometry]; none if the section is absent."""
 
     map: Name | None = None
-    """File of as-built errors, from `tools/calibrate.py --map`, relative to the configuration file."""
+    """File of as-built errors, written by `tools/calibrate.py --map`; its path is relative to the configuration
+    file."""
     backlash: tuple[Play, Play, Play] = (0.0, 0.0, 0.0)
-    """Play between drive and slider, A, B, C [m]: compensated when a slider reverses."""
+    """Play between drive and slider for A, B and C [m]. The service compensates it when a slider reverses."""
     as_built: AsBuilt | None = None
 
 
@@ -245,44 +248,47 @@ class LoopTable(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [loop]."""
 
     rate_hz: Annotated[int, Meta(ge=1, le=4000)]
-    """Cycles per second: SYNCs, setpoints and records; a cycle is a whole number of microseconds."""
+    """Cycles per second. Each cycle has one SYNC, one set of setpoints and one record, and lasts a whole number of
+    microseconds."""
     realtime: Literal["off", "prefer", "enforce"] = "prefer"
-    """Whether SCHED_FIFO, locked memory and a pinned processor are unused, optional or required."""
+    """Whether SCHED_FIFO, locked memory and a pinned processor are not used, used if possible, or required."""
     priority: Annotated[int, Meta(ge=1, le=99)] = 80
-    """The loop's priority among SCHED_FIFO threads."""
+    """Priority of the loop among SCHED_FIFO threads."""
     cpu: Annotated[int, Meta(ge=0, le=8191)] | None = None
-    """Processor of the loop; the last one that the process may use if absent."""
+    """Processor to which the loop is pinned. If absent, it is the last one that the process may use."""
 
 
 class Tls(Struct, frozen=True, forbid_unknown_fields=True):
-    """Section [zenoh.tls]: users need a certificate to connect, and a role to do anything."""
+    """Section [zenoh.tls]: users need a certificate to connect and a role to do anything."""
 
     directory: Name = "keys"
-    """Folder with ca.pem, cert.pem and key.pem from `trirail keys init`, relative to the configuration file; users in
-    its file revoked.txt have no role."""
+    """Folder with ca.pem, cert.pem and key.pem from `trirail keys init`; its path is relative to the configuration
+    file. Users listed in the folder's file revoked.txt have no role."""
 
 
 class Zenoh(Struct, frozen=True, forbid_unknown_fields=True):
     """Section [zenoh]."""
 
     listen: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=64)] = ("tcp/127.0.0.1:7447",)
-    """Zenoh locators of the service: tcp on the loopback for all users of this machine, unixsock-stream for those with
-    access to the socket's file, tls with [zenoh.tls] for the network. At a port 1000 higher, or PATH.stop, the service
-    accepts stops only."""
+    """Zenoh locators at which the service listens: tcp on the loopback for all users of this machine, unixsock-stream
+    for users with access to the socket file, and tls with [zenoh.tls] for the network. At the port number plus 1000, or
+    at PATH.stop, the service accepts stops only."""
     connect: Annotated[tuple[Name, ...], Meta(max_length=8)] = ()
-    """Zenoh locators of routers that the service connects to, with retries; users reach it through them."""
+    """Zenoh locators of routers to which the service connects, retrying if necessary. Users reach the service through
+    these routers."""
     router: UserName | None = None
-    """Common name of the routers' certificate. With [zenoh.tls] the robot accepts no other router, and this one for
-    every user, because the router checks the users' roles."""
+    """Common name in the routers' certificates. With [zenoh.tls], the robot accepts no other router. It accepts this
+    router on behalf of every user, because the router checks the users' roles."""
     insecure: bool = False
-    """Listen beyond this machine without certificates: anyone on the network can move the robot."""
+    """Allow the service to listen beyond this machine without certificates. Anyone on the network can then move the
+    robot."""
     tls: Tls | None = None
     users: dict[UserName, Role] = {}
-    """Role of each user, named by the common name of the certificate: a viewer sees everything and may stop, an
-    operator also moves the robot, a maintainer also resets and homes."""
+    """Role of each user, whose name is the common name of their certificate. A viewer sees everything and may stop the
+    robot, an operator may also move it, and a maintainer may also reset and home it."""
 
     def beside(self, folder: Path) -> Zenoh:
-        """Return the section with the certificates' folder resolved relative to `folder`, that of the file."""
+        """Return the section with its certificate folder resolved relative to `folder`, the folder of the file."""
         if self.tls is None:
             return self
         return structs.replace(self, tls=structs.replace(self.tls, directory=str(folder / self.tls.directory)))
@@ -294,25 +300,28 @@ class Telemetry(Struct, frozen=True, forbid_unknown_fields=True):
     log: Literal["text", "json"] = "text"
     """Format of the service's log lines: text for people, or JSON."""
     directory: Name = "recordings"
-    """Folder of recordings, relative to the configuration file; for shipped files, to the working directory."""
+    """Folder for recordings. Its path is relative to the configuration file or, for shipped files, to the working
+    directory."""
     state_hz: Annotated[int, Meta(ge=1, le=200)] = 50
-    """Publication rate of the state [Hz]."""
+    """Rate at which the state is published [Hz]."""
     live_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     """Loopback port of the live Rerun server; 0 for none."""
     live_mb: Annotated[float, Meta(ge=1.0, le=4096.0)] = 64.0
-    """Memory for the history that late viewers receive [1e6 bytes]; the oldest data is dropped."""
+    """Memory for the history that viewers receive when they connect late [1e6 bytes]. When it is full, the oldest data
+    is dropped."""
     metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
-    """Port of the metrics for Prometheus, /metrics, and of the processes' health, /healthz; 0 for none."""
+    """Port that serves the Prometheus metrics at /metrics and the health of the processes at /healthz; 0 for none."""
     metrics_address: Name = "127.0.0.1"
-    """IP address of that port; beyond the loopback it needs [zenoh.tls], and readers a certificate with a role."""
+    """IP address on which the metrics port listens. An address beyond the loopback requires [zenoh.tls], and readers
+    then need a certificate with a role."""
     capture_can: bool = False
-    """Write every CAN frame of the session beside the recording, in candump's log format."""
+    """Whether to write every CAN frame of the session to a file beside the recording, in candump's log format."""
     rotate_minutes: Annotated[float, Meta(ge=0.01, le=100_000.0)] = 30.0
-    """Maximum duration of a recording's file [min]; the recording continues in another one."""
+    """Maximum duration of one recording file [min]. The recording then continues in another file."""
     rotate_mb: Annotated[float, Meta(ge=1.0, le=1e6)] = 1000.0
-    """Maximum size of a recording's file [1e6 bytes]."""
+    """Maximum size of one recording file [1e6 bytes]."""
     keep_mb: Annotated[float, Meta(ge=1.0, le=1e9)] = 20_000.0
-    """Maximum total size of the recordings in the folder [1e6 bytes]; the oldest are deleted."""
+    """Maximum total size of the recordings in the folder [1e6 bytes]. The oldest recordings are deleted first."""
 
 
 class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
@@ -321,13 +330,14 @@ class Watchdogs(Struct, frozen=True, forbid_unknown_fields=True):
     enable_timeout: Timeout = 2.0
     """Time-out for enabling the drives [s]."""
     max_overruns: Annotated[int, Meta(ge=1, le=100_000)] = 10
-    """Consecutive missed ticks that cause a controlled stop."""
+    """Number of consecutive missed ticks that causes a controlled stop."""
     gateway_timeout: Annotated[float, Meta(ge=0.2, le=10.0)] = 0.3
-    """Time without a heartbeat of the gateway, 20 per second, that causes a controlled stop [s]."""
+    """Time without a heartbeat from the gateway after which a controlled stop begins [s]. The gateway sends 20
+    heartbeats per second."""
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True):
-    """Contents of a configuration file."""
+    """The contents of a configuration file."""
 
     robot: RobotTable
     geometry: GeometryTable
@@ -343,16 +353,16 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     correction: CorrectionTable = CorrectionTable()
     control: ControlTable = ControlTable()
     poses: dict[PoseName, tuple[Coordinate, Coordinate, Angle]] = {}
-    """Poses by name: x, y [m] of the platform's centre and phi [rad], in the base frame. Taught poses are not here; the
-    service stores them."""
+    """Named poses: x, y [m] of the platform's centre and phi [rad], in the base frame. Taught poses are not listed
+    here, because the service stores them itself."""
     outputs: dict[OutputName, Output] = {}
-    """Digital outputs by name."""
+    """Named digital outputs."""
     inputs: dict[OutputName, Input] = {}
-    """Digital inputs by name, each other than an output's."""
+    """Named digital inputs. An input and an output cannot have the same name."""
 
     @property
     def drive_io(self) -> DriveIo:
-        """Digital outputs and inputs of the drives A, B, C."""
+        """Digital outputs and inputs of the drives A, B and C."""
         return digital_io(self.outputs, self.inputs)
 
     @property
@@ -362,7 +372,10 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def metrics_url(config: Config) -> str:
-    """Return the URL of the metrics, "" without metrics. With [zenoh.tls] it is encrypted beyond the loopback."""
+    """Return the URL of the metrics, or "" if metrics are off.
+
+    With [zenoh.tls], the connection is encrypted if the address is beyond the loopback.
+    """
     telemetry = config.telemetry
     endpoint = endpoint_of(telemetry.metrics_address, telemetry.metrics_port)
     encrypted = config.zenoh.tls is not None and not is_local(endpoint)
@@ -371,7 +384,7 @@ def metrics_url(config: Config) -> str:
 
 
 def geometry(table: GeometryTable) -> Geometry:
-    """Build the robot's geometry from its section. Raises ConfigError."""
+    """Build the robot's geometry from its section. Raises ConfigError if the section is invalid."""
     if (table.l0 is None) == (table.leg is None):
         raise ConfigError("geometry: give either l0 (the symmetric robot) or three [[geometry.leg]] tables")
     if table.l0 is not None and table.kind != "3-PRP":
@@ -389,7 +402,10 @@ def geometry(table: GeometryTable) -> Geometry:
 
 
 def _labels(table: GeometryTable) -> Labels:
-    """Return the sliders' labels. Raises ConfigError if one is ambiguous, or an answer to trirail commission."""
+    """Return the sliders' labels.
+
+    Raises ConfigError if a label is ambiguous or is also an answer to a question of trirail commission.
+    """
     labels = dict(zip(NAMES, table.labels, strict=True))
     for name, label in labels.items():
         others = [word for other in NAMES if other != name for word in (other, labels[other])]
@@ -407,7 +423,7 @@ _KIND_WORDS = {"3-PRP": "the platform's edge turns with it", "3-PPR": "the cross
 
 
 def _leg(kind: str, name: str, table: LegTable) -> AnyLeg:
-    """Build a leg from the keys of its mechanism. Raises ConfigError."""
+    """Build a leg from the keys of its mechanism. Raises ConfigError if a key is missing or not allowed."""
     for other, keys in _LEG_KEYS.items():
         for key in keys:
             if other != kind and getattr(table, key) is not None:
@@ -425,12 +441,12 @@ def _leg(kind: str, name: str, table: LegTable) -> AnyLeg:
 
 
 def corrected_geometry(config: Config) -> Geometry:
-    """Build the robot's geometry with its correction, if it has one. Raises ConfigError."""
+    """Build the robot's geometry, including its correction if it has one. Raises ConfigError if either is invalid."""
     robot, errors = geometry(config.geometry), config.correction.as_built
     return dataclasses.replace(robot, correction=as_built.correction(errors)) if errors is not None else robot
 
 
 def room(limits: Limits) -> Room:
-    """Return the limits of the platform and the sliders' travel."""
+    """Return the limits of the platform and the travel of the sliders."""
     low, high = np.transpose([limits.platform.x, limits.platform.y, limits.platform.phi]).tolist()
     return Room(low, high, limits.slider.positions, limits.slider.passive)

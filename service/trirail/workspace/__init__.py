@@ -1,1 +1,1 @@
-"""Workspace, singularities and parts of the robot, and plots of them."""
+"""Computation and plots of the robot's workspace, singularities and parts."""

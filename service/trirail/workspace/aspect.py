@@ -1,6 +1,6 @@
 """Bounds of the aspect in which the robot works: angles that are singular for any centre G, and zeros of det J2.
 
-Plain numpy, so that drawing a workspace needs no compiled kinematics.
+This module uses plain numpy, so that drawing a workspace does not need the compiled kinematics.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ def phi_range(geometry: Geometry) -> tuple[float, float]:
 
 
 def det_j2_rows(geometry: Geometry, phi: Array) -> Array:
-    """Return rows d (K, 3) for angles phi (K,), with det J2 = d @ (1, x, y) [m] at each of them.
+    """Return rows d (K, 3) for angles phi (K,), such that det J2 = d @ (1, x, y) [m] at each angle.
 
-    Only the third column of J2, (18), depends on G; at a fixed phi it is linear in G or constant.
+    Only the third column of J2 (18) depends on G. At a fixed phi, this column is linear in G or constant.
     """
     rows = np.stack([det_j2(geometry, centre, phi) for centre in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))], axis=1)
     rows[:, 1:] -= rows[:, :1]
@@ -34,8 +34,8 @@ def det_j2_rows(geometry: Geometry, phi: Array) -> Array:
 def wall_angles(geometry: Geometry) -> Array:
     """Return the angles phi [rad] that are singular for any G; they repeat every pi.
 
-    A 3-PRP robot has one per leg, at which the cross slide is parallel to the rail. A 3-PPR robot has none of these;
-    its det J2 does not depend on G and gives one angle.
+    A 3-PRP robot has one such angle per leg, at which the cross slide is parallel to the rail. A 3-PPR robot has a
+    single such angle, which is a zero of det J2, because its det J2 does not depend on G.
     """
     parallel = [leg.parallel_angle for leg in geometry.each]
     known = [phi for phi in parallel if phi is not None]

@@ -1,6 +1,6 @@
-"""Positions of the robot's parts for drawings [m], from its geometry and limits.
+"""Positions of the robot's parts for drawings [m], computed from its geometry and limits.
 
-Fixed parts are in the base frame, parts of the platform in the platform's frame with the centre G at the origin.
+Fixed parts are in the base frame. Parts of the platform are in the platform's frame, whose origin is the centre G.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from trirail.kinematics.leg import AnyLeg
 
 Points = NDArray[np.float64]
 STOP_LENGTH_SHARE = 0.022
-"""Length of an end stop's mark, as a share of the longest rail."""
+"""Length of the mark for an end stop, as a share of the longest rail."""
 SLEEVE_HALF_LENGTH_SHARE = 0.035
 """Half the length of the sleeve around an edge of the platform, as a share of the longest rail."""
 TABLE_OVERHANG_SHARE = 0.3
@@ -27,7 +27,7 @@ TABLE_OVERHANG_SHARE = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotParts:
-    """Parts of the robot; a line is an array of points (N, 2)."""
+    """Parts of the robot. Each line is an array of points (N, 2)."""
 
     anchors: Points
     """Start points of the rails (3, 2)."""
@@ -37,21 +37,21 @@ class RobotParts:
     stops: list[Points]
     """Marks across both ends of each travel."""
     outline: list[Points]
-    """The platform: the triangle of its edges, or else a table over its edges or pivots."""
+    """Outline of the platform: the triangle formed by its edges or, if there is none, a table over edges or pivots."""
     edge_stops: list[Points]
-    """Marks across both ends of the passive joints' travel along the platform's edges."""
+    """Marks across both ends of each passive joint's travel along its edge of the platform."""
     arms: list[Points]
     """Lines from the platform's centre to its supports."""
     names: Points
-    """Positions of the sliders' labels, outside the middle of each rail (3, 2)."""
+    """Positions of the sliders' labels, on the outer side of the middle of each rail (3, 2)."""
     cross_slides: Points
-    """Start and end of each cross slide's drawn part, along it from the carriage (3, 2) [m]."""
+    """Start and end of the drawn part of each cross slide, measured along the slide from the carriage (3, 2) [m]."""
     bounds: Points
-    """Lowest and highest x and y of all parts at the pose (0, 0, 0) (2, 2)."""
+    """Lowest and highest x and y of all parts at the pose (0, 0, 0); shape (2, 2)."""
 
     @classmethod
     def from_geometry(cls, geometry: Geometry, limits: SliderLimits) -> RobotParts:
-        """Return the parts of a robot."""
+        """Return the parts of a robot with this geometry and these limits."""
         legs, ends_of = geometry.each, limits.positions
         # a rail extends equally far beyond both ends of its slider's travel
         rails = [
@@ -99,9 +99,9 @@ def slider_points(geometry: Geometry, position: Points) -> Points:
 
 
 def cross_slide_lines(geometry: Geometry, parts: RobotParts, carriages: Points, phi: Points) -> Points:
-    """Return the cross slides as lines (N, 3, 2, 2), for carriages (N, 3, 2) and angles of the platform (N,).
+    """Return the cross slides as lines (N, 3, 2, 2), for carriages (N, 3, 2) and platform angles (N,).
 
-    The sleeve of an edge turns with the platform; a cross slide on its carriage does not.
+    The sleeve around an edge turns with the platform, whereas a cross slide mounted on a carriage does not.
     """
     crossings = [leg.crossing for leg in geometry.each]
     angles = np.outer(phi, [each.turns for each in crossings]) + [each.angle for each in crossings]
@@ -111,7 +111,10 @@ def cross_slide_lines(geometry: Geometry, parts: RobotParts, carriages: Points, 
 
 
 def pivot_points(geometry: Geometry, carriages: Points, poses: Points) -> Points:
-    """Return the pivots (N, 3, 2): carriages (N, 3, 2) in 3-PRP, points of the platform at poses (N, 3) in 3-PPR."""
+    """Return the pivots (N, 3, 2).
+
+    In 3-PRP, the pivots are the carriages (N, 3, 2). In 3-PPR, they are points of the platform at poses (N, 3).
+    """
     at = carriages.copy()
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     for k, leg in enumerate(geometry.each):
@@ -122,7 +125,7 @@ def pivot_points(geometry: Geometry, carriages: Points, poses: Points) -> Points
 
 
 def transform_lines(lines: list[Points], pose: Sequence[float]) -> list[Points]:
-    """Return lines of the platform's frame in the base frame, for a pose of the platform."""
+    """Transform lines from the platform's frame to the base frame for a pose of the platform."""
     x, y, phi = pose
     c, s = math.cos(phi), math.sin(phi)
     return [line @ np.array([[c, s], [-s, c]]) + [x, y] for line in lines]
@@ -138,19 +141,19 @@ def _edge_points(leg: AnyLeg, *positions: float) -> Points:
 
 
 def _stop_mark(place: Points, angle: float, length: float) -> Points:
-    """Return a mark across a line of this angle [rad], at a point (1, 2)."""
+    """Return a mark across a line with this angle [rad] at the point `place` (1, 2)."""
     across = length / 2.0 * _unit_vector(angle + math.pi / 2.0)
     return np.concatenate([place - across, place + across])
 
 
 def _outward_normal(leg: AnyLeg, outward: Points) -> Points:
-    """Return the unit vector across the rail on the side of `outward`."""
+    """Return the unit vector perpendicular to the rail that points to the side of `outward`."""
     across = _unit_vector(leg.rail_angle + math.pi / 2.0)
     return across if across @ outward >= 0.0 else -across
 
 
 def _edge_intersections(legs: Sequence[AnyLeg]) -> Points | None:
-    """Return the intersections of neighbouring platform edges (3, 2); None for parallel or missing edges."""
+    """Return the intersections of neighbouring platform edges (3, 2), or None if edges are parallel or missing."""
     corners = []
     for one, other in zip(legs, (*legs[1:], legs[0]), strict=True):
         (point, angle, turns), (beyond, other_angle, _) = one.crossing, other.crossing
@@ -164,7 +167,7 @@ def _edge_intersections(legs: Sequence[AnyLeg]) -> Points | None:
 
 
 def _table_outline(legs: Sequence[AnyLeg]) -> Points:
-    """Return a closed rectangle over the supports of a stage's table and its centre (5, 2)."""
+    """Return a closed rectangle (5, 2) that covers the centre and the supports of a stage's table."""
     held = np.array([(0.0, 0.0), *(leg.crossing.point for leg in legs)])
     low, high = held.min(axis=0), held.max(axis=0)
     beyond = TABLE_OVERHANG_SHARE * float((high - low).max()) / 2.0

@@ -1,4 +1,7 @@
-"""Plot of the workspace: slices over phi, coloured by conditioning, and their area along phi. Needs matplotlib."""
+"""Plot of the workspace: slices at several phi, coloured by conditioning, and their area as a function of phi.
+
+This module requires matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ MM, CM2 = 1e3, 1e4
 def draw_workspace(
     file: Path, title: str, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
-    """Draw slices and their areas into a file; its suffix selects the format.
+    """Draw slices of the workspace and their areas into a file, whose suffix selects the format.
 
     Parameters
     ----------
@@ -47,7 +50,7 @@ def draw_workspace(
     title : str
         Title of the figure.
     geometry, limits
-        The robot.
+        Geometry and limits of the robot.
     angles : Sequence[float]
         Angles phi of the slices [rad].
     reach, service : Extent
@@ -56,7 +59,7 @@ def draw_workspace(
     Raises
     ------
     ValueError
-        Matplotlib does not write this format.
+        Matplotlib does not support this format.
     OSError
         The file cannot be written.
     """
@@ -77,7 +80,7 @@ def draw_workspace(
     panels[0, 0].set(xlim=(-extent, extent), ylim=(-extent, extent))
     for panel in panels[:, 0]:
         panel.set_ylabel("y [mm]", color=GREY, fontsize=9)
-    for panel in panels.flat[max(len(angles) - columns, 0) : len(angles)]:  # the lowest of each column
+    for panel in panels.flat[max(len(angles) - columns, 0) : len(angles)]:  # the lowest panel of each column
         panel.tick_params(labelbottom=True)
     for panel in panels[-1]:
         panel.set_xlabel("x [mm]", color=GREY, fontsize=9)
@@ -89,7 +92,7 @@ def draw_workspace(
 
 
 def _draw_slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, phi: float) -> None:
-    """Draw the slice at one angle, with the rails, and the platform at the origin turned by this angle."""
+    """Draw the slice at one angle, with the rails and with the platform at the origin, turned by this angle."""
     for rail in parts.rails:
         panel.plot(*(MM * rail.T), color=RAIL, linewidth=4.0, solid_capstyle="round", zorder=1)
     reach, service = reachable_slice(geometry, limits, phi), permitted_slice(geometry, limits, phi)
@@ -133,7 +136,7 @@ def _draw_conditioning(panel: Axes, geometry: Geometry, polygon: Array, phi: flo
 def _draw_areas(
     strip: Axes, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
-    """Draw the area of the slices along phi, with the angles near which every pose is singular."""
+    """Draw the area of the slices as a function of phi, and the angles near which every pose is singular."""
     low, high = np.degrees(phi_range(geometry))
     margin = math.degrees(limits.singularity_margin)
     for wall, inward in ((low, margin), (high, -margin)):
@@ -201,7 +204,7 @@ def _draw_areas(
 
 
 def _style_axes(axes: Axes) -> None:
-    """Make ticks and frame unobtrusive."""
+    """Make the ticks and the frame unobtrusive."""
     axes.tick_params(colors=GREY, labelsize=8, length=2)
     for spine in axes.spines.values():
         spine.set_color(RAIL)

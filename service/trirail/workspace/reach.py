@@ -1,6 +1,6 @@
 """Reach from the current pose: outline of the permitted centres at its φ, and distance of φ from a singularity.
 
-Both are cached for rounded poses, so that a recorder can compute them at any rate.
+Both results are cached for rounded poses, so that a recorder can compute them at any rate.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from trirail.workspace.part_positions import Points
 from trirail.workspace.workspace import permitted_slice
 
 ANGLE_STEP_RAD = math.radians(0.5)
-"""Step to which φ is rounded for workspace outlines."""
+"""Step to which φ is rounded when looking up workspace outlines."""
 CENTRE_STEP_M = 2e-3
-"""Step to which x and y of the centre are rounded for singular angles."""
+"""Step to which x and y of the centre are rounded when looking up singular angles."""
 _CACHE_SIZE = 4096
 
 
@@ -29,8 +29,8 @@ class Reach:
 
     def __init__(self, geometry: Geometry, limits: Limits) -> None:
         self.outline = lru_cache(_CACHE_SIZE)(lambda step: _closed_outline(geometry, limits, int(step)))
-        """Closed outline of the permitted centres at φ = `step` ANGLE_STEP_RAD, (V + 1, 2) [m]; empty if there are
-        none."""
+        """Closed outline of the permitted centres at φ = `step` * ANGLE_STEP_RAD, shape (V + 1, 2) [m]. It is empty if
+        no centre is permitted."""
         self._singular = lru_cache(_CACHE_SIZE)(
             lambda x, y: np.array(singular_angles(geometry, (x * CENTRE_STEP_M, y * CENTRE_STEP_M)))[:, np.newaxis]
         )
@@ -41,11 +41,11 @@ class Reach:
         )
 
     def outline_indices(self, phi: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of the outlines for angles [rad]."""
+        """Return the indices of the outlines that belong to angles [rad]."""
         return np.rint(phi / ANGLE_STEP_RAD).astype(np.int64)
 
     def singularity_distance(self, poses: Points) -> NDArray[np.float64]:
-        """Return the distance of φ from the nearest singular angle [rad], (N,), for poses (N, 3)."""
+        """Return the distance of φ from the nearest singular angle [rad] for poses (N, 3); shape (N,)."""
         if self._constant_angles:
             return _least_angle(poses[:, 2], self._singular(0, 0))
         distances = np.empty(len(poses))
@@ -56,7 +56,7 @@ class Reach:
 
 
 def _least_angle(phi: NDArray[np.float64], singular: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the least angle between phi (N,) and any of the singular angles (K, 1)."""
+    """Return the smallest angle between each phi (N,) and any of the singular angles (K, 1)."""
     between = phi - singular
     least: NDArray[np.float64] = np.abs(between - math.tau * np.rint(between / math.tau)).min(axis=0)
     return least

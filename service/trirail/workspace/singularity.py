@@ -1,8 +1,9 @@
 """Distance of a pose from a singularity, and conditioning of the Jacobian.
 
-A pose is (x, y, phi): the platform's centre G [m] and its angle [rad]; arrays hold one, shape (3,), or N of
-them, (N, 3). Singular poses divide the others into aspects, which no motion connects. The robot works in the
-aspect of the pose (0, 0, 0), in which each delta_i of J1 and det J2 keep the signs that they have at that pose.
+A pose (x, y, phi) consists of the platform's centre G [m] and its angle [rad]. An array holds one pose, shape (3,), or
+N poses, shape (N, 3). Singular poses divide all other poses into aspects; no motion leads from one aspect to another
+without passing a singular pose. The robot works in the aspect of the pose (0, 0, 0), in which each delta_i of J1 and
+det J2 keep the signs that they have at that pose.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ COINCIDENT_WALLS_RAD = 1e-4  # no pose fits between walls nearer than this
 
 
 def sensitivity(geometry: Geometry, pose: ArrayLike) -> Array:
-    """Return J1⁻¹ J2, (3, 3) or (N, 3, 3): slider velocity = J1⁻¹ J2 @ platform velocity, (16).
+    """Return J1⁻¹ J2, shape (3, 3) or (N, 3, 3), which maps platform velocity to slider velocity (16).
 
-    Rows are the sliders A, B, C; the columns for x and y have no unit, that for phi is in m/rad.
-    Raises KinematicsError as inverse.
+    The rows are the sliders A, B and C. The columns for x and y are dimensionless, and the column for phi is in m/rad.
+    Raises KinematicsError in the same cases as inverse.
     """
     j1, j2 = jacobians(geometry, pose)
     return j2 / np.diagonal(j1, axis1=-2, axis2=-1)[..., np.newaxis]
@@ -42,19 +43,20 @@ def sensitivity(geometry: Geometry, pose: ArrayLike) -> Array:
 def characteristic_length(geometry: Geometry) -> float:
     """Return the length [m] that makes rotation comparable with translation.
 
-    A rotation by an angle counts as a translation by this length times the angle. At the pose (0, 0, 0) both move the
-    sliders equally, in the root mean square over sliders and directions. A symmetric robot is therefore isotropic
-    there, with the length l0/√6. The length does not depend on the choice of zeros or of points along rails and edges.
+    A rotation by an angle counts as a translation by this length times the angle. At the pose (0, 0, 0), both move the
+    sliders by the same amount in the root mean square over sliders and directions. A symmetric robot is therefore
+    isotropic at that pose, and its length is l0/√6. The length does not depend on the choice of zeros or of points
+    along rails and edges.
     """
     at_home = sensitivity(geometry, HOME)
     return float(math.sqrt(2.0) * np.linalg.norm(at_home[:, 2]) / np.linalg.norm(at_home[:, :2]))
 
 
 def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = None) -> NDArray[np.float64]:
-    """Return the ratio of the least to the greatest singular value of J1⁻¹ J2, shape () or (N,), no unit.
+    """Return the ratio of the smallest to the largest singular value of J1⁻¹ J2, shape () or (N,), dimensionless.
 
-    1 is isotropic, 0 singular. `length` [m] scales the column for phi; the default is the characteristic length.
-    Raises KinematicsError as inverse.
+    The ratio is 1 at an isotropic pose and 0 at a singular one. `length` [m] scales the column for phi; the default is
+    the characteristic length. Raises KinematicsError in the same cases as inverse.
     """
     scale = [1.0, 1.0, 1.0 / (characteristic_length(geometry) if length is None else length)]
     values = np.linalg.svd(sensitivity(geometry, pose) * scale, compute_uv=False)
@@ -64,14 +66,14 @@ def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = Non
 def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.float64]:
     """Return the angle [rad] by which the platform can turn in both directions before it is singular, () or (N,).
 
-    This is the distance in phi to the nearest of singular_angles at the pose's G. It is negative if the pose belongs to
-    an aspect other than that of (0, 0, 0). Like singular_angles, the function can miss two zeros of det J2 that are
-    closer together than its samples, which are at most 1.2° apart.
+    The angle is the distance in phi to the nearest of singular_angles at the pose's G. It is negative if the pose
+    belongs to an aspect other than that of (0, 0, 0). Like singular_angles, this function can miss two zeros of det J2
+    that are closer together than its samples, which are at most 1.2° apart.
 
     Raises
     ------
     KinematicsError
-        Like inverse, and therefore also if J1 is singular.
+        In the same cases as inverse, and therefore also if J1 is singular.
     """
     at_home, _ = jacobians(geometry, HOME)
     j1, j2 = jacobians(geometry, pose)
@@ -94,8 +96,8 @@ def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.f
 
 
 def _zeros_of_det_j2(geometry: Geometry, poses: Array, low: float, high: float) -> tuple[NDArray[np.intp], Array]:
-    """Return rows of poses, and for each the phi between two neighbouring walls at which J2 is singular."""
-    # zeros of det J2 cluster near the walls, so the samples do as well
+    """Return indices of poses, each with a phi between two neighbouring walls at which J2 is singular."""
+    # zeros of det J2 cluster near the walls, so the samples are denser there
     phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, DET_SAMPLES + 2)[1:-1])
     ones = np.ones(len(poses))
     negative = np.column_stack([ones, poses[:, :2]]) @ det_j2_rows(geometry, phi).T < 0.0

@@ -1,4 +1,4 @@
-"""Limits of the robot's own reach that a pose violates."""
+"""Check of a pose against the limits of the robot's own reach."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["violations"]
 def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Violation]:
     """Return every limit of the robot's own reach that a pose (3,) exceeds, with the value at that pose.
 
-    These are the limits of `reachable_slice`. Raises KinematicsError as inverse.
+    The limits are those of `reachable_slice`. Raises KinematicsError in the same cases as inverse.
     """
     motion = inverse(geometry, pose)
     exceeded = []

@@ -1,8 +1,8 @@
-"""Workspace: the exact polygon of the centre G for one phi, and extent and volume over all phi.
+"""Workspace: the exact polygon of the possible centres G for one phi, and the extent and volume over all phi.
 
-At a fixed phi the travel of every joint and det J2 are linear in x and y. Each limit is a half-plane, and their
-intersection is a convex polygon. A half-plane is a row r with r @ (1, x, y) >= 0. A polygon is an array of vertices
-(V, 2) [m], anticlockwise; (0, 2) if it is empty.
+At a fixed phi, the travel of every joint and det J2 are linear in x and y. Each limit is therefore a half-plane, and
+the intersection of all limits is a convex polygon. A half-plane is given by a row r with r @ (1, x, y) >= 0. A polygon
+is an array of vertices (V, 2) [m] in anticlockwise order; an empty polygon has the shape (0, 2).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 class Extent(NamedTuple):
-    """Workspace over all phi: extents [m, rad], volume [m² rad], greatest slice, and area along phi."""
+    """Workspace over all phi: extents [m, rad], volume [m² rad], greatest slice, and area as a function of phi."""
 
     x: Range
     y: Range
@@ -44,13 +44,13 @@ class Extent(NamedTuple):
 
 
 def reachable_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
-    """Return the polygon (V, 2) [m] of all G that the robot itself reaches at this phi.
+    """Return the polygon (V, 2) [m] of all G that the robot itself can reach at this phi.
 
-    Its limits are the travel of the sliders (limits.slider.position), the travel of the cross slides
-    (limits.slider.passive), and the singularity margin: the platform can turn by the margin in either direction and
-    stay in the aspect of (0, 0, 0). Vertices are exact to rounding, with one exception. Where det J2 is not monotonic
-    within the margin, as on robots far from symmetric, the true limit is a curve; the polygon circumscribes it, and
-    misses at most a 64th of the margin.
+    The polygon is bounded by the travel of the sliders (limits.slider.position), the travel of the cross slides
+    (limits.slider.passive), and the singularity margin: the platform must be able to turn by the margin in either
+    direction and stay in the aspect of (0, 0, 0). Vertices are exact to rounding, with one exception. If det J2 is not
+    monotonic within the margin, as on robots that are far from symmetric, the true limit is a curve. The polygon then
+    circumscribes the curve, and misses at most a 64th of the margin.
     """
     phi = math.remainder(phi, 2.0 * math.pi)
     low, high = phi_range(geometry)
@@ -71,7 +71,7 @@ def reachable_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
 
 
 def permitted_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
-    """Return the part of the reachable polygon that is within limits.platform, the limits that the service enforces."""
+    """Return the part of the reachable polygon that is within limits.platform; the service enforces these limits."""
     window = limits.platform
     if not window.phi[0] <= phi <= window.phi[1]:
         return EMPTY_POLYGON
@@ -91,7 +91,7 @@ def polygon_area(polygon: Array) -> float:
 def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limits, float], Array]) -> Extent:
     """Return the extent of `reachable_slice` or `permitted_slice` over all phi.
 
-    Extents and the greatest slice are accurate to 1e-9. The volume is an integral by the trapezoidal rule, with a
+    Extents and the greatest slice are accurate to 1e-9. The volume is integrated by the trapezoidal rule and has a
     relative error of about 1e-6. Raises KinematicsError if no pose is within the limits.
     """
 
@@ -102,7 +102,7 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
     filled = np.flatnonzero([len(slice_at(phi)) > 0 for phi in scan])
     if len(filled) == 0:
         raise KinematicsError("no pose is within the limits: widen limits.slider, limits.platform or the margin")
-    first, last = filled[0], filled[-1]  # never the ends of the scan, which are singular
+    first, last = filled[0], filled[-1]  # never an end of the scan: both are singular
     angles = np.linspace(
         _last_nonempty_phi(slice_at, scan[first], scan[first - 1]),
         _last_nonempty_phi(slice_at, scan[last], scan[last + 1]),
@@ -134,7 +134,7 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
 
 
 def _joint_rows(geometry: Geometry, phi: float) -> Array:
-    """Return rows (6, 3) for sliders A, B, C and their cross slides: position = row @ (1, x, y) [m]."""
+    """Return rows (6, 3) for the sliders A, B, C and their cross slides, such that position = row @ (1, x, y) [m]."""
     step = 1.0 if geometry.correction is None else SLOPE_STEP_M
     at_zero, *beside = travels(geometry, [[0.0, 0.0, phi], [step, 0.0, phi], [0.0, step, phi]]).swapaxes(0, 1)
     slopes = [(there - at_zero) / step for there in beside]
@@ -142,7 +142,7 @@ def _joint_rows(geometry: Geometry, phi: float) -> Array:
 
 
 def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:
-    """Return the polygon that one leg alone reaches, from its rows for slider and cross slide (2, 3)."""
+    """Return the polygon that one leg alone can reach, from the rows of its slider and cross slide (2, 3)."""
     (low, high), (inner, outer) = position, passive
     ends = np.array([[low, inner], [high, inner], [high, outer], [low, outer]])
     corners = np.asarray(np.linalg.solve(joints[:, 1:], (ends - joints[:, 0]).T).T, dtype=np.float64)
@@ -152,7 +152,7 @@ def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:
 def _clip(polygon: Array, half_planes: Array) -> Array:
     """Return the part of a convex polygon within all half-planes (K, 3)."""
     values = half_planes[:, 0] + polygon @ half_planes[:, 1:].T
-    for offset, *slope in half_planes[(values < -EDGE_TOLERANCE_M).any(axis=0)]:  # most cut nothing off
+    for offset, *slope in half_planes[(values < -EDGE_TOLERANCE_M).any(axis=0)]:  # most half-planes cut nothing off
         inside = offset + polygon @ slope
         inside[np.abs(inside) < EDGE_TOLERANCE_M] = 0.0
         if not (inside > 0.0).any():
@@ -177,7 +177,7 @@ def _last_nonempty_phi(slice_at: Callable[[float], Array], nonempty: float, empt
 
 
 def _golden_section_maximum(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Return argument and value of the only maximum of a function in an interval, found by golden-section search."""
+    """Find the only maximum of a function in an interval by golden-section search; return its argument and value."""
     inner = high - GOLDEN_RATIO * (high - low), low + GOLDEN_RATIO * (high - low)
     values = function(inner[0]), function(inner[1])
     while high - low > 1e-10:
