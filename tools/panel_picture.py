@@ -28,24 +28,24 @@ from websockets.sync.client import connect
 
 OUT = Path(__file__).parent / "pictures" / "panel.png"
 SIZE = (1280, 800)
-WITHIN = 60.0
-"""The page has to show what is wanted within so long [s]."""
-WANTED = (
+TIMEOUT = 60.0
+"""Maximum time until the browser answers and the page shows the robot [s]."""
+READY = (
     "document.querySelector('.goal')?.getBoundingClientRect().width && document.querySelector('#people').textContent"
 )
-"""When the picture is taken: all is there, and the robot on its way."""
+"""JavaScript condition for the picture: the page has loaded and the robot moves."""
 TOUR = ((0.03, 0.02, 0.2), (-0.03, 0.02, -0.2), (0.02, -0.03, 0.1), (0.0, 0.0, 0.0))
 
 
 def main() -> None:
-    """Draw it."""
+    """Write the picture."""
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else OUT
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         raise SystemExit("no Chromium here: install it (Debian: apt-get install chromium)")
     with tempfile.TemporaryDirectory(prefix="trirail-", ignore_cleanup_errors=True) as folder:
         config, locator = own_service.private(Path(folder))
-        os.environ["STATE_DIRECTORY"] = folder  # its poses are no one else's
+        os.environ["STATE_DIRECTORY"] = folder  # keeps the taught poses apart from the user's
         with own_service.service(config, Path(folder, "shown.rrd")), Robot("demo", locator, user="ann") as robot:
             robot.enable()
             for name in ("pick", "place"):
@@ -56,10 +56,10 @@ def main() -> None:
             try:
                 shown = Panel(AsyncRobot("demo", locator, user="ann"), 0)
                 with shown as panel, _page(browser, Path(folder, "profile"), panel.url) as call:
-                    deadline = time.monotonic() + WITHIN
-                    while not call("Runtime.evaluate", expression=f"Boolean({WANTED})")["result"]["value"]:
+                    deadline = time.monotonic() + TIMEOUT
+                    while not call("Runtime.evaluate", expression=f"Boolean({READY})")["result"]["value"]:
                         if time.monotonic() > deadline:
-                            raise SystemExit("the page does not come to show the robot")
+                            raise SystemExit("the page does not show the robot in time")
                         time.sleep(0.02)
                     out.write_bytes(base64.b64decode(call("Page.captureScreenshot", format="png")["data"]))
             finally:
@@ -70,14 +70,14 @@ def main() -> None:
 
 @contextmanager
 def _page(browser: str, profile: Path, url: str) -> Iterator[Callable[..., dict[str, Any]]]:
-    """Open a page in a browser; yield what calls a method of the DevTools protocol on it."""
+    """Open a page in a browser; yield a function that calls a method of the DevTools protocol on it."""
     width, height = SIZE
     flags = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--remote-debugging-port=0")
     command = [browser, *flags, f"--user-data-dir={profile}", f"--window-size={width},{height}", url]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
         try:
-            told, deadline = profile / "DevToolsActivePort", time.monotonic() + WITHIN
-            while not (told.is_file() and len(lines := told.read_text().splitlines()) == 2):
+            port_file, deadline = profile / "DevToolsActivePort", time.monotonic() + TIMEOUT
+            while not (port_file.is_file() and len(lines := port_file.read_text().splitlines()) == 2):
                 if process.poll() is not None or time.monotonic() > deadline:
                     raise SystemExit(f"{browser} does not start")
                 time.sleep(0.05)
@@ -87,10 +87,10 @@ def _page(browser: str, profile: Path, url: str) -> Iterator[Callable[..., dict[
 
                 def call(method: str, **parameters: Any) -> dict[str, Any]:
                     opened.send(json.dumps({"id": 1, "method": method, "params": parameters}))
-                    while "result" not in (said := json.loads(opened.recv(WITHIN))):
-                        if "error" in said:
-                            raise SystemExit(said["error"]["message"])
-                    result: dict[str, Any] = said["result"]
+                    while "result" not in (message := json.loads(opened.recv(TIMEOUT))):
+                        if "error" in message:
+                            raise SystemExit(message["error"]["message"])
+                    result: dict[str, Any] = message["result"]
                     return result
 
                 call(

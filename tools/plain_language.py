@@ -1,11 +1,10 @@
 """Find names and sentences that an engineer who is new to the project stumbles over.
 
-python tools/plain_language.py                        count per room and guide, beside the ceiling of each
-python tools/plain_language.py service/trirail/wire   list each place below a folder, or in a file
-python tools/plain_language.py --lower                lower the ceilings to today's counts
+python tools/plain_language.py                        list every place
+python tools/plain_language.py service/trirail/wire   list the places below a folder, or in a file
 
-A place is a suggestion. Words, openings and phrases are in plain_language.toml, the ceilings in
-plain_language_ceilings.toml: tests/test_language.py fails where a room has more places than its ceiling allows.
+Words, openings and phrases are in plain_language.toml. So are the exceptions, names that are keys of messages or
+recordings, with their reasons. tests/test_language.py fails if there is any other place.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import subprocess
 import sys
 import tokenize
 import tomllib
-from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -26,7 +24,6 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 WORDS = Path(__file__).with_suffix(".toml")
-CEILINGS = WORDS.with_name("plain_language_ceilings.toml")
 CONTEXT = 40
 """Number of characters shown on either side of a phrase."""
 
@@ -38,6 +35,11 @@ class Place(NamedTuple):
     line: int
     rule: str
     text: str
+
+    @property
+    def key(self) -> str:
+        """Key of the place among the exceptions."""
+        return f"{self.file}: {self.text}"
 
 
 class _Rules:
@@ -132,59 +134,25 @@ def files() -> list[str]:
     return sorted(file for file in listed.stdout.split() if not file.startswith("tests/") and (ROOT / file).exists())
 
 
-def room(file: str) -> str:
-    """Return the room of a source file, such as service/trirail/wire, or a guide itself."""
-    if file.endswith(".md"):
-        return file
-    *folders, _ = file.split("/")
-    return "/".join(folders[: 1 if folders[0] == "tools" else 3])
-
-
-def counts() -> Counter[str]:
-    """Return the number of places in each room and guide."""
-    result: Counter[str] = Counter()
-    for file in files():
-        result[room(file)] += len(places(file))
-    return result
-
-
-def ceilings() -> dict[str, int]:
-    """Return the maximum number of places of each room and guide; 0 for a room that is not listed."""
-    ceiling: dict[str, int] = tomllib.loads(CEILINGS.read_text(encoding="utf-8"))["ceilings"]
-    return ceiling
-
-
-def lowered() -> str:
-    """Return the text of the ceilings, each lowered to today's count."""
-    old = ceilings() if CEILINGS.exists() else {}
-    rows = [f'"{name}" = {min(count, old.get(name, count))}' for name, count in sorted(counts().items()) if count]
-    return (
-        "# Places that tools/plain_language.py finds: the counts may only fall.\n[ceilings]\n" + "\n".join(rows) + "\n"
-    )
+def exceptions() -> dict[str, str]:
+    """Return the reason for each permitted place, by file and text: "wire/packets.py: given"."""
+    reasons: dict[str, str] = tomllib.loads(WORDS.read_text(encoding="utf-8"))["exceptions"]
+    return reasons
 
 
 def main() -> int:
-    """Print the requested list or counts, or lower the ceilings."""
+    """Print the places in the given folders and files, or everywhere; return 1 if one of them is not an exception."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("paths", nargs="*", help="folders and files of which each place is listed")
-    parser.add_argument("--lower", action="store_true", help="lower the ceilings to today's counts")
-    options = parser.parse_args()
-    if options.lower:
-        CEILINGS.write_text(lowered(), encoding="utf-8")
-        return 0
-    if options.paths:
-        for file in files():
-            if any(file == path or file.startswith(path.rstrip("/") + "/") for path in options.paths):
-                for place in places(file):
-                    print(f"{place.file}:{place.line}: {place.rule}: {place.text}")
-        return 0
-    allowed, total = ceilings(), 0
-    for name, count in sorted(counts().items(), key=lambda row: -row[1]):
-        total += count
-        if count or allowed.get(name):
-            print(f"{count:6} of {allowed.get(name, 0):6} {name}")
-    print(f"{total:6} places")
-    return 0
+    parser.add_argument("paths", nargs="*", default=[""], help="folders and files; default: all")
+    paths = parser.parse_args().paths
+    reasons, left = exceptions(), 0
+    for file in files():
+        if any(file == path or file.startswith(path and path.rstrip("/") + "/") for path in paths):
+            for place in places(file):
+                reason = reasons.get(place.key)
+                left += reason is None
+                print(f"{place.file}:{place.line}: {place.rule}: {place.text}" + (f" ({reason})" if reason else ""))
+    return int(left > 0)
 
 
 if __name__ == "__main__":

@@ -23,9 +23,9 @@ from trirail.telemetry.sinks import free_port
 
 TIMEOUT = 60.0
 SETTLE = 2.0
-"""For the views to take in what has been loaded [s]."""
+"""Time until the views show the loaded data [s]."""
 NOTICED = 5.0
-"""For the viewer's notices to go [s]."""
+"""Time until the notices of the viewer disappear [s]."""
 TITLE_BAR = 36
 """Height of the strip that the viewer keeps for the window's buttons [pixels]; there is nothing in it."""
 
@@ -67,7 +67,7 @@ def viewer(recording: Path, width: int, height: int) -> Iterator[ViewerClient]:
 
 
 def picture(client: ViewerClient) -> Image.Image:
-    """Take a picture of what a viewer shows, without the strip for a window's buttons."""
+    """Take a picture of a viewer, without the strip for the window's buttons."""
     time.sleep(SETTLE)
     whole = Image.open(io.BytesIO(client.take_screenshot()))
     return whole.crop((0, TITLE_BAR, whole.width, whole.height))

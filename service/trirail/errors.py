@@ -91,7 +91,7 @@ class RefusalCode(StrEnum):
     meaning: str
     """Meaning of the code, in one line."""
     remedy: str
-    """What the sender should do next."""
+    """Next step for the sender."""
 
     # The message.
     MALFORMED = (

@@ -47,7 +47,7 @@ _WHOLE_TOLERANCE: Final = 1e-6
 """Maximum rounding error of an angle that was converted from degrees [0.01°]."""
 
 
-def meant(value: float, limit: float, unit: str) -> float | None:
+def as_familiar_unit(value: float, limit: float, unit: str) -> float | None:
     """Reinterpret a bare number that exceeds its SI limit as millimetres or degrees.
 
     Returns the value in SI units, or None if this interpretation is implausible. An angle that is a whole number of

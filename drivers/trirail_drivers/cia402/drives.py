@@ -311,7 +311,7 @@ class Cia402(Driver[Cia402Axis]):
             lent.expect([row for number, axis in enumerate(self._axes) for row in axis.expected_rows(number)])
         return lent
 
-    def take_back(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
+    def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
         """Continue from the tables; see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._heartbeat_due = float(times["beat_due"])

@@ -1,7 +1,7 @@
 """Tables of the frames that one cycle exchanges with three drives. The compiled cycle knows only these tables.
 
 A driver lends the tables while cycles only handle expected frames and send setpoints. They always hold the state of
-each drive. `Lender.take_back` passes the frames that the compiled cycle has not handled back to the driver.
+each drive. `Lender.reclaim` passes the frames that the compiled cycle has not handled back to the driver.
 """
 
 from __future__ import annotations
@@ -103,10 +103,10 @@ class Lender(Protocol):
         """Return the tables between two cycles, or None if the next cycle needs more than the tables.
 
         While they are lent, the caller may only call commands such as `disable` or `quick_stop`; it then calls
-        `take_back` before the next cycle.
+        `reclaim` before the next cycle.
         """
 
-    def take_back(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
+    def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
         """Continue from the tables, and return the feedback.
 
         Parameters

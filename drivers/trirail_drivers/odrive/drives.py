@@ -205,7 +205,7 @@ class Odrive(Driver[OdriveAxis]):
         self._table_writer.fill(follow=self._enabled, within=self._drives.following_error)
         return self._tables
 
-    def take_back(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
+    def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
         """Continue from the tables; see trirail_drivers.driver.cyclic.Lender."""
         times = self._tables.times[0]
         self._errors_due, self._next_request = float(times["beat_due"]), int(times["next_beat"])

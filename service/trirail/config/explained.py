@@ -14,7 +14,7 @@ from msgspec import inspect as mi
 from trirail_drivers.config import Coordinate
 
 from trirail.config.tables import Angle, Config, ShapeError
-from trirail.quantities import meant
+from trirail.quantities import as_familiar_unit
 from trirail.wire.decoding import converted
 
 Place = tuple[str | int, ...]
@@ -96,7 +96,7 @@ def _wrong_values(value: object, kind: mi.Type, place: Place) -> Iterator[_Wrong
         case mi.UnionType(types=types), _:
             of_each = [list(_wrong_values(value, part, place)) for part in types]
             if all(of_each):
-                # If the value has the shape of one of the types, the errors are those within that type. Otherwise no type
+                # If the value has the shape of one of the types, its errors are the answer. Otherwise no type
                 # is closer than another.
                 inside = (errors for errors in of_each if all(wrong.place != place for wrong in errors))
                 yield from next(inside, [_unexpected(value, kind, place)])
@@ -246,7 +246,7 @@ def _other_unit(value: object, kind: mi.Type) -> str:
     """Return a question whether an out-of-range number was meant to be in degrees or millimetres."""
     for number, limit, unit, words in _UNITS:
         if number in (kind, *getattr(kind, "types", ())) and isinstance(value, int | float):
-            likely = meant(value, limit, unit)
+            likely = as_familiar_unit(value, limit, unit)
             return f"; did you mean {likely:.4g}? {words}" if likely is not None else ""
     return ""
 

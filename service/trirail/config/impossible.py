@@ -19,7 +19,7 @@ from trirail.config.network_checks import network_rules
 from trirail.config.tables import BASE, PLATFORM, Config, Limits, corrected_geometry, geometry, room
 from trirail.errors import ConfigError
 from trirail.kinematics.geometry import Geometry, gains, singular_angles, travels
-from trirail.quantities import FAMILIAR_UNITS, meant
+from trirail.quantities import FAMILIAR_UNITS, as_familiar_unit
 from trirail.wire.text import QUANTITY_RULE, is_quantity
 
 
@@ -116,7 +116,7 @@ def _check_metres(config: Config, key: str, low: float, high: float) -> None:
     """Refuse a range that is far larger than the robot but would be plausible in millimetres."""
     size = _size(config)
     widest = max(low, high, key=abs)
-    if abs(widest) > MAX_RANGE_SIZES * size and meant(widest, MAX_RANGE_SIZES * size, "m") is not None:
+    if abs(widest) > MAX_RANGE_SIZES * size and as_familiar_unit(widest, MAX_RANGE_SIZES * size, "m") is not None:
         raise ConfigError(
             f"{key} = [{low:g}, {high:g}]: {abs(widest):g} m on a robot of {size:g} m; "
             f"did you mean [{low * MM:g}, {high * MM:g}]? Lengths are in metres"

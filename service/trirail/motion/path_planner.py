@@ -29,7 +29,7 @@ from trirail.motion.runs import (
     tool_motion,
 )
 from trirail.motion.straight_lines import time_optimal
-from trirail.quantities import apart, beyond, meant, worded
+from trirail.quantities import apart, as_familiar_unit, beyond, worded
 from trirail.wire.messages import GoalReply
 
 MIN_LIMIT_SHARE = 0.1
@@ -385,5 +385,5 @@ def _scaled_limits(limits: Kinodynamic, factor: float, softer: float) -> Kinodyn
 
 
 def _suggestion(value: float, limit: float, unit: str) -> str:
-    likely = meant(value, limit, unit)
+    likely = as_familiar_unit(value, limit, unit)
     return "" if likely is None else f": did you mean {worded(likely, unit)}?"

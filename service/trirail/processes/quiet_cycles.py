@@ -144,9 +144,9 @@ class QuietCycles:
         return QuietResult(reached, *tick, left["marked_ns"], called, left["behind"], left["code"])
 
     def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
-        """Return the lent tables to the drives, as in trirail_drivers.driver.cyclic.Lender.take_back."""
+        """Return the lent tables to the drives, as in trirail_drivers.driver.cyclic.Lender.reclaim."""
         if self._lent is not None:
-            self._control.measured.feedback = self._drives.take_back(handled, arrived, synced=synced, error=error)
+            self._control.measured.feedback = self._drives.reclaim(handled, arrived, synced=synced, error=error)
             self._lent = None
 
     def _tables_ready(self) -> bool:

@@ -58,7 +58,7 @@ OUTCOMES: dict[str, Colour] = {
     "unsettled": (168, 60, 160),
     "unknown": (123, 135, 148),
 }
-"""Colour of each goal outcome, on paper and in terminals; "unknown" stands for an outcome that was not recorded."""
+"""Colour of each goal outcome, in print and in terminals; "unknown" is for an outcome that was not recorded."""
 
 
 def pale(colour: Colour) -> Colour:

@@ -189,7 +189,7 @@ class Recorder:
             self._contents.add_cycles(began, ended, len(rows))
 
     def save(self) -> None:
-        """Write all records and log lines received so far, so that they survive the end of this process."""
+        """Write all records and log lines that have arrived; they then survive the end of this process."""
         self._records.flush()
         self._streams.save()
 
