@@ -193,7 +193,25 @@ def test_a_period_that_is_held_is_told_with_the_highest_rate_that_would_be() -> 
     """88 µs late and 110 µs of work leave half of 500 µs, and not half of 250."""
     check = doctor_cycle.cycle(cycles([88_000] * 10, 110_000), REAL)
     assert check.verdict == "ok"
-    assert check.found == "1 kHz: cycle p99.9 110 µs, lateness p99.9 88 µs: fine; up to 2 kHz"
+    assert check.found == (
+        "1 kHz: cycle p99.9 110 µs, lateness p99.9 88 µs; setpoints p50 79%, p99.9 79%, worst 79% of the 250 µs that "
+        "the bus leaves: fine; up to 2 kHz"
+    )
+
+
+@given(st.integers(1, 2_000_000))
+def test_setpoints_beyond_the_time_that_the_bus_leaves_are_warned_of(work: int) -> None:
+    """The frames of a cycle take 75 % of 1 Mbit/s at 1 kHz, and leave 250 µs."""
+    budget = drive_checks.setpoint_budget_us(REAL)
+    assert budget == pytest.approx(250.0, abs=1.0)
+    check = doctor_cycle.cycle(cycles([0] * 10, work), REAL)
+    assert (check.verdict == "ok") == (work / 1e3 <= budget)
+
+
+def test_a_full_bus_leaves_no_time() -> None:
+    full = changed(REAL, "can", bitrate=500_000)
+    assert drive_checks.setpoint_budget_us(full) == 0.0
+    assert "leaves no time" in doctor_cycle.cycle(cycles([0] * 10, 1000), full).found
 
 
 def test_what_was_not_measured_is_said() -> None:

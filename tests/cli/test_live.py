@@ -49,7 +49,7 @@ def a_state(**changed: Any) -> State:
         settled=True,
         override=1.0,
         faults=(),
-        loop=LoopState(1000, 1, 0, NONE, NONE, 0.5, 0.4, ()),
+        loop=LoopState(1000, 1, 0, NONE, NONE, NONE, 500.0, 0.5, 0.4, ()),
     )
     return msgspec.structs.replace(state, **changed)
 

@@ -45,7 +45,7 @@ T = TypeVar("T")
 PERIOD = 0.02
 ZERO = (0.0, 0.0, 0.0)
 STEADY = Percentiles(10.0, 20.0, 30.0, 40.0)
-LOOP = LoopState(1000, 0, 0, STEADY, STEADY, 0.5, 0.4, ())
+LOOP = LoopState(1000, 0, 0, STEADY, STEADY, STEADY, 500.0, 0.5, 0.4, ())
 
 
 async def no_command(*_: object) -> None:

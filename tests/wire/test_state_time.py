@@ -1,11 +1,15 @@
-"""The wall-clock time of a state is that of its own cycle, whenever the state is made."""
+"""Times in a state: the wall-clock time is that of its own cycle, and setpoints are timed from their deadline."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from control_rig import CONFIG
+from hypothesis import given
+from hypothesis import strategies as st
 from trirail.processes.publications import StateMaker
-from trirail.wire.records import DTYPE
+from trirail.wire.packets import Welcome
+from trirail.wire.records import DTYPE, Part
 
 
 def test_a_state_has_the_wall_clock_time_of_its_cycle() -> None:
@@ -19,3 +23,20 @@ def test_a_state_has_the_wall_clock_time_of_its_cycle() -> None:
     assert times == [1_700_000_005.01, 1_700_000_005.03]
     offset_ns += 3_600_000_000_000  # the clock is set
     assert maker.newest().time == 1_700_003_605.03
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)), min_size=1, max_size=40))
+def test_setpoints_are_timed_from_the_deadline_to_the_last_one(times: list[tuple[int, int]]) -> None:
+    """Time after the setpoints, for the record and decisions, does not count."""
+    maker = StateMaker(CONFIG)
+    maker.update(Welcome((), 0.75))
+    rows = np.zeros(len(times), DTYPE)
+    rows["cycle"] = np.arange(len(times)) + 1
+    for row, (late, part) in zip(rows, times, strict=True):
+        row["lateness_ns"], row["parts_ns"][: Part.WRITE + 1] = late, part
+        row["parts_ns"][Part.WRITE + 1 :] = 10**7
+    maker.records(rows)
+    loop = maker.newest().loop
+    worst = max(late + 6 * part for late, part in times)
+    assert loop.setpoints_us.max == pytest.approx(worst / 1e3, abs=0.1)
+    assert loop.setpoint_budget_us == pytest.approx(250.0)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from msgspec import Struct
 
+from trirail.cli.terminal import budget_share
 from trirail.config import Config
 from trirail.diagnosis import Check
 from trirail.diagnosis.bare_loop import Cycles, compute_percentiles
+from trirail.diagnosis.drive_checks import setpoint_budget_us
 from trirail.wire.state import Percentiles
 
 MAX_PERIOD_SHARE = 0.5
@@ -61,9 +63,10 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
         return Check("cycle", "ok", "not measured: --quick")
     held = compute_held_rate(cycles)
     period = 1e6 / held.rate_hz
+    budget = setpoint_budget_us(config)
     summary = (
         f"{_frequency(held.rate_hz)}: cycle p99.9 {held.cycle_us.p999:.0f} µs, "
-        f"lateness p99.9 {held.lateness_us.p999:.0f} µs"
+        f"lateness p99.9 {held.lateness_us.p999:.0f} µs; setpoints {budget_share(held.over_us, budget)}"
     )
     lost = f"{held.missed} of {held.cycles} ticks missed" if held.missed else ""
     remedy = "see the lines above; end other programs, or isolate a processor"
@@ -79,6 +82,8 @@ def cycle(cycles: Cycles | str, config: Config) -> Check:
     if held.over_us.p999 > MAX_PERIOD_SHARE * period:
         left = f"little is left of the period of {period:.0f} µs for the service" + (f", {lost}" if lost else "")
         return Check("cycle", "warning", f"{summary}: {left}", remedy)
+    if held.over_us.p999 > budget:
+        return Check("cycle", "warning", f"{summary}: late setpoints take effect a cycle later", remedy)
     if lost:
         return Check("cycle", "warning", f"{summary}: {lost}", remedy)
     return Check("cycle", "ok", f"{summary}: fine; up to {_frequency(held.up_to_hz or held.rate_hz)}")

@@ -15,7 +15,17 @@ from trirail_drivers.interface import MissingProtection
 
 from trirail import naming
 from trirail.cli import notation
-from trirail.cli.terminal import COLOURS, SERVICE_TIMEOUT_S, json, left, out, percentiles, plain, print_line
+from trirail.cli.terminal import (
+    COLOURS,
+    SERVICE_TIMEOUT_S,
+    budget_share,
+    json,
+    left,
+    out,
+    percentiles,
+    plain,
+    print_line,
+)
 from trirail.errors import ServiceError
 from trirail.naming import Labels
 from trirail.wire.decoding import converted
@@ -114,6 +124,8 @@ def table(state: State, robot: str, labels: Labels, limits: Limits | None = None
     grid.add_row("loop", f"{words}, bus {loop.bus_load_measured:.0%} of at most {loop.bus_load:.0%}")
     grid.add_row("lateness", percentiles(loop.lateness_us))
     grid.add_row("cycle", percentiles(loop.cycle_us))
+    share = budget_share(loop.setpoints_us, loop.setpoint_budget_us)
+    grid.add_row("setpoints", f"{percentiles(loop.setpoints_us)}: {share}")
     for lack in loop.lacking:
         grid.add_row("[yellow]without[/]", plain(lack))
     for warning in state.warnings:

@@ -218,6 +218,14 @@ def percentiles(values: Percentiles) -> str:
     return f"p50 {values.p50:.0f}  p99 {values.p99:.0f}  p99.9 {values.p999:.0f}  max {values.max:.0f} µs"
 
 
+def budget_share(values: Percentiles, budget_us: float) -> str:
+    """Format percentiles as shares of the part of a cycle that the bus leaves to the loop [µs]."""
+    if budget_us <= 0.0:
+        return "the bus leaves no time to the loop"
+    p50, p999, worst = (f"{value / budget_us:.0%}" for value in (values.p50, values.p999, values.max))
+    return f"p50 {p50}, p99.9 {p999}, worst {worst} of the {budget_us:.0f} µs that the bus leaves"
+
+
 def table(first: str, *others: str) -> Table:
     """Return an empty table with these headings and right-aligned numbers; a column without a heading holds units."""
     made = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="bold")

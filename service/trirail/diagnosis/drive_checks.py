@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from statistics import median
 
-from trirail_drivers.bus.load import HIGH_LOAD
+from trirail_drivers.bus.load import HIGH_LOAD, Traffic
 from trirail_drivers.interface import NAMES
 from trirail_drivers.protocols import PROTOCOLS
 
@@ -93,17 +93,29 @@ def windows(config: Config) -> Iterator[Check]:
     yield Check("following error", "warning", finding, remedy, "drives.following_error")
 
 
+def traffic(config: Config) -> Traffic:
+    """Return the frames that a configuration puts on the bus."""
+    outputs = sum(bool(each.outputs) for each in config.drive_io)
+    return PROTOCOLS[config.drives.protocol].traffic.with_outputs(outputs)
+
+
+def setpoint_budget_us(config: Config) -> float:
+    """Return the part of the cycle that the bus leaves to the loop [µs], as in trirail.wire.state.LoopState."""
+    share = traffic(config).bus_load(config.loop.rate_hz, config.can.bitrate, config.drives.heartbeat)
+    return max(0.0, 1.0 - share) * config.period * 1e6
+
+
 def load(config: Config) -> Iterator[Check]:
     """Check the fraction of the bus capacity that the cycle uses in the worst case."""
     rate, bitrate, drives = config.loop.rate_hz, config.can.bitrate, config.drives
-    outputs = sum(bool(each.outputs) for each in config.drive_io)
-    traffic = PROTOCOLS[drives.protocol].traffic.with_outputs(outputs)
-    share = traffic.bus_load(rate, bitrate, drives.heartbeat)
-    finding = f"{share:.0%} of {bitrate} bit/s at {rate} Hz"
+    frames = traffic(config)
+    share = frames.bus_load(rate, bitrate, drives.heartbeat)
+    left = f", which leaves {setpoint_budget_us(config):.0f} µs of each cycle to the loop" if share < 1.0 else ""
+    finding = f"{share:.0%} of {bitrate} bit/s at {rate} Hz{left}"
     if share <= HIGH_LOAD:
         yield Check("bus load", "ok", finding)
         return
-    highest = HIGH_LOAD * traffic.highest_rate(bitrate, drives.heartbeat)
+    highest = HIGH_LOAD * frames.highest_rate(bitrate, drives.heartbeat)
     remedy = f"set loop.rate_hz below {highest:.0f}, or a higher bitrate"
     yield Check("bus load", "failure" if share > 1.0 else "warning", finding, remedy, "loop.rate_hz")
 

@@ -19,6 +19,7 @@ from trirail.telemetry.provenance import software, versions
 from trirail.wire import boundary, zenoh_session
 from trirail.wire.messages import Event
 from trirail.wire.packets import Status, Welcome
+from trirail.wire.records import Part
 from trirail.wire.state import (
     CommandedMotion,
     DigitalLine,
@@ -114,7 +115,8 @@ class StateMaker:
         self._rate_hz = config.loop.rate_hz
         self._lateness = _RecentValues(round(WINDOW / config.period))
         self._cycle = _RecentValues(round(WINDOW / config.period))
-        self._statistics = _NONE, _NONE
+        self._setpoints = _RecentValues(round(WINDOW / config.period))
+        self._statistics = [_NONE, _NONE, _NONE]
         self._statistics_due = 0
         self._newest: Any = None
         self._velocity = self._acceleration = np.zeros(3)
@@ -144,9 +146,11 @@ class StateMaker:
             self._error_max = np.maximum(self._error_max, np.abs(enabled).max(axis=0))
         self._lateness.extend(rows["lateness_ns"])
         self._cycle.extend(rows["parts_ns"].sum(axis=1))
+        self._setpoints.extend(rows["lateness_ns"] + rows["parts_ns"][:, : Part.WRITE + 1].sum(axis=1))
         if newest["cycle"] >= self._statistics_due:
             self._statistics_due = int(newest["cycle"]) + self._rate_hz
-            self._statistics = self._lateness.percentiles(), self._cycle.percentiles()
+            each = self._lateness, self._cycle, self._setpoints
+            self._statistics = [values.percentiles() for values in each]
 
     @property
     def lease(self) -> str | None:
@@ -161,7 +165,7 @@ class StateMaker:
     def newest(self, warnings: tuple[str, ...] = ()) -> State:
         """Return the state according to the newest record, with the given warnings."""
         row = self._newest
-        lateness, cycle = self._statistics
+        lateness, cycle, setpoints = self._statistics
         goal, target = self._status.goal, self._status.target
         a, b, c = self._status.counts
         offset = row["backlash"]  # part of the drives' positions, not of the sliders'
@@ -207,6 +211,8 @@ class StateMaker:
                 overruns=int(row["overruns"]),
                 lateness_us=lateness,
                 cycle_us=cycle,
+                setpoints_us=setpoints,
+                setpoint_budget_us=round(max(0.0, 1.0 - self._welcome.bus_load) * self._period * 1e6, 1),
                 bus_load=self._welcome.bus_load,
                 bus_load_measured=self._status.bus_load,
                 lacking=self._welcome.lacking,

@@ -115,6 +115,11 @@ class LoopState(Struct, frozen=True):
     """Delay of a cycle's start after its deadline [µs]."""
     cycle_us: Percentiles
     """Execution time of a cycle [µs]."""
+    setpoints_us: Percentiles
+    """Time from a cycle's deadline until its last setpoint was sent [µs]."""
+    setpoint_budget_us: float
+    """Part of the cycle that the bus leaves to the loop [µs]: the period minus the worst-case time of all frames.
+    Setpoints sent within this time reach the drives before the next SYNC."""
     bus_load: float
     """Fraction of the bus capacity that the cycle uses in the worst case, computed at the start."""
     bus_load_measured: float
