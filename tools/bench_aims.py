@@ -13,13 +13,13 @@ Results = dict[str, Any]
 """Results of each benchmark by name."""
 
 COMMANDS = {
+    "peers": ("--seconds", "5"),
     "fairness": ("--goals", "400"),
     "frames": (),
     "kinematics": (),
     "latency": ("--goals", "80"),
     "loop": ("--rates", "1000", "--rates", "2000", "--seconds", "60", "--runs", "5"),
     "outputs": ("--tries", "5"),
-    "peers": ("--seconds", "5"),
     "start": (),
 }
 """Benchmarks and their options: together under ten minutes."""
@@ -64,7 +64,25 @@ def _cycle_to_bare(results: Results, rate: int) -> tuple[float, ...]:
     return tuple(at(results, rate).get("to_bare", {}).get("cycle", ())[:3])
 
 
+def _to_canopen(deviations: Results) -> tuple[float, ...]:
+    """Return the ratios of trirail's deviations to those of python-canopen with setpoints, p99 and p99.9."""
+    ours, theirs = deviations["trirail, moving"], deviations["python-canopen, SCHED_FIFO, with setpoints"]
+    return tuple(ours[k] / theirs[k] for k in (1, 2))
+
+
 AIMS = (
+    Aim(
+        "SYNC's interval off its period to the machine's lateness spread, p99 / p99.9",
+        "not measured",
+        (1.2, 1.5),
+        lambda results: tuple(results["peers"]["ratio"][1:3]),
+    ),
+    Aim(
+        "SYNC's interval off its period to python-canopen's with setpoints, p99 / p99.9",
+        "not measured",
+        (1.0, 1.0),
+        lambda results: _to_canopen(results["peers"]["deviation_us"]),
+    ),
     Aim(
         "memory [MB]; up [s], of processor [s]",
         "915; 5; 6 to 9",
@@ -178,17 +196,25 @@ def main(brief: bool, json: bool = False) -> None:
 
 
 def _show(results: Results) -> None:
-    print(f"{'':68}{'before':>26}{'measured':>26}{'aim':>20}   met")
+    if "peers" in results:
+        _show_sync(results["peers"])
+    print(f"{'':80}{'before':>26}{'measured':>26}{'aim':>20}   met")
     for row in results["aims"]:
         measured, aim = (" / ".join(f"{value:.4g}" for value in row[key]) or "not kept" for key in ("measured", "aim"))
-        print(f"{row['name']:68}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
+        print(f"{row['name']:80}{row['before']:>26}{measured:>26}{aim:>20}   {'yes' if row['met'] else 'NO'}")
     for loop in results.get("loop", {}).get("rates", ()):
         if "to_bare" in loop:
             times = " / ".join(f"{value:.1f}" for value in loop["to_bare"]["cycle"][:3])
             print(f"whole cycle at {loop['rate_hz']} Hz to the bare loop's, p50 / p99 / p99.9: {times} times")
         else:
             print(f"{loop['rate_hz']} Hz are not kept here: {loop['not_kept']}")
-    if "peers" in results:
-        off = results["peers"]["deviation_us"]
-        print("SYNC's interval off its period, p99.9 [µs]: " + ", ".join(f"{k} {v[2]:.0f}" for k, v in off.items()))
-        print(f"LinuxCNC's servo thread: {results['peers']['linuxcnc']}")
+
+
+def _show_sync(peers: Results) -> None:
+    """Print the table of SYNC's intervals."""
+    title = f"SYNC at {peers['rate_hz']} Hz, interval off its period [µs]"
+    print(f"{title:50}{'p50':>8}{'p99':>8}{'p99.9':>8}{'worst':>8}")
+    machine = {f"the machine's lateness spread, {when}": values for when, values in peers["machine_us"].items()}
+    for name, values in {**machine, **peers["deviation_us"]}.items():
+        print(f"{name:50}" + "".join(f"{value:8.0f}" for value in values))
+    print(f"LinuxCNC's servo thread: {peers['linuxcnc']}\n")

@@ -70,10 +70,6 @@ class Listener:
             if identifier in SETPOINTS
         ]
 
-    def arrivals(self, identifier: int) -> list[float]:
-        """Return the arrival times of frames with an identifier since the last call [s]."""
-        return [t for t, one, _ in self._new_frames() if one == identifier]
-
     def _new_frames(self) -> Iterator[tuple[float, int, bytes]]:
         for chunk in self._capture.drain():
             for t, frame in CAPTURED.iter_unpack(chunk):

@@ -1,7 +1,8 @@
-"""Intervals of SYNC at a receiver: trirail's loop, python-canopen's own periodic SYNC, and LinuxCNC's servo thread.
+"""Intervals of SYNC at the drives: trirail's loop, python-canopen's SYNC, and the machine's own wake-ups.
 
-trirail and python-canopen send over the same bus between processes, with the same drives; the receiver is a third
-party there, and uses the kernel's time of arrival. python-canopen runs unchanged, and with the loop's privileges.
+trirail and python-canopen send over the same bus between processes to the same drives, which note when each SYNC
+arrives. python-canopen runs unchanged, with the loop's privileges, and with setpoints. The machine's own lateness is
+measured before and after them, with the same priority on the same processor.
 """
 
 from __future__ import annotations
@@ -17,45 +18,73 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_latency import listener
+from bench_beside import Beside
 from bench_rig import QUANTILES, configured, drives, quantiles, rig, without_pause
+from trirail.processes.clock import Ticker
 from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.cia402 import canopen_frames as layout
 
 RATE = 1000
 PRIORITY = 80
+NODES = (1, 2, 3)
 
 
 def measure(seconds: float) -> dict[str, Any]:
-    """Listen to each for `seconds`; return the deviations of SYNC's interval from its period [µs]."""
+    """Listen to each for `seconds`; return the deviations of SYNC's interval from its period [µs].
+
+    `machine_us` is the machine's own share: the deviation of a wake-up's lateness from its median, in runs before and
+    after the others. `ratio` compares trirail's deviation with the larger of the two.
+    """
+    before = _machine(seconds)
+    deviations = {
+        "trirail, moving": _trirail(seconds),
+        "python-canopen": _canopen(seconds, "its own thread"),
+        "python-canopen, SCHED_FIFO": _canopen(seconds, "real time"),
+        "python-canopen, SCHED_FIFO, with setpoints": _canopen(seconds, "setpoints"),
+    }
+    after = _machine(seconds)
+    machine = [max(pair) for pair in zip(before, after, strict=True)]
     return {
         "rate_hz": RATE,
         "quantiles": QUANTILES,
-        "deviation_us": {
-            "trirail, moving": _trirail(seconds),
-            "python-canopen": _canopen(seconds, real_time=False),
-            "python-canopen, SCHED_FIFO": _canopen(seconds, real_time=True),
-        },
+        "deviation_us": deviations,
+        "machine_us": {"before": before, "after": after},
+        "ratio": [ours / own for ours, own in zip(deviations["trirail, moving"], machine, strict=True)],
         "linuxcnc": _linuxcnc(),
     }
 
 
+def _machine(seconds: float) -> list[float]:
+    """Return the deviations of the lateness of wake-ups from their median at QUANTILES [µs]."""
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        late = Beside(seconds, 1_000_000 // RATE, PRIORITY, Path(folder, "lateness.json")).lateness()
+    return [max(1.0, value) for value in quantiles(np.abs(late - np.median(late)))]
+
+
 def _trirail(seconds: float) -> list[float]:
-    with rig(RATE) as made:
-        without_pause(made.robot, 1.0)
-        with listener(made.bus) as heard:
+    with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
+        times = Path(folder, "syncs")
+        with rig(RATE, times=times) as made:
+            without_pause(made.robot, 1.0)
+            began = time.monotonic()
             without_pause(made.robot, seconds)
-            return _deviations(heard.arrivals(layout.SYNC))
+            ended = time.monotonic()
+        return _deviations([each for each in _arrivals(times) if began < each < ended])
 
 
-def _canopen(seconds: float, real_time: bool) -> list[float]:
+def _canopen(seconds: float, way: str) -> list[float]:
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
         config, _ = configured(Path(folder), RATE, own=False)
-        path = f"{folder}/can"
-        with drives(config, path), listener(path) as heard:
-            command = [sys.executable, __file__, path, str(seconds), str(int(real_time))]
-            subprocess.run(command, check=True)
-            return _deviations(heard.arrivals(layout.SYNC))
+        path, times = f"{folder}/can", Path(folder, "syncs")
+        with drives(config, path, times):
+            subprocess.run([sys.executable, __file__, path, str(seconds), way], check=True)
+        return _deviations(_arrivals(times))
+
+
+def _arrivals(times: Path) -> list[float]:
+    """Return the times at which SYNCs arrived at the drives [s]."""
+    arrivals: list[float] = np.frombuffer(times.read_bytes()).tolist()
+    return arrivals
 
 
 def _deviations(arrivals: list[float]) -> list[float]:
@@ -72,20 +101,36 @@ def _linuxcnc() -> str:
     return "installed: run its latency-histogram beside this, it measures its servo thread itself"
 
 
-def _send_sync(path: str, seconds: float, real_time: bool) -> None:
-    """Send python-canopen's periodic SYNC on the bus for `seconds`."""
+def _send_sync(path: str, seconds: float, way: str) -> None:
+    """Send SYNC by python-canopen on the bus for `seconds`.
+
+    `way` is "its own thread" for the library's periodic SYNC; "real time" for the same with the loop's priority; or
+    "setpoints" for SYNC and three setpoints from a loop with that priority, which sleeps to absolute deadlines.
+    """
     import canopen
 
-    if real_time:
+    if way != "its own thread":
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     with UnixBus(path) as bus:
         network = canopen.Network(bus)
-        network.sync.start(1.0 / RATE)
-        time.sleep(seconds)
-        network.sync.stop()  # type: ignore[no-untyped-call]
+        if way == "setpoints":
+            setpoint, ticker, end = (
+                layout.SETPOINT.pack(0, 0),
+                Ticker(1_000_000_000 // RATE),
+                time.monotonic() + seconds,
+            )
+            while time.monotonic() < end:
+                ticker.wait()
+                network.sync.transmit()
+                for node in NODES:
+                    network.send_message(layout.RPDO2 + node, setpoint)
+        else:
+            network.sync.start(1.0 / RATE)
+            time.sleep(seconds)
+            network.sync.stop()  # type: ignore[no-untyped-call]
 
 
 if __name__ == "__main__":
-    _send_sync(sys.argv[1], float(sys.argv[2]), bool(int(sys.argv[3])))
+    _send_sync(sys.argv[1], float(sys.argv[2]), sys.argv[3])

@@ -47,10 +47,10 @@ def quantiles(values: list[float] | NDArray[np.float64]) -> list[float]:
 
 
 @contextlib.contextmanager
-def rig(rate_hz: int, own: bool = False, sections: str = "") -> Iterator[Rig]:
+def rig(rate_hz: int, own: bool = False, sections: str = "", times: Path | None = None) -> Iterator[Rig]:
     """Run an enabled service at a rate, on its `own` simulated drives or on some on a bus with listeners.
 
-    `sections` are added to its configuration.
+    `sections` are added to its configuration. The drives on the bus write the arrivals of SYNC to `times` at the end.
     """
     with tempfile.TemporaryDirectory(prefix="trirail-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
@@ -59,7 +59,7 @@ def rig(rate_hz: int, own: bool = False, sections: str = "") -> Iterator[Rig]:
             file.write(f"\n{sections}")
         bus = "" if own else str(folder / "can")
         if bus:
-            stack.enter_context(drives(config, bus))
+            stack.enter_context(drives(config, bus, times))
         stack.enter_context(own_service.service(config, folder / "bench.rrd"))
         robot = stack.enter_context(Robot("demo", locator, user="bench"))
         robot.enable()
@@ -84,9 +84,11 @@ def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
 
 
 @contextlib.contextmanager
-def drives(config: Path, bus: str) -> Iterator[None]:
-    """Run the drives of a configuration in a process of their own."""
+def drives(config: Path, bus: str, times: Path | None = None) -> Iterator[None]:
+    """Run the drives of a configuration in a process of their own, which writes the arrivals of SYNC to `times`."""
     command = [sys.executable, str(Path(__file__).with_name("bench_drives.py")), str(config), bus]
+    if times is not None:
+        command.append(str(times))
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             if process.stdout is None or process.stdout.readline() != "ready\n":

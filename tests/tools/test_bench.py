@@ -140,3 +140,17 @@ def test_alignment_needs_one_correction_by_the_right_model_and_more_by_the_other
         assert right["reached after at most two"] == built["reached after at most two"] == 1.0, kind
         for wrong in ("small angles", "the other kind's model"):
             assert max(cases[wrong]["µm after one, p50/p95/max"]) > max(right["µm after one, p50/p95/max"]), kind
+
+
+@pytest.mark.alone
+def test_the_intervals_of_sync_are_measured_beside_a_plain_loop_and_the_machine() -> None:
+    found = bench_peers.measure(0.3)
+    assert set(found["deviation_us"]) >= {"trirail, moving", "python-canopen, SCHED_FIFO, with setpoints"}
+    assert all(0.0 < values[-1] < 1e6 for values in found["deviation_us"].values())
+    rows = {row["name"]: row for row in bench_aims.table({"peers": found})}
+    assert [len(row["measured"]) for row in rows.values()] == [2, 2]
+    machine = [max(found["machine_us"][when][k] for when in ("before", "after")) for k in (1, 2)]
+    ratios = [found["deviation_us"]["trirail, moving"][k] / own for k, own in zip((1, 2), machine, strict=True)]
+    assert rows["SYNC's interval off its period to the machine's lateness spread, p99 / p99.9"]["measured"] == tuple(
+        ratios
+    )
