@@ -51,6 +51,7 @@ bench: $(READY)  ## all that is measured, under ten minutes, beside the aims; on
 
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "trirail needs Python 3.11 or newer: make PYTHON=python3.12 …")'
+	$(PYTHON) tools/check_ruckig.py
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
 	$(VENV)/bin/python -m pip install --quiet --editable . --group dev
