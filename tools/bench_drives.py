@@ -2,9 +2,8 @@
 
 python tools/bench_drives.py CONFIG PATH [TIMES]    real-time if permitted, away from the loop's processor
 
-At SIGTERM, the times at which SYNCs arrived are written to the file TIMES, as 64-bit floats in seconds. On a socket
-between processes, the kernel stamps a frame when it is read, so only a reader that always wakes up at once sees when it
-was sent.
+At SIGTERM, the times at which SYNCs arrived are written to the file TIMES, as 64-bit floats in seconds. The drives note
+them because they have real-time priority; the kernel stamps a frame between processes only when it is read.
 
 tools/virtual_drives.py is the version for users: it accepts faults and reports the drives' states.
 """

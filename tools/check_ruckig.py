@@ -24,12 +24,12 @@ def is_compiled(system: str, machine: str, version: tuple[int, int]) -> bool:
 
 
 def missing(compiler: str | None, headers: Path) -> list[str]:
-    """Return what the compilation lacks, as Debian's packages."""
+    """Return the Debian packages that the compilation lacks."""
     return ["g++"] * (compiler is None) + ["python3-dev"] * (not headers.is_file())
 
 
 def main() -> int:
-    """Print what pip is about to do, or what is missing; return the exit code."""
+    """Print the next step of pip, or the missing packages; return the exit code."""
     machine = platform.machine()
     if not is_compiled(sys.platform, machine, sys.version_info[:2]):
         return 0
