@@ -136,7 +136,7 @@ class FairQueue(Generic[T]):
         return self._queues[user][0]
 
     def pop(self, user: str) -> T:
-        """Remove and return the first item of a user, who then is last in the order.
+        """Remove and return the first item of a user. That user is then last in the order.
 
         Raises KeyError if the user has no item.
         """
