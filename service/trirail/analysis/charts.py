@@ -40,7 +40,7 @@ PANELS = {
     "error [µm]": 1.3,
     "loop [µs]": 1.3,
 }
-"""Panels from top to bottom, with their heights [inch]."""
+"""Heights of the panels, from top to bottom [inch]."""
 FIGURE_WIDTH_IN = 13.0
 DRAWN_LIMIT_SHARE = 0.7
 """Fraction of a limit that a curve must reach before the limit is drawn. A distant limit would flatten the curve."""
@@ -144,7 +144,7 @@ def _draw_motion(
     limits: Limits | None,
     labels: Labels,
 ) -> None:
-    """Draw the motion of the platform and the sliders in millimetres and degrees, and the limits that it approaches."""
+    """Draw the motion of platform and sliders in millimetres and degrees, and the limits that are nearly reached."""
     # While the drives are disabled, the sliders move freely. Their distance from the setpoints is then meaningless.
     enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
     error = np.where(enabled, records["following_error"], np.nan)

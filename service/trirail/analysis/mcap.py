@@ -84,8 +84,7 @@ def messages(recording: Recording, geometry: Geometry) -> list[Message]:
 def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the positions [m, rad] and the velocities [m/s, rad/s] of all JOINTS, each (N, 9).
 
-    The values of the sliders are measured. The values of the other joints, which have no sensors, are calculated from
-    the measured pose.
+    The values of the sliders are measured. The values of the passive joints are calculated from the measured pose.
     """
     sliders, velocity, pose = records["position"] - records["backlash"], records["velocity"], records["pose"]
     J1, J2 = jacobians(geometry, pose)

@@ -40,7 +40,10 @@ class GoalSummary(msgspec.Struct, frozen=True):
     ended: float | None
     message: str
     settle: float | None = None
-    """Time from the end of the path until the robot was in position [s]; None if not done, or if it does not settle."""
+    """Time from the end of the path until the robot was in position [s].
+
+    None if the goal is not done or does not settle.
+    """
 
 
 class AlignmentSummary(msgspec.Struct, frozen=True):

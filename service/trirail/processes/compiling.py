@@ -38,7 +38,7 @@ class Progress:
 
     def begin(self, name: str) -> None:
         """Report that a function is being compiled. The next report must follow within `patience` seconds."""
-        from trirail.kinematics.compiled import FUNCTIONS  # with numba, which a start without compiling does not need
+        from trirail.kinematics.compiled import FUNCTIONS  # imports numba, which is not needed if nothing is compiled
 
         before = len(self._begun)
         self._begun.add(name)

@@ -96,7 +96,7 @@ class UrgentFlag:
     def __init__(self, heartbeats: Heartbeats) -> None:
         self._counts = heartbeats.counts
         self.seen = 0
-        """Count at the last check."""
+        """Count of urgent requests at the last check."""
 
     def was_raised(self) -> bool:
         """Return True if there has been an urgent request since the last call."""

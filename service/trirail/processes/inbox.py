@@ -239,8 +239,8 @@ def _stops(incoming: Incoming) -> bool:
 def _named(stop: Incoming, name: str) -> Incoming:
     """Return a stop with its id set, if the id is valid.
 
-    The id connects copies of a stop on different ways. A stop that is too large for the stop port has no copy, and
-    therefore gets no id.
+    The copies of a stop that arrive over Zenoh and at the stop port have the same id. A stop that is too large for the
+    stop port has no copy there, and therefore gets no id.
     """
     return stop._replace(id=name) if is_id(name) and stop.size <= MAX_LINE else stop
 

@@ -53,7 +53,7 @@ class LoopDeath:
                 self._farewell = True
 
     def _record_begin(self, goal_id: str, user: str | None) -> None:
-        if goal_id not in self._ended:  # the loop refuses an id that is in use, and reports that itself
+        if goal_id not in self._ended:  # the loop itself reports that it refuses an id that was used before
             self._open.setdefault(goal_id, user)
 
     def _record_end(self, goal_id: str) -> None:

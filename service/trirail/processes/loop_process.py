@@ -134,7 +134,7 @@ class _Rehearsal:
         self._hang_up()
         yield from self._wait_until(lambda: self._mode is Mode.HOLDING)
         self._loop.ending = True
-        yield from self._wait_until(lambda: False)  # the loop returns first
+        yield from self._wait_until(lambda: False)  # the loop returns before this wait times out
 
     def _reset(self) -> Iterator[None]:
         """Wait until the drives are unpowered, and reset the fault."""
@@ -237,7 +237,7 @@ def main(
         loop.run(Ticker(round(config.period * 1e9)))
         ended_normally = True
     finally:
-        heartbeats.heart("loop").rest()  # closing the drives may take longer than the watchdog allows
+        heartbeats.heart("loop").rest()  # closing the drives may take longer than the time-out of the heartbeat
         if drives is not None:
             drives.close()
         for port in (ports.gateway, ports.recorder):

@@ -103,7 +103,7 @@ class Poses:
         """Warning that the file of taught poses has been deleted; empty while it exists."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about taught poses, one line each."""
+        """Return warnings about taught poses, with one line per warning."""
         both = sorted(self._taught.keys() & self._configured.keys())
         foreign = sorted(name for name in self._taught.keys() - both if self._is_foreign(self._taught[name]))
         other = (

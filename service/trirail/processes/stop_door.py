@@ -84,8 +84,8 @@ class StopDoor:
     def __init__(self, secured: ssl.SSLContext | None, handle_request: RequestHandler) -> None:
         self._secured = secured
         self._handle_request = handle_request
-        self._callers: dict[_Caller, None] = {}  # the oldest first
-        self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # those first that are longest in it
+        self._callers: dict[_Caller, None] = {}  # from the oldest to the newest connection
+        self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # connections in the order of joining
         self._listening: list[socket.socket] = []
         self._max_callers = min(MAX_CALLERS, descriptor_limit() // 4)
         self._reserve = Reserve(self._max_callers)

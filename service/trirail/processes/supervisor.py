@@ -40,7 +40,7 @@ The loop runs its rehearsal while the drives start, and then waits for the drive
 PORTS = ("gateway", "recorder", "planner")
 """Processes that connect to the loop, in the order of trirail.processes.ports.Ports."""
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
-"""Processes whose heartbeats are reported to systemd. The service survives the loss of the other processes."""
+"""Essential processes, without whose heartbeats systemd ends the service. It survives the loss of other processes."""
 CONSEQUENCES = {
     "gateway": "the loop stops the robot and holds",
     "planner": "the motion under way continues, new goals are refused",

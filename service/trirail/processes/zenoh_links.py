@@ -143,7 +143,7 @@ class LinkMonitor:
         self._warn(count >= UNOPENED * self._hysteresis(text.code), text)
 
     def _check_use(self, what: str, used: int, most: int, by: str) -> None:
-        """Warn if a resource is nearly used up."""
+        """Set or clear the warning that a resource is nearly used up."""
         code = EventCode.SESSIONS_FULL if what == "sessions" else EventCode.DESCRIPTORS_FULL
         words = (
             f"{used} of {most} {what} of the gateway are in use{by}: beyond that, new clients can only stop the robot"

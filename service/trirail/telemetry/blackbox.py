@@ -103,7 +103,7 @@ class BlackBox:
             self._faults.append(event)
 
     def control_input(self, item: ControlInput) -> None:
-        """Store an input of the control loop."""
+        """Store an input to the control loop."""
         self._keep_packed(item)
 
     def latch(self, name: str, *values: object) -> None:
@@ -138,7 +138,7 @@ class BlackBox:
 
     def _write(self, fault: Event) -> None:
         if self._dropped_at >= self._t - BEFORE_S - AFTER_S - MARGIN_S:
-            # A flood of messages fills the memory before a minute has passed.
+            # A flood of messages has filled the memory in less than a minute.
             words = (
                 f"black box: messages exceed {MAX_MESSAGES_MB:g} MB; "
                 f"those before t = {self._dropped_at:.1f} s are missing"
@@ -167,7 +167,7 @@ class BlackBox:
 
 
 def _replay_message(recorder: Recorder, packed: bytes) -> None:
-    """Pass a message of the loop to a recorder."""
+    """Decode a stored message and pass it to a recorder."""
     match decode_answer(packed):
         case EventReport(event):
             recorder.event(event)

@@ -97,7 +97,7 @@ prepare(Contents)
 
 
 def save(recording: Path, contents: Contents) -> None:
-    """Save the contents of a recording next to it, with the recording's permissions. Raises OSError."""
+    """Save contents in the sidecar of a recording, with the same permissions as the recording. Raises OSError."""
     mode = stat.S_IMODE(recording.stat().st_mode)
     files.replace(sidecar(recording), msgspec.json.encode(contents), mode)
 
@@ -113,7 +113,7 @@ def load(recording: Path) -> Contents | None:
 
 
 def read_contents(path: Path) -> Contents:
-    """Read the contents of a recording; if it is unreadable, `trouble` contains the reason."""
+    """Read the contents of a recording. If the recording cannot be read, `trouble` contains the reason."""
     from trirail.telemetry import provenance  # imported late, because importing Rerun takes most of the start-up time
     from trirail.telemetry.reading import read
 

@@ -89,7 +89,7 @@ def read(path: str | os.PathLike[str]) -> Recording:
     except ServiceError:
         if not path.is_file() or path.stat().st_size == size:
             raise
-        with _without_partial_message(path, growing=True) as whole:  # it was being written while Rerun read it
+        with _without_partial_message(path, growing=True) as whole:  # the file was being written while Rerun read it
             chunks = _chunks(whole, path)
     texts = _static(chunks, _DOCUMENT)
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]

@@ -169,7 +169,7 @@ class Recorder:
 
     @property
     def missing(self) -> tuple[int, int, int]:
-        """Three counts: batches missing in the file, batches missing in the live view, and cycles that were missed."""
+        """Three counts: batches missing in the file, batches missing in the live view, and cycles not received."""
         return self.lost, self.skipped, self._missed_cycles
 
     def records(self, batch: bytes) -> None:

@@ -104,7 +104,10 @@ class RotatedFiles:
             self.turn()
 
     def turn(self) -> bool:
-        """Continue in another file and return True. If no other file can be written, stay in this one: return False."""
+        """Continue in another file and return True.
+
+        If no other file can be written, continue in the present file and return False.
+        """
         number = self._number + 1
         try:
             path = claim(self._first.parent, f"{self._first.stem}-part{number}")

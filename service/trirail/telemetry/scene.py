@@ -56,17 +56,17 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
     yield "/robot/platform/stops", _lines(parts.edge_stops, [palette.LIMIT], 1.2, order=23)
     yield "/robot/workspace", _strips([palette.WORKSPACE], 0.8, order=15)
     yield "/robot/goal", _strips([palette.GOAL], 1.0, order=24)
-    # Sleeves in which the platform's edges slide, or the carriages' cross slides.
+    # These are the sleeves in which the platform's edges slide, or the cross slides on the carriages.
     yield "/robot/passive", _strips([palette.dark(c) for c in palette.SLIDERS], 5.5, order=25)
     yield "/robot/trace", _strips([palette.CENTRE], 1.2, order=30)
     yield (
         "/robot/platform/centre",
         rr.Points2D([[0.0, 0.0]], radii=rr.Radius.ui_points(4.0), colors=[palette.CENTRE], draw_order=31),
     )
-    yield (  # each slider, and the pivot about which the platform turns
+    yield (  # the three sliders, and the pivot of each leg, about which the platform turns
         "/robot/sliders",
         rr.Points2D.from_fields(
-            radii=[-8.5] * 3 + [-3.0] * 3,  # negative values are screen points, not metres
+            radii=[-8.5] * 3 + [-3.0] * 3,  # negative values mean screen points instead of metres
             colors=[*palette.SLIDERS, *[palette.PIN] * 3],
             draw_order=32,
         ),

@@ -124,7 +124,7 @@ class Streams:
         self._entries.append(journal.input_entry(item, self._rate_hz, self._wall_offset_ns))
 
     def log(self, level: Level, message: str) -> None:
-        """Add a line to the log at the time of the newest record."""
+        """Add a line to the log, at the time of the newest record."""
         wall = (int(self._record["deadline_ns"]) + self._wall_offset_ns) / SECOND
         self._entries.append(Entry(EVENTS, self.t, wall, message, level))
 
@@ -133,7 +133,7 @@ class Streams:
         self._goal_drawn = self._state.target is None
 
     def drop(self, stream: rr.RecordingStream) -> None:
-        """Remove a finished stream."""
+        """Remove a finished stream, which then receives no more changes of the static parts."""
         self._streams.remove(stream)
 
     def save(self) -> None:
@@ -190,7 +190,7 @@ class MissingDataReport:
         self._next = 0.0
 
     def check(self) -> None:
-        """Write the report if it is due."""
+        """Write a report if more data is missing and REPORT_EVERY has passed since the last report."""
         missing = self._counts()
         if missing != self._reported and self._streams.t >= self._next:
             self._reported, self._next = missing, self._streams.t + REPORT_EVERY
