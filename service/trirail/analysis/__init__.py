@@ -1,1 +1,1 @@
-"""Analysis of recordings: summaries, charts, replays."""
+"""Analysis of recordings: summaries, charts, exports and replays."""

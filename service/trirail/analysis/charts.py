@@ -1,4 +1,4 @@
-"""Charts of a session: modes, goals, pose, sliders, following error and the loop's timing. Requires matplotlib."""
+"""Charts of a session: modes, goals, pose, sliders, following error and loop timing. This module needs matplotlib."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DASHES = (0, (4, 3))
 MODE_COLOURS = {mode: palette.code(palette.pale(colour)) for mode, colour in palette.MODES.items()}
 OUTCOME_COLOURS = {outcome: palette.code(colour) for outcome, colour in palette.OUTCOMES.items()}
 CURVE_BINS = 1500
-"""Number of bins of a drawn curve; each bin keeps its minimum and maximum."""
+"""Number of bins into which a long curve is divided. Only the minimum and the maximum of each bin are drawn."""
 PANELS = {
     "goals": 1.1,
     "x, y [mm]": 1.3,
@@ -40,10 +40,10 @@ PANELS = {
     "error [µm]": 1.3,
     "loop [µs]": 1.3,
 }
-"""Panels from top to bottom, with their heights [inch]."""
+"""Heights of the panels, from top to bottom [inch]."""
 FIGURE_WIDTH_IN = 13.0
 DRAWN_LIMIT_SHARE = 0.7
-"""Fraction of a limit that a curve must reach for the limit to be drawn, since distant limits flatten the curve."""
+"""Fraction of a limit that a curve must reach before the limit is drawn. A distant limit would flatten the curve."""
 MAX_LISTED_FAULTS = 8
 """Maximum number of faults listed below the curves."""
 LETTER_WIDTH_PT = 4.0
@@ -53,11 +53,11 @@ RESIDUAL_PANEL = "to go [µm]"
 MARK_COLOURS = ("#0e7c86", "#7a4fc0", "#b7791f", "#d1495b", "#2e8b57", "#2f6fb3")
 """Colours of marks, in the order of their names."""
 MIN_RESIDUAL_UM = 1e-3
-"""Lowest value on the logarithmic scale [µm]; it also represents a residual of zero."""
+"""Lowest value drawn on the logarithmic scale [µm]. Smaller residuals, including zero, are drawn at this value."""
 
 
 def draw(file: Path, recording: Recording, summary: Summary) -> None:
-    """Draw a session to a file, in the format given by the file suffix.
+    """Draw the charts of a session and write them to a file, in the format of the file's suffix.
 
     Raises
     ------
@@ -103,7 +103,10 @@ def draw(file: Path, recording: Recording, summary: Summary) -> None:
 
 
 def _draw_residuals(panel: Axes, alignments: Sequence[RecordedAlignment]) -> dict[str, str]:
-    """Draw a line with a dot per look for each mark, and the end of each alignment; return the colour of each mark."""
+    """Draw the residuals of each mark as a line with one dot per look, and label the end of each alignment.
+
+    Return the colour of each mark.
+    """
     panel.set_yscale("log")
     names = sorted({name for each in alignments for name in each.marks})
     colours = {name: MARK_COLOURS[n % len(MARK_COLOURS)] for n, name in enumerate(names)}
@@ -120,13 +123,13 @@ def _draw_residuals(panel: Axes, alignments: Sequence[RecordedAlignment]) -> dic
 
 
 def _fault_lines(faults: list[Incident]) -> list[str]:
-    """Return a numbered line for each fault, up to MAX_LISTED_FAULTS, and one with the number of remaining faults."""
+    """Return a numbered line for each of the first MAX_LISTED_FAULTS faults. A last line counts the other faults."""
     lines = [f"{n}   {each.t:.3f} s   {each.message}" for n, each in enumerate(faults[:MAX_LISTED_FAULTS], start=1)]
     return lines + ([f"and {len(faults) - MAX_LISTED_FAULTS} more"] if len(faults) > MAX_LISTED_FAULTS else [])
 
 
 def _recorded_limits(recording: Recording) -> Limits | None:
-    """Return the limits in force, or None if the recording has no configuration that this version can read."""
+    """Return the configured limits, or None if the recording has no configuration that this version can read."""
     try:
         config = provenance.configuration(recording.texts)
     except ConfigError:
@@ -141,8 +144,8 @@ def _draw_motion(
     limits: Limits | None,
     labels: Labels,
 ) -> None:
-    """Draw the motion of platform and sliders in millimetres and degrees, with the limits that it approaches."""
-    # Without power, the sliders move freely, so their distance from the setpoints is meaningless.
+    """Draw the motion of platform and sliders in millimetres and degrees, and the limits that are nearly reached."""
+    # While the drives are disabled, the sliders move freely. Their distance from the setpoints is then meaningless.
     enabled = np.isin(records["mode"], ENABLED_MODES)[:, np.newaxis]
     error = np.where(enabled, records["following_error"], np.nan)
     _draw_curves(panels["x, y [mm]"], t, records["pose"][:, :2] * 1e3, CENTRE)
@@ -166,7 +169,7 @@ def _draw_motion(
 
 
 def _draw_bounds(panel: Axes, values: NDArray[np.float64], low: float, high: float) -> None:
-    """Draw the limits that the values approach."""
+    """Draw the limits `low` and `high`, each only if the values come close to it."""
     for limit in (low, high):
         greatest = np.nanmax(values * np.sign(limit), initial=0.0)
         if limit and greatest >= DRAWN_LIMIT_SHARE * abs(limit):
@@ -180,7 +183,7 @@ def _title(summary: Summary) -> str:
 
 
 def _draw_modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], summary: Summary) -> None:
-    """Draw the modes as a band, and the goals as bars above it."""
+    """Draw the modes as a coloured band, and the goals as bars above the band."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(records["mode"])) + 1])
     ends = np.append(t[starts[1:]], t[-1])
     bands = [Rectangle((t[start], 0.0), end - t[start], 0.9) for start, end in zip(starts, ends, strict=True)]
@@ -198,7 +201,7 @@ def _draw_modes(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64], 
 
 
 def _draw_goal(panel: Axes, goal: GoalSummary, y: float, begin: float, end: float) -> None:
-    """Draw a goal as a bar with its name, which is truncated to the length of the bar."""
+    """Draw a goal as a bar labelled with the goal's name. A name longer than the bar is truncated or omitted."""
     ended = end if goal.ended is None else goal.ended
     colour = OUTCOME_COLOURS[goal.outcome]
     panel.add_patch(Rectangle((goal.given, y), ended - goal.given, 0.65, facecolor=colour, linewidth=0))
@@ -214,13 +217,13 @@ def _draw_goal(panel: Axes, goal: GoalSummary, y: float, begin: float, end: floa
 
 
 def _draw_curves(panel: Axes, t: NDArray[np.float64], values: NDArray[np.float64], colours: Sequence[str]) -> None:
-    """Draw the columns of (N, k) values so that even the shortest excursion remains visible."""
+    """Draw each column of `values`, (N, k), as a curve in which even the shortest excursion is visible."""
     for column, colour in zip(values.T, colours, strict=True):
         panel.plot(*_decimate(t, column), color=colour, linewidth=1.0)
 
 
 def _label_curves(panel: Axes, names: Sequence[str], colours: Sequence[str]) -> None:
-    """Add a legend with a name for each curve."""
+    """Add a legend that names each curve in the colour of the curve."""
     pairs = zip(names, colours, strict=True)
     _draw_legend(panel, [Line2D([], [], color=colour, label=name) for name, colour in pairs])
 
@@ -244,13 +247,13 @@ def _draw_timing(panel: Axes, records: NDArray[np.void], t: NDArray[np.float64],
 
 
 def _decimate(t: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the minimum and maximum of each bin, in order of time."""
+    """Reduce a long curve to the minimum and the maximum of each bin, in order of time."""
     size = len(values) // CURVE_BINS
     if size < 3:
         return t, values
     length = len(values) // size * size
     rows = values[:length].reshape(-1, size)
-    # argmin and argmax return the index of a NaN; a bin that contains one is drawn as a gap.
+    # argmin and argmax return the index of a NaN. A bin that contains a NaN is therefore drawn as a gap.
     empty = np.isnan(rows).any(axis=1)
     filled = np.where(np.isnan(rows), 0.0, rows)
     at = np.sort(np.stack([filled.argmin(axis=1), filled.argmax(axis=1)], axis=1), axis=1)

@@ -1,4 +1,4 @@
-"""Export of a recording as a table with one row per cycle, or per switch of an output: CSV, Parquet or numpy."""
+"""Export of a recording as a table with one row per cycle or one row per switched output, as CSV, Parquet or numpy."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SWITCHES: Final = pa.schema(
 
 
 def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
-    """Write the table of a recording as CSV, Parquet or numpy, depending on the file suffix; return the number of rows.
+    """Write a recording as a table in the format of the file's suffix; return the number of rows.
 
     Parameters
     ----------
@@ -46,22 +46,22 @@ def write(recording: Recording, path: Path, columns: Sequence[str] = ()) -> int:
     Raises
     ------
     ServiceError
-        A column or the suffix is unknown, the file exists, or it cannot be written.
+        A column or the suffix is unknown, or the file already exists or cannot be written.
     """
     return _write(path, lambda: table(recording, columns))
 
 
 def write_switches(recording: Recording, path: Path) -> int:
-    """Write the output switches on the paths of goals, one per row; return their number.
+    """Write a table of the outputs that were switched on the paths of goals; return the number of rows.
 
-    `path` and the errors are the same as for `write`. The columns are the fields of trirail.wire.marks.Switch, split so
-    that each column contains one number.
+    The table has one row per switched output. `path` and the errors are the same as for `write`. The columns are the
+    fields of trirail.wire.marks.Switch; a field with several numbers has one column per number.
     """
     return _write(path, lambda: pa.Table.from_pylist(switch_rows(switches(recording)), SWITCHES))
 
 
 def switches(recording: Recording) -> tuple[Switch, ...]:
-    """Return the output switches on the paths of goals, in the order in which they happened."""
+    """Return the switches of outputs on the paths of goals, in the order of their cycles."""
     events = (line.event for line in recording.events if line.event is not None)
     return tuple(sorted((switch for event in events for switch in event.marks), key=lambda switch: switch.cycle))
 
@@ -71,7 +71,7 @@ def _write(path: Path, make: Callable[[], pa.Table]) -> int:
         raise ServiceError(f"{path}: its name must end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
     rows = make()
     try:
-        # Mode x never overwrites an existing file, such as another export.
+        # Mode "x" fails if the file exists, so that an earlier export is never overwritten.
         with path.open("xb") as file:
             _WRITERS[path.suffix](rows, file)
     except FileExistsError as error:
@@ -82,7 +82,7 @@ def _write(path: Path, make: Callable[[], pa.Table]) -> int:
 
 
 def _save_numpy(rows: pa.Table, file: BinaryIO) -> None:
-    """Write a structured array whose fields are the columns."""
+    """Write a structured array with one field per column."""
     columns = [column.to_numpy() for column in rows.columns]
     columns = [column.astype(str) if column.dtype == object else column for column in columns]
     array = np.empty(len(rows), [(name, column.dtype) for name, column in zip(rows.column_names, columns, strict=True)])

@@ -1,4 +1,7 @@
-"""Export of a recording as MCAP with ROS 2 messages, for Foxglove, PlotJuggler and `ros2 bag`. Requires rosbags."""
+"""Export of a recording as an MCAP file with ROS 2 messages, for Foxglove, PlotJuggler and `ros2 bag`.
+
+This module needs the package rosbags.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from trirail.telemetry.journal import Line
 from trirail.telemetry.recording import Recording
 from trirail.wire.vocabulary import MODES, Mode
 
-# The definitions of these messages are the same in Jazzy, Kilted and Lyrical.
+# The definitions of these messages are the same in the ROS 2 releases Jazzy, Kilted and Lyrical.
 STORE = get_typestore(Stores.ROS2_JAZZY)
 Time, Header = STORE.types["builtin_interfaces/msg/Time"], STORE.types["std_msgs/msg/Header"]
 Point, Vector3 = STORE.types["geometry_msgs/msg/Point"], STORE.types["geometry_msgs/msg/Vector3"]
@@ -42,9 +45,9 @@ TOPICS = {
 }
 """Message type of each topic."""
 BASE, MEASURED, COMMANDED = "base", "platform_measured", "platform_commanded"
-"""Names of frames. The platform of the URDF is a separate link, which joints move."""
+"""Names of the frames in /tf. The URDF has a separate link for the platform, which the joints move."""
 JOINTS = tuple(f"{joint}_{leg}" for joint in ("slider", "pivot", "cross") for leg in "abc")
-"""Joints of the URDF: sliders, pivots and cross slides of the legs A, B, C."""
+"""Names of the joints in the URDF: first the sliders, then the pivots, then the cross slides of the legs A, B, C."""
 OK, ERROR = 0, 2
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 Message = tuple[int, str, Any]
@@ -54,8 +57,8 @@ Message = tuple[int, str, Any]
 def write(recording: Recording, path: Path) -> int:
     """Write a recording as one MCAP file; return the number of messages.
 
-    Each message has the wall-clock time of its record. Raises ServiceError if the file exists or cannot be written, or
-    if the recording has no configuration.
+    Each message has the wall-clock time of the record or the log line from which it is made. Raises ServiceError if the
+    file already exists or cannot be written, or if the recording has no configuration.
     """
     settings = provenance.configuration(recording.texts)
     if settings is None:
@@ -73,15 +76,15 @@ def write(recording: Recording, path: Path) -> int:
 
 
 def messages(recording: Recording, geometry: Geometry) -> list[Message]:
-    """Return the messages of a recording in order of time."""
+    """Convert a recording to messages, in order of time."""
     made = [*_motion(recording, geometry), *_log(recording), *_diagnostics(recording)]
     return sorted(made, key=lambda message: message[0])
 
 
 def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions and velocities of all JOINTS, (N, 9) [m, rad, m/s, rad/s].
+    """Return the positions [m, rad] and the velocities [m/s, rad/s] of all JOINTS, each (N, 9).
 
-    The values of the sliders are measured. Those of the passive joints follow from the kinematics at the measured pose.
+    The values of the sliders are measured. The values of the passive joints are calculated from the measured pose.
     """
     sliders, velocity, pose = records["position"] - records["backlash"], records["velocity"], records["pose"]
     J1, J2 = jacobians(geometry, pose)
@@ -95,7 +98,7 @@ def joint_motion(records: NDArray[np.void], geometry: Geometry) -> tuple[NDArray
 
 
 def _write_bag(folder: Path, made: list[Message]) -> int:
-    """Write messages as a rosbag2 bag, which is a folder with one file."""
+    """Write messages as a rosbag2 bag, which is a folder that contains the MCAP file; return the number of messages."""
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         connections = {topic: bag.add_connection(topic, kind, typestore=STORE) for topic, kind in TOPICS.items()}
         for wall, topic, message in made:
@@ -127,7 +130,10 @@ def _motion(recording: Recording, geometry: Geometry) -> Iterator[Message]:
 
 
 def _log(recording: Recording) -> Iterator[Message]:
-    """Yield the log lines: events as JSON, as the service publishes them, and messages from the recorder."""
+    """Yield one message for each line of the log of events, as JSON.
+
+    An event has the same JSON as in the service's publications. A line from the recorder has only a level and a text.
+    """
     string = STORE.types["std_msgs/msg/String"]
     for line in recording.events:
         content = line.event if line.event is not None else {"level": line.level, "message": line.text}
@@ -135,7 +141,7 @@ def _log(recording: Recording) -> Iterator[Message]:
 
 
 def _diagnostics(recording: Recording) -> Iterator[Message]:
-    """Yield the mode at each of its changes, and each fault."""
+    """Yield a message for each change of the mode, and a message for each fault."""
     modes = recording.records["mode"]
     changes = np.flatnonzero(np.diff(modes, prepend=np.uint8(255)))  # no mode has this number
     walls = _nanoseconds(recording.wall)

@@ -1,12 +1,14 @@
-"""Replay of a recorded session in process, without waiting: the same control with the same inputs, cycle by cycle.
+"""Replay of a recorded session: the same control code runs with the recorded inputs, cycle by cycle.
 
-The decisions of the control depend on its configuration, on the feedback of the drives at each SYNC, and on its inputs,
-which are goals, commands, disturbances and the planner's answers. A recording contains all of these, each with its
-cycle, so the setpoints must be the same to the last bit. The requests to the planner follow from them as well: the
-replay plans them again, and compares the result with the recorded answer.
+The replay runs in a single process, as fast as possible. The decisions of the control depend on the configuration, on
+the feedback of the drives at each SYNC, and on the inputs, which are goals, commands, disturbances and the planner's
+answers. A recording contains all of these, each with the number of its cycle. Therefore the setpoints of the replay
+must equal the recorded setpoints in every bit. The control also makes the same requests to the planner. The replay
+plans these requests again, and compares the results with the recorded answers.
 
-With another configuration, the recorded answers from drives and planner are no longer valid. They are replaced by
-simulated drives, whose clock advances by one period per cycle, and by a planner that answers in the next cycle.
+With another configuration, the recorded feedback of the drives and the recorded answers of the planner are not valid.
+The replay then uses simulated drives, whose clock advances by one period per cycle, and a planner that answers in the
+next cycle.
 """
 
 from __future__ import annotations
@@ -49,45 +51,45 @@ _FLAG_FIELDS = (("age", int), ("follows", bool), ("homed", bool))
 
 
 class Comparison(NamedTuple):
-    """Comparison of the setpoints of a session with those of its replay."""
+    """Comparison of a recorded session with its replay."""
 
     cycles: int
     """Number of compared cycles."""
     lacking: int
-    """Number of cycles at the end that were not compared, because the recording has a gap before them."""
+    """Number of cycles that were not compared, because they follow a gap in the recording."""
     requests: int
-    """Number of goals, commands and disturbances."""
+    """Number of replayed inputs, such as goals, commands and disturbances, without the planner's answers."""
     plans: int
-    """Number of recorded answers from the planner; 0 if the replay makes all plans."""
+    """Number of recorded answers from the planner that were used; 0 if the replay made all plans itself."""
     plans_differing: int
-    """Number of recorded answers that differ in any bit from those of the replay."""
+    """Number of recorded answers that differ from the plan that the replay made for the same request."""
     differing: int
-    """Number of cycles whose setpoints, mode or outputs differ in any bit."""
+    """Number of cycles in which any bit of the setpoints, the mode or the outputs differs from the recording."""
     first: int | None
-    """Number of the first of these cycles."""
+    """Number of the first cycle that differs; None if no cycle differs."""
     position: Triple
-    """Largest difference of a setpoint for each slider [m]."""
+    """Largest difference of the position setpoint for each slider [m]."""
     velocity: Triple
     """Largest difference of the velocity feed-forward for each slider [m/s]."""
 
 
 def replay_session(recording: Recording, config: Config, *, simulated: bool) -> Comparison:
-    """Run a session again and compare the setpoints.
+    """Run a session again, and compare its setpoints, modes and outputs with the recorded values.
 
     Parameters
     ----------
     recording
         Session to replay.
     config
-        Configuration of the control.
+        Configuration with which the control runs.
     simulated
-        Whether to use simulated drives with this configuration instead of the recorded ones.
+        True to run simulated drives with this configuration, False to use the recorded feedback of the drives.
 
     Raises
     ------
     ServiceError
-        The recording does not begin with a disabled robot, so its earlier state is unknown, or its rate differs from
-        the configured rate.
+        The robot is not disabled at the start of the recording, so that the state of the control is unknown. Or the
+        rate of the recording differs from the configured rate.
     """
     records, inputs = _replayable_part(recording)
     _check_recording(recording, records, config)
@@ -105,7 +107,7 @@ def replay_session(recording: Recording, config: Config, *, simulated: bool) -> 
         clock.run()
         drives.close()
     recorded = np.stack([records[name] for name in SETPOINT_FIELDS], axis=1)
-    # Compared as integers, so that all bits must match, including the sign of a zero.
+    # The values are compared as integers, so that all bits must match, including the sign of a zero.
     differs = (setpoints.view(np.int64) != recorded.view(np.int64)).any(axis=(1, 2)) | (modes != records["mode"])
     differs |= (outputs != records["outputs"]).any(axis=1)
     greatest = np.abs(setpoints - recorded).max(axis=0).tolist()
@@ -130,10 +132,10 @@ def _run(
     records: NDArray[np.void],
     inputs: Sequence[ControlInput],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64]]:
-    """Return the commands of each cycle.
+    """Run the control through all N cycles of `records`, and return its commands.
 
-    These are the setpoints, position [m] and velocity [m/s], (N, 2, 3), the modes, (N,), and the output words of the
-    drives, (N, 3).
+    These are the setpoints, which are positions [m] and velocities [m/s], (N, 2, 3), the modes, (N,), and the output
+    words of the drives, (N, 3).
     """
     clock.step()
     drives.sync()
@@ -157,14 +159,14 @@ def _run(
 def _run_cycle(
     control: Control, drives: DriveGroup, planner: _RecordedPlanner | LocalPlanner, entries: Sequence[ControlInput]
 ) -> None:
-    """Run the steps of a cycle of the loop that follow its SYNC."""
+    """Run the same steps that the loop runs in a cycle after its SYNC."""
     inputs = [entry for entry in entries if not isinstance(entry.given, DrivesFault)]
     decided = [entry for entry in inputs if not entry.urgent]
     if isinstance(drives, _RecordedDrives):
         for entry in entries:
             if isinstance(entry.given, DrivesFault):
                 drives.set_fault(entry.given)
-    # Inputs that arrived while the loop waited for its tick were handled separately, after the others.
+    # The loop handled inputs that arrived while it waited for its tick separately, after the other inputs.
     for waiting in (False, True):
         received = [entry for entry in decided if entry.waiting is waiting]
         batch: list[TimedInput] = [(entry.given, entry.now_ns) for entry in received]  # type: ignore[misc]
@@ -188,14 +190,14 @@ def _due_inputs(pending: deque[ControlInput], cycle: int) -> Iterator[ControlInp
 
 
 def _replayable_part(recording: Recording) -> tuple[NDArray[np.void], list[ControlInput]]:
-    """Return the records up to the first gap in the records or the inputs, and the inputs of these cycles."""
+    """Return the records before the first gap in the records or in the inputs, and the inputs of the same cycles."""
     records, inputs = recording.records, recording.requests
     steps = np.diff(records["cycle"]) != 1
     length = int(np.argmax(steps)) + 1 if steps.any() else len(records)
     first, last = int(records["cycle"][0]), int(records["cycle"][length - 1])
     known = [entry for index, entry in enumerate(inputs) if entry.seq - inputs[0].seq == index]
     if len(known) < len(inputs):
-        # The missing input may belong to any cycle after that of the last known input.
+        # The missing input may belong to any cycle after the cycle of the last known input.
         last = max(first, min(last, known[-1].cycle))
     return records[: last - first + 1], [entry for entry in known if first <= entry.cycle <= last]
 
@@ -216,16 +218,19 @@ def _check_recording(recording: Recording, records: NDArray[np.void], config: Co
 
 
 def _has_same_plans(recording: Recording, config: Config) -> bool:
-    """Return whether a configuration has the same values as the recorded one in everything on which plans depend.
+    """Return True if all values that affect plans are the same in `config` and in the recorded configuration.
 
-    A recording without a configuration is assumed to have the same values.
+    If the recording has no configuration, the values are assumed to be the same.
     """
     recorded = provenance.configuration(recording.texts)
     return recorded is None or revision(recorded) == revision(config)
 
 
 class _RecordedPlanner:
-    """Planner whose answers come from the recording. It plans each request again and compares the results with them."""
+    """Planner that plans each request again, only to compare the plans with the recorded answers.
+
+    The control uses the recorded answers.
+    """
 
     def __init__(self, config: Config) -> None:
         self.answers = 0
@@ -238,7 +243,7 @@ class _RecordedPlanner:
         self._planned[request.number] = self._planner.plan(request)
 
     def compare(self, entries: Sequence[ControlInput]) -> None:
-        """Count the answers among the inputs of a cycle, and the answers that differ from the replanned ones."""
+        """Count the recorded answers among the inputs of a cycle, and those that differ from the new plans."""
         for entry in entries:
             if isinstance(entry.given, PlanAnswer):
                 self.answers += 1
@@ -246,7 +251,7 @@ class _RecordedPlanner:
 
 
 class _RecordedDrives:
-    """DriveGroup that returns the recorded feedback, and ignores setpoints and commands."""
+    """Implementation of DriveGroup that returns the recorded feedback, and ignores setpoints and commands."""
 
     bus_load = 0.0
     missing_protections: tuple[MissingProtection, ...] = ()
@@ -270,7 +275,7 @@ class _RecordedDrives:
         self._unready: UnreadyDrives = (None, None, None)
 
     def set_fault(self, fault: DrivesFault) -> None:
-        """From now on, report a fault and the drives that are not ready."""
+        """Set the fault and the drives that are not ready, which `read` reports from now on."""
         self._fault = DriveFault("", "recorded", 0, fault.message) if fault.message is not None else None
         a, b, c = (Unready(f"drive {name} was not ready") if name in fault.unready else None for name in NAMES)
         self._unready = a, b, c
@@ -280,12 +285,12 @@ class _RecordedDrives:
         self._row += 1
 
     def read(self) -> Feedback:
-        """Return the feedback of the present cycle or, before the first cycle, of the first cycle."""
+        """Return the recorded feedback of the current cycle; before the first cycle, return that of the first cycle."""
         return self._feedback[max(0, self._row - 1)]._replace(fault=self._fault, unready=self._unready)
 
     @property
     def reported_faults(self) -> tuple[DriveFault | None, ...]:
-        """None for each drive, since `read` reports the faults."""
+        """None for each drive, because `read` reports the faults."""
         return None, None, None
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
@@ -301,7 +306,7 @@ class _RecordedDrives:
         """See trirail_drivers.interface.DriveGroup."""
 
     def set_outputs(self, words: Sequence[int]) -> None:
-        """Do nothing."""
+        """See trirail_drivers.interface.DriveGroup."""
 
     def stop_homing(self) -> None:
         """See trirail_drivers.interface.DriveGroup."""
@@ -320,7 +325,7 @@ class _RecordedDrives:
 
 
 class _SimulatedClock:
-    """Clock of the simulated drives. It advances by one period per cycle, and runs by itself after the replay."""
+    """Clock of the simulated drives, which advances by one period per cycle, and in real time after the replay."""
 
     def __init__(self, period: float) -> None:
         self._now = 0.0
@@ -335,7 +340,7 @@ class _SimulatedClock:
         self._now += self._period
 
     def run(self) -> None:
-        """Run by itself from now on, since drives that are closed wait until they are at rest."""
+        """Advance in real time from now on, because closing the drives waits until they are at rest."""
         self._released_at = time.monotonic()
 
 

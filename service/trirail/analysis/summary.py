@@ -21,13 +21,16 @@ from trirail.wire.state import Percentiles
 from trirail.wire.vocabulary import MODES, Mode
 
 ENABLED_MODES = tuple(MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING))
-"""Modes in which the drives follow the setpoints."""
+"""Indices in MODES of the modes in which the drives follow the setpoints."""
 UNKNOWN_LABEL = "unknown"
-"""Text for values that are not recorded, such as the outcome of a goal whose end is not recorded."""
+"""Text for values that are not in the recording, such as the outcome of a goal that had not ended yet."""
 
 
 class GoalSummary(msgspec.Struct, frozen=True):
-    """Goal, from its acceptance by the control to its end. Times are nominal, since the start of the loop [s]."""
+    """Summary of a goal from its arrival at the control to its end.
+
+    Times are nominal times since the start of the loop [s].
+    """
 
     id: str
     user: str
@@ -37,20 +40,23 @@ class GoalSummary(msgspec.Struct, frozen=True):
     ended: float | None
     message: str
     settle: float | None = None
-    """Time from the end of the path until the robot was in position [s]; None if the goal did not settle."""
+    """Time from the end of the path until the robot was in position [s].
+
+    None if the goal is not done or does not settle.
+    """
 
 
 class AlignmentSummary(msgspec.Struct, frozen=True):
     """Summary of an alignment, a camera calibration, or a check."""
 
     id: str
-    """Prefix of the ids of its goals."""
+    """Prefix of the ids of the alignment's goals."""
     user: str
     purpose: str
     end: str
-    """Reason why it ended; "unknown" if that is not recorded."""
+    """Reason why the alignment ended; "unknown" if that is not recorded."""
     message: str
-    """Error message, if an error ended it."""
+    """Error message if an error ended the alignment; otherwise empty."""
     began: float
     """Nominal time of the first look, since the start of the loop [s]."""
     seconds: float
@@ -58,7 +64,7 @@ class AlignmentSummary(msgspec.Struct, frozen=True):
     looks: int
     corrections: int
     residuals: dict[str, list[float | None]]
-    """Distance of each mark from its target at each look [m]; None for a mark that was not found."""
+    """Distance of each mark from its target in each look [m]; None if the mark was not found in that look."""
 
 
 class Incident(msgspec.Struct, frozen=True):
@@ -72,8 +78,9 @@ class Incident(msgspec.Struct, frozen=True):
 
 
 class Tracking(msgspec.Struct, frozen=True):
-    """Following error of one slider while the drives are enabled [m]: maximum, root mean square, and root mean square
-    in motion.
+    """Following error of one slider while the drives are enabled [m].
+
+    The values are the maximum, the root mean square, and the root mean square while the robot moves.
     """
 
     slider: str
@@ -87,12 +94,12 @@ class Summary(msgspec.Struct, frozen=True):
 
     name: str
     began: str
-    """Wall clock at the start, ISO 8601, UTC."""
+    """Wall-clock time of the first record, in ISO 8601 format and UTC."""
     duration: float
     """Time from the first to the last record [s]."""
     cycles: int
     lacking: int
-    """Number of cycles without a record between the first and the last record."""
+    """Number of cycles between the first and the last record that have no record."""
     missed: int
     """Number of ticks that the loop missed."""
     rate_hz: int
@@ -115,7 +122,7 @@ class Summary(msgspec.Struct, frozen=True):
 
 
 def summarise(recording: Recording) -> Summary:
-    """Return the summary of a session."""
+    """Summarise a recorded session."""
     records = recording.records
     period = _period(recording)
     cycles = records["cycle"]
@@ -176,7 +183,10 @@ def _commands(recording: Recording) -> dict[str, int]:
 
 
 def _goals(recording: Recording, period: float) -> Iterator[GoalSummary]:
-    """Yield the goals in the order of their requests. The many velocities of a jog count as one goal."""
+    """Yield the goals in the order of their requests.
+
+    A jog, in which many velocities are sent as requests with the same id, counts as one goal.
+    """
     ends: dict[str, Event] = {}
     for line in recording.events:
         if line.event is not None and line.event.kind == "goal" and line.event.id is not None:

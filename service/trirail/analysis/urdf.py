@@ -1,7 +1,8 @@
-"""Mechanism as URDF, drawn without meshes, with the joints of exported recordings.
+"""Description of the mechanism as URDF, with simple shapes instead of meshes.
 
-URDF allows only trees. Therefore the platform is the end of leg A, while the legs B and C end at their own cross
-slides. These meet the platform if the positions of all joints belong to one pose.
+The joints have the same names as in exported recordings. URDF allows only trees of links. Therefore the platform is
+attached only to leg A, and each of the legs B and C ends in a separate link at the platform's centre. The ends of all
+legs coincide if the positions of all joints belong to the same pose.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Vector = tuple[float, float]
 
 
 def document(name: str, geometry: Geometry, limits: Limits) -> str:
-    """Return the URDF of a robot with its links, its joints and their limits [m, rad]."""
+    """Return the URDF document of a robot, with its links, its joints and the limits of the joints [m, rad]."""
     robot = ET.Element("robot", name=name)
     for colour, rgba in COLOURS.items():
         ET.SubElement(ET.SubElement(robot, "material", name=colour), "color", rgba=rgba)
@@ -40,7 +41,7 @@ def document(name: str, geometry: Geometry, limits: Limits) -> str:
 
 
 def _add_leg(robot: ET.Element, leg: AnyLeg, side: str, travel: Vector, velocity: float, limits: Limits) -> None:
-    """Add the three joints of a leg: the slider, then the pivot and the cross slide in the order of its mechanism."""
+    """Add the three joints of a leg: first the slider, then pivot and cross slide in the order of the mechanism."""
     cross = leg.crossing
     start = leg.anchor[0] + leg.home * math.cos(leg.rail_angle), leg.anchor[1] + leg.home * math.sin(leg.rail_angle)
     carriage, turned, slid = f"carriage_{side}", f"pivot_link_{side}", f"cross_link_{side}"
@@ -61,7 +62,7 @@ def _add_leg(robot: ET.Element, leg: AnyLeg, side: str, travel: Vector, velocity
     _add_link(robot, turned)
     low, high = limits.slider.passive
     _draw(_add_link(robot, slid), "box", _box(high - low, SLIDE_M, SLIDE_M), (-(low + high) / 2.0, 0.0), 0.0, side)
-    # Each leg ends at the platform's centre, but only leg A carries the platform.
+    # Each leg ends at the platform's centre, but only leg A is connected to the platform.
     target = PLATFORM if side == "a" else f"centre_{side}"
     if target != PLATFORM:
         _add_link(robot, target)
@@ -81,9 +82,9 @@ def _add_joint(
     angle: float,
     limit: tuple[float, float, float] | None = None,
 ) -> None:
-    """Add a joint between two links, at a position and direction in the first link.
+    """Add a joint between two links, given its position and its direction in the frame of the first link.
 
-    `limit` contains the lower limit, the upper limit and the velocity limit.
+    `limit` contains the lower position limit, the upper position limit and the velocity limit.
     """
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=links[0])

@@ -1,1 +1,1 @@
-"""The service's processes and their use of the system: supervisor, loop, gateway, recording."""
+"""Processes of the service (supervisor, loop, planner, gateway, recorder), and their use of the operating system."""

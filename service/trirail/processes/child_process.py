@@ -1,6 +1,7 @@
-"""Entry point of each child process, and its messages to the supervisor.
+"""Entry point of each child process, and the messages that a child sends to the supervisor.
 
-The messages are lines of JSON: names of functions being compiled, one ready message, events for the log, measurements.
+Each message is a line of JSON. A child sends the names of functions that are being compiled, one ready message, events
+for the log, and measurements.
 """
 
 from __future__ import annotations
@@ -30,23 +31,23 @@ from trirail.wire.messages import Event
 from trirail.wire.plan_packets import Overtaken, decode_plan_request, encode
 
 COMPILING = "compiling"
-"""Key of a function that is being compiled."""
+"""Key of a message with the name of a function that is being compiled."""
 HAPPENED = "happened"
-"""Key of an event, for the service's log."""
+"""Key of a message with an event for the service's log."""
 MEASURED = "measured"
-"""Key of a process's measurements, for the metrics."""
+"""Key of a message with measurements for the metrics."""
 LOG_WITHIN = 0.05
-"""Time after which a log line is dropped because the supervisor's own output is blocked [s]."""
+"""Time after which a log line is dropped if the pipe is full because the supervisor's output is blocked [s]."""
 DRIVES: Final = "drives"
-"""Name of the simulated drives' process, and of its socket in the service's folder of sockets."""
+"""Name of the process of the simulated drives, and of the socket of that process in the service's runtime folder."""
 DRIVES_WITHIN: Final = 60.0
-"""Longest wait for the socket of the simulated drives [s]."""
+"""Maximum time to wait for the socket of the simulated drives [s]."""
 LOOK_EVERY: Final = 0.005
-"""Interval of the checks for that socket [s]."""
+"""Interval between checks for the socket of the simulated drives [s]."""
 
 
 class Child:
-    """Context of a child process, with its link to the supervisor."""
+    """Everything that a child process needs to run, including the pipe to the supervisor."""
 
     def __init__(
         self, name: str, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int], voice: int
@@ -56,34 +57,34 @@ class Child:
         self.runtime = runtime
         self.heartbeats = heartbeats
         self.sockets = sockets
-        """Sockets that the loop listens on."""
-        # Stays open until the process ends: the supervisor detects the end by the closed pipe.
+        """Sockets on which the loop listens."""
+        # The pipe stays open until the process ends. The closed pipe shows the supervisor that the process has ended.
         self._pipe = voice
 
     def report_ready(self, content: object) -> None:
-        """Report that the process is up.
+        """Report to the supervisor that the process has started.
 
-        The process sends its first heartbeat before this message, so that a hang right after the message is detected.
+        The first heartbeat is sent before this message, so that a hang immediately after the message is detected.
         """
         if self.name in PROCESSES:
             self.heartbeats.heart(self.name).beat()
         self._send(content)
 
     def _send(self, content: object) -> None:
-        with suppress(BrokenPipeError):  # the supervisor was killed; the loop ends by itself, then the others
+        with suppress(BrokenPipeError):  # the supervisor was killed: first the loop, then the other processes will end
             os.write(self._pipe, msgspec.json.encode(content) + b"\n")
 
     def report_compiling(self, function: str) -> None:
-        """Report the function that is being compiled."""
+        """Report to the supervisor that a function is being compiled."""
         self._send({COMPILING: function})
 
     def log(self, event: Event) -> None:
-        """Report an event."""
+        """Send an event to the supervisor for the log; drop the event if the pipe is full for LOG_WITHIN."""
         if select.select([], [self._pipe], [], LOG_WITHIN)[1]:
             self._send({HAPPENED: event})
 
     def report_measurements(self, content: msgspec.Struct) -> None:
-        """Report measurements, or drop them if the pipe is full; new ones follow in a second."""
+        """Send measurements to the supervisor; drop them if the pipe is full, because new ones follow in a second."""
         line = msgspec.json.encode({MEASURED: content}) + b"\n"
         if len(line) <= select.PIPE_BUF and select.select([], [self._pipe], [], 0.0)[1]:
             with suppress(BrokenPipeError):
@@ -100,7 +101,8 @@ def run(child: Child) -> int:
 
 
 def _run(child: Child) -> int:
-    # Each process imports what it needs and no more: the loop must not load Zenoh or Rerun, the gateway no mathematics.
+    # Each process imports only the modules that it needs: the loop must not load Zenoh or Rerun, and the gateway must
+    # not load the mathematics.
     name, config = child.name, child.order.config
     if name in ("loop", "planner"):
         from trirail.kinematics.compiled import on_compile
@@ -132,14 +134,14 @@ def _run(child: Child) -> int:
 
 
 def _plan(child: Child) -> int:
-    """Run the planner: answer the loop's requests, one at a time, until the loop has ended.
+    """Run the planner, which answers the loop's requests one at a time until the loop has ended.
 
-    The planner never runs on the loop's processor. It has no state, so it can be killed at any time.
+    The planner never runs on the loop's processor. It has no state, so that it can be killed at any time.
     """
     from trirail.motion.motion_planner import MotionPlanner
 
     def beat() -> None:
-        if serving:  # the first start compiles in its warm-up
+        if serving:  # no beats during the warm-up, in which the first start compiles
             heart.beat()
             if poll.poll(0):
                 raise Overtaken
@@ -158,7 +160,7 @@ def _plan(child: Child) -> int:
         while True:
             heart.beat()
             poll.poll(BEAT_EVERY * 1e3)
-            newest = None  # no process waits for earlier requests any more
+            newest = None  # only the newest request is planned, because nothing waits for earlier requests
             while (packet := link.receive()) is not None:
                 newest = packet
             if newest is not None:
@@ -172,8 +174,8 @@ def _plan(child: Child) -> int:
 def _serve_drives(child: Child) -> int:
     """Run the simulated drives until the loop has ended.
 
-    The loop reaches them over a bus between processes, as it reaches real drives over CAN. They have no state, so they
-    can be killed once the loop has ended.
+    The loop communicates with the simulated drives over a bus between processes, in the same way as with real drives
+    over CAN. The process has no state to save, so that it can be killed once the loop has ended.
     """
     from trirail_drivers.connection.serving import serve
 
@@ -184,7 +186,7 @@ def _serve_drives(child: Child) -> int:
         child.report_ready({"lacking": lacking})
 
     def connected() -> None:
-        # On SIGTERM the loop stops the robot first; this process ends when the loop disconnects.
+        # On SIGTERM, the loop first stops the robot. This process must run until the loop disconnects.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
     serve(child.runtime / DRIVES, config.can, config.drives, begin, connected)
@@ -192,9 +194,10 @@ def _serve_drives(child: Child) -> int:
 
 
 def _bus(can: Can, drives: Path) -> Can:
-    """Return the loop's [can] section; for simulated drives, wait for their process and return its socket.
+    """Return the [can] section that the loop is to use.
 
-    Raises ServiceError if the socket does not appear within DRIVES_WITHIN.
+    For simulated drives, wait for the socket of their process and return a section that refers to that socket. Raises
+    ServiceError if the socket does not appear within DRIVES_WITHIN.
     """
     if can.interface != "simulated":
         return can

@@ -1,8 +1,9 @@
-"""Fixed-rate ticks on absolute deadlines of the monotonic clock; messages that arrive during a wait end it early.
+"""Ticks of the loop at a fixed rate, on absolute deadlines of the monotonic clock.
 
-A neighbour is a process connected to the loop; it calls by sending a packet or by disconnecting. A call that arrives
-early enough before the deadline is served immediately, not a cycle later. The wait is compiled, and used by the Python
-cycle and the compiled one alike.
+A message that arrives while the loop waits for its next tick ends the wait early. A neighbour is a process that is
+connected to the loop. A neighbour calls when it sends a packet or disconnects. If a call arrives early enough before
+the deadline, the loop serves the call immediately instead of in the next cycle. The wait is compiled, and is used both
+by cycles in Python and by cycles in compiled code.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _ppoll: Any = types.ExternalFunction("ppoll", i4(types.intp, u8, types.intp, typ
 
 POLLFDS = i4[:, ::1]
 SPARE_NS: Final = 500_000
-"""Time that Python needs to serve a call [ns]; with less time before the deadline, a call waits for the next cycle."""
+"""Time that Python needs to serve a call [ns]. If less time is left before the deadline, the next cycle serves it."""
 _MONOTONIC: Final = 1
 _ABSOLUTE: Final = 1
 """TIMER_ABSTIME of clock_nanosleep(2)."""
@@ -38,14 +39,14 @@ _SECOND: Final = 1_000_000_000
 
 @compiled()
 def now_ns(moment: NDArray[np.int64]) -> int:
-    """Return the time of the monotonic clock [ns]; `moment` (2,) is room for a struct timespec."""
+    """Return the time of the monotonic clock [ns]; `moment` (2,) is memory for a struct timespec."""
     _clock_gettime(_MONOTONIC, moment.ctypes.data)
     return int(moment[0] * _SECOND + moment[1])
 
 
 @compiled()
 def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
-    """Sleep until the deadline and resume after interruptions; `moment` is as in `now_ns`."""
+    """Sleep until the deadline, even if signals interrupt the sleep; `moment` is the same as for `now_ns`."""
     moment[0], moment[1] = deadline_ns // _SECOND, deadline_ns % _SECOND
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, moment.ctypes.data, 0) == _INTERRUPTED:
         pass
@@ -53,25 +54,25 @@ def sleep(deadline_ns: int, moment: NDArray[np.int64]) -> None:
 
 @compiled(b1(POLLFDS))
 def called(pollfds: NDArray[np.int32]) -> bool:
-    """Return whether a neighbour has called; `pollfds` (n, 2) is an array of struct pollfd."""
+    """Return True if a neighbour has called; `pollfds` (n, 2) is an array of struct pollfd."""
     return bool(_poll(pollfds.ctypes.data, np.uint64(len(pollfds)), 0) != 0)
 
 
 @compiled(b1(i8, POLLFDS, i8[::1]), releases=True)
 def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]) -> bool:
-    """Wait for the deadline or for a call more than SPARE_NS before it; return whether there is a call.
+    """Wait for the deadline, or for a call more than SPARE_NS before the deadline. Return True if there is a call.
 
     Parameters
     ----------
     deadline_ns : int
         Time of the monotonic clock [ns].
     pollfds : (n, 2)
-        Sockets of the neighbours, as in `called`.
+        Sockets of the neighbours, as for `called`.
     moment : (2,)
-        Room for a struct timespec.
+        Memory for a struct timespec.
 
     """
-    # Two separate waits: one ppoll that watches the sockets until the deadline wakes up later than clock_nanosleep.
+    # There are two separate waits, because ppoll wakes up later after its time-out than clock_nanosleep.
     left = deadline_ns - SPARE_NS - now_ns(moment)
     while left > 0:
         moment[0], moment[1] = left // _SECOND, left % _SECOND
@@ -83,7 +84,7 @@ def wait(deadline_ns: int, pollfds: NDArray[np.int32], moment: NDArray[np.int64]
 
 
 class PollSet:
-    """Sockets of the neighbours, to poll in compiled code."""
+    """Sockets of the neighbours, in an array that compiled code can poll."""
 
     def __init__(self, ports: Sequence[Port]) -> None:
         self._ports = ports
@@ -92,17 +93,17 @@ class PollSet:
         self._moment = np.zeros(2, np.int64)
 
     def refresh(self) -> None:
-        """Update the array with the present connections."""
+        """Update the array with the descriptors of the present connections."""
         for pollfd, port in zip(self.pollfds, self._ports, strict=True):
             pollfd[:] = port.fileno(), _POLLIN
 
     def called(self) -> bool:
-        """Return whether a neighbour calls."""
+        """Return True if a neighbour has called."""
         self.refresh()
         return bool(called(self.pollfds))
 
     def wait(self, deadline_ns: int) -> bool:
-        """Wait for the deadline or an early call, like the function `wait`."""
+        """Wait for the deadline or for an early call, like the function `wait`. Return True if there is a call."""
         self.refresh()
         return bool(wait(deadline_ns, self.pollfds, self._moment))
 
@@ -119,7 +120,7 @@ class Tick(NamedTuple):
 
 
 class Overruns:
-    """Counter of missed ticks, with a limit `allowed` on consecutive ones."""
+    """Counter of missed ticks. `allowed` is the maximum number of consecutive missed ticks that is tolerated."""
 
     def __init__(self, allowed: int) -> None:
         self.allowed = allowed
@@ -129,7 +130,10 @@ class Overruns:
         """Number of consecutive missed ticks, up to the newest tick."""
 
     def too_many(self, missed: int) -> int:
-        """Count the ticks missed before a tick; return the consecutive ones if they exceed the limit, else 0."""
+        """Count the ticks that were missed before the present tick.
+
+        Return the number of consecutive missed ticks if it exceeds `allowed`, and start counting again; else return 0.
+        """
         self.all += missed
         in_a_row = self.in_a_row + missed if missed else 0
         self.in_a_row = in_a_row if in_a_row <= self.allowed else 0
@@ -137,14 +141,14 @@ class Overruns:
 
 
 def sleep_until(deadline_ns: int) -> None:
-    """Sleep to an absolute time of the monotonic clock."""
+    """Sleep until an absolute time of the monotonic clock [ns]."""
     remaining = deadline_ns - time.monotonic_ns()
     if remaining > 0:
-        time.sleep(remaining * 1e-9)  # CPython sleeps to an absolute deadline: clock_nanosleep, TIMER_ABSTIME
+        time.sleep(remaining * 1e-9)  # CPython converts this to an absolute deadline: clock_nanosleep, TIMER_ABSTIME
 
 
 class Ticker:
-    """Source of ticks every `period_ns`; a missed tick is skipped and counted, never caught up in a burst."""
+    """Source of a tick every `period_ns`. Missed ticks are skipped and counted; no burst of ticks follows."""
 
     def __init__(
         self,
@@ -156,12 +160,12 @@ class Ticker:
         self._now = now
         self._sleep = sleep
         self.deadline_ns = now()
-        """Time at which the newest tick was due."""
+        """Time at which the newest tick was due [ns]."""
 
     def sleep_if_injected(self) -> int:
-        """Sleep until the next deadline of an injected clock, and return its time [ns].
+        """If the clock was injected, sleep until the next deadline and return the time of the clock [ns].
 
-        Return -1 immediately for the machine's clock, since compiled code waits for that clock itself.
+        With the machine's own clock, return -1 immediately, because compiled code waits for that clock itself.
         """
         if self._now is time.monotonic_ns:
             return -1
@@ -169,14 +173,14 @@ class Ticker:
         return self._now()
 
     def listen(self, poll_set: PollSet) -> bool:
-        """Wait for the next deadline or an early call; return whether there is a call."""
+        """Wait for the next deadline or for an early call. Return True if there is a call."""
         if self._now is time.monotonic_ns:
             return poll_set.wait(self.deadline_ns + self._period_ns)
         self._sleep_to_next()
         return poll_set.called()
 
     def wait(self) -> Tick:
-        """Sleep until the next deadline, skipping those missed by a whole period or more."""
+        """Sleep until the next deadline and return its tick. Skip ticks that were missed by a whole period or more."""
         self._sleep_to_next()
         self.deadline_ns += self._period_ns
         return self.tick()

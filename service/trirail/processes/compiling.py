@@ -1,6 +1,6 @@
 """Compilation of the numerical functions at the first start, with progress reports.
 
-`python -m trirail.processes.compiling` compiles everything ahead of the first start.
+`python -m trirail.processes.compiling` compiles all functions before the first start.
 """
 
 from __future__ import annotations
@@ -12,13 +12,16 @@ from trirail.processes.operating_system import notify
 from trirail.processes.realtime import release_startup_memory
 
 LAST_MODULE = "trirail.processes.loop_process"
-"""Module imported last: once it is loaded, all compiled modules are."""
+"""Module that is imported last. Once it has been imported, all modules with compiled functions have been imported."""
 QUARTERS = 4
-"""Number of progress reports."""
+"""Number of parts of the compilation, with one progress report for each."""
 
 
 class Progress:
-    """Progress of the compilation, reported to users and to systemd, which waits for the service meanwhile."""
+    """Progress of the compilation, reported to users and to systemd.
+
+    The reports extend the time that systemd waits for the service to start.
+    """
 
     def __init__(self, say: Callable[[str], None], patience: float) -> None:
         self._say = say
@@ -27,15 +30,15 @@ class Progress:
 
     @property
     def interrupted(self) -> str:
-        """Consequence of interrupting the start now, for people."""
+        """Message for a user who interrupts the start, which explains the consequence."""
         if not self._begun:
             return "the start is interrupted, nothing has moved"
         place = len(self._begun)
         return f"compiling is interrupted at function {place}: those before it are kept, the next start continues there"
 
     def begin(self, name: str) -> None:
-        """Report that a function is being compiled; the next report may take up to the patience [s]."""
-        from trirail.kinematics.compiled import FUNCTIONS  # with numba, which a start without compiling does not need
+        """Report that a function is being compiled. The next report must follow within `patience` seconds."""
+        from trirail.kinematics.compiled import FUNCTIONS  # imports numba, which is not needed if nothing is compiled
 
         before = len(self._begun)
         self._begun.add(name)
@@ -49,14 +52,18 @@ class Progress:
 
 
 class NotKeptError(Exception):
-    """Raised when a function is not in the cache and would have to be compiled."""
+    """Error raised if a function is not in the cache and would have to be compiled."""
 
 
 def load() -> bool:
-    """Import the compiled modules, which takes a second; return False if a function is not in the cache."""
+    """Import the modules with compiled functions, which takes a second.
+
+    Return True if all functions were in the cache, and False as soon as a function is missing.
+    """
     if LAST_MODULE in sys.modules:
         return True
-    # numba imports scipy if it is installed, 0.15 s and 10 MB, for linear algebra that no compiled function here uses.
+    # numba imports scipy if it is installed. That costs 0.15 s and 10 MB, and is only needed for linear algebra that no
+    # compiled function here uses.
     sys.modules.setdefault("scipy", None)  # type: ignore[arg-type]
     from trirail.kinematics.compiled import compile_no_more, on_compile
 
@@ -74,7 +81,7 @@ def load() -> bool:
 
 
 def compile_all(begin: Callable[[str], None]) -> None:
-    """Compile the functions that are not in the cache; call `begin` with the name of each one first."""
+    """Compile the functions that are not in the cache. Call `begin` with the name of each function beforehand."""
     from trirail.kinematics.compiled import on_compile
 
     on_compile(begin)

@@ -1,9 +1,9 @@
-"""Compiled exchange of a cycle's CAN frames: send, receive, recognise expected frames, encode setpoints.
+"""Compiled functions that exchange the CAN frames of a cycle.
 
-The code does not know any drive protocol. It uses only the tables of trirail_drivers.driver.cyclic, which each driver
-fills: `axes` (3,) of AXIS, `expected` (n,) of EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct
-can_frame`. Frames are sent and received by libc on the socket of the bus, or by Python functions if the bus has no
-socket.
+They send and receive frames, recognise expected frames and encode setpoints. The functions do not depend on any drive
+protocol. They use only the tables of trirail_drivers.driver.cyclic, which each driver fills: `axes` (3,) of AXIS,
+`expected` (n,) of EXPECTED, `times` (1,) of TIMES, and frames (n, 16) as `struct can_frame`. Frames are sent and
+received by libc on the socket of the bus. If the bus has no socket, Python functions send and receive the frames.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ memcpy: Any = types.ExternalFunction("memcpy", types.intp(types.intp, types.intp
 _NOTHING_THERE: Final = 11
 """EAGAIN of errno.h."""
 _PERSISTENT_ERROR: Final = -1
-"""Error that the next call returns again: the other end has disconnected, or Python has stored an exception."""
+"""Error that the next call would return again. The other end has disconnected, or Python has stored an exception."""
 _FLAGS: Final = 0x40 | 0x4000
-"""MSG_DONTWAIT, MSG_NOSIGNAL."""
+"""MSG_DONTWAIT and MSG_NOSIGNAL of sys/socket.h."""
 _FRAME: Final = CAN_FRAME.size
 
 
 def _call(_typing: Any, _address: Any, _frames: Any, _number: Any) -> Any:
-    """Compile a call of the function at an address with two numbers, which returns one."""
+    """Generate code that calls the function at an address with two 64-bit integers and returns its integer result."""
 
     def build(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         word = ir.IntType(64)
@@ -70,9 +70,9 @@ def receive_frames(
     Parameters
     ----------
     bus : (3,)
-        A BusAccess.
+        BusAccess of the bus.
     headers, frames
-        Arrays of PackedFrames, with room for MOST_FRAMES.
+        Arrays of a PackedFrames with space for MOST_FRAMES frames.
     scratch : (1,)
         Scratch space.
 
@@ -81,7 +81,8 @@ def receive_frames(
     number : int
         Number of frames received.
     error : int
-        Error after them, a number of errno.h; 0 for none, negative for one that the next call returns again.
+        Error after the received frames, as a number of errno.h; 0 if there is none, and negative if the next call would
+        return the error again.
 
     """
     if bus[0] < 0:
@@ -102,7 +103,10 @@ def receive_frames(
 def send_frames(
     bus: NDArray[np.int64], headers: NDArray[np.uint64], frames: NDArray[np.uint8], times: NDArray[np.void]
 ) -> int:
-    """Send frames of PackedFrames and count their bits; return the number accepted before the first refused one."""
+    """Send the frames of a PackedFrames, and count the bits of the accepted frames as traffic.
+
+    Return the number of frames that were accepted before the first refused frame.
+    """
     if len(headers) == 0:
         return 0
     if bus[0] < 0:
@@ -116,7 +120,7 @@ def send_frames(
 
 @compiled()
 def _number(frame: NDArray[np.uint8], at: int, size: int) -> int:
-    """Return the unsigned little-endian number of `size` bytes."""
+    """Return the unsigned little-endian number of `size` bytes at offset `at`."""
     number = np.int64(0)
     for i in range(size):
         number |= np.int64(frame[at + i]) << (8 * i)
@@ -125,15 +129,16 @@ def _number(frame: NDArray[np.uint8], at: int, size: int) -> int:
 
 @compiled()
 def _signed(number: int) -> int:
-    """Return 32 bits as a signed number."""
+    """Convert an unsigned 32-bit number to the signed number with the same bits."""
     return number - (1 << 32) if number >> 31 else number
 
 
 @compiled()
 def _answers_in_time(axis: Any) -> bool:
-    """Count a position as the answer to a SYNC, as trirail_drivers.driver.axis.Answers.answer does.
+    """Count a received position as the answer to a SYNC, like trirail_drivers.driver.axis.Answers.answer.
 
-    Return False, and count nothing, for a second answer to the same SYNC, or after a late or lost answer.
+    Return True if it was counted. Return False, and count nothing, if the SYNC was answered before, or if an answer was
+    late or lost.
     """
     to_the_one_before = not axis.between and not axis.prompt and axis.sampled < axis.syncs - 1
     sampled = axis.syncs - to_the_one_before
@@ -146,7 +151,7 @@ def _answers_in_time(axis: Any) -> bool:
 
 @compiled()
 def _accept_counts(axis: Any, counts: int, now: float) -> bool:
-    """Store a position [counts]; return False, and change nothing, if it is not an answer in time."""
+    """Store a position [counts]. Return False, and change nothing, if it did not arrive in time."""
     if not _answers_in_time(axis):
         return False
     if abs(counts - axis.stands_at) > axis.still:
@@ -162,7 +167,7 @@ def _accept_counts(axis: Any, counts: int, now: float) -> bool:
 
 @compiled()
 def _accept_turns(axis: Any, turns: float) -> bool:
-    """Store a position [turns]; return False, and change nothing, if it is not finite or not an answer in time."""
+    """Store a position [turns]. Return False, and change nothing, if it is not finite or did not arrive in time."""
     if not math.isfinite(turns) or not _answers_in_time(axis):
         return False
     axis.position = turns / axis.counts_per_metre + axis.zero
@@ -178,15 +183,15 @@ def process_frames(
     times: NDArray[np.void],
     now: float,
 ) -> int:
-    """Process received frames up to the first unexpected one; return the number processed.
+    """Process received frames up to the first unexpected frame; return the number of processed frames.
 
-    A frame is unexpected if its identifier, length or masked data match no row of `expected`, or if its position is not
-    an answer in time. The caller passes it and the frames after it to Python.
+    A frame is unexpected if its identifier, its length or its masked data match no row of `expected`, or if its
+    position did not arrive in time. The caller passes the unexpected frame and all later frames to Python.
 
     Parameters
     ----------
     frames : (n, 16)
-        Frames, the first `number` of them received.
+        Frames, of which the first `number` have been received.
     now : float
         Time of reception [s].
 
@@ -223,7 +228,7 @@ def process_frames(
 
 @compiled()
 def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
-    """Record that the SYNC has been sent, with the setpoints that waited for it."""
+    """Record that the SYNC has been sent, and that setpoints which take effect at a SYNC are now in force."""
     for i in range(3):
         axis = axes[i]
         axis.syncs += 1
@@ -238,9 +243,9 @@ def begin_cycle(axes: NDArray[np.void], history: Array) -> None:
 
 @compiled(i8(AXES, TIMINGS, f8[:, ::1], f8))
 def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, now: float) -> int:
-    """Record that a cycle's frames have arrived, if every drive has sent all its frames and follows its setpoints.
+    """Conclude the reading of a cycle's frames if every drive has sent all its frames and follows its setpoints.
 
-    Return whether that is the case; otherwise do nothing.
+    Return True in that case; otherwise change nothing and return False.
     """
     for i in range(3):
         axis = axes[i]
@@ -262,14 +267,17 @@ def end_read(axes: NDArray[np.void], times: NDArray[np.void], history: Array, no
 
 @compiled()
 def _put(frame: NDArray[np.uint8], at: int, number: int, size: int) -> None:
-    """Write `size` bytes, little-endian."""
+    """Write a number as `size` little-endian bytes at offset `at` of a frame's data."""
     for i in range(size):
         frame[DATA_AT + at + i] = (number >> (8 * i)) & 0xFF
 
 
 @compiled(i8(FRAMES, AXES, f8[:, ::1]))
 def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -> int:
-    """Write setpoints, rows of positions [m] and velocities [m/s], into frames; return False if one does not fit."""
+    """Write setpoints into frames. `sent` has a row of positions [m] and a row of velocities [m/s].
+
+    Return False if a setpoint is outside the range of its field in the frame.
+    """
     for i in range(3):
         axis = axes[i]
         counts = axis.counts_per_metre * (sent[0, i] - axis.zero)
@@ -296,7 +304,10 @@ def set_frames(frames: NDArray[np.uint8], axes: NDArray[np.void], sent: Array) -
 
 @compiled()
 def needs_python(axes: NDArray[np.void], words: NDArray[np.int64]) -> bool:
-    """Return whether an output has changed on a drive that accepts outputs only by SDO; `words` (3,) are 60FEh."""
+    """Return True if an output has changed on a drive that accepts outputs only by SDO, which Python sends.
+
+    `words` (3,) are the values of the drives' object 60FEh.
+    """
     for i in range(3):
         axis = axes[i]
         if axis.has_outputs and not axis.maps_outputs and words[i] != axis.outputs_sent:
@@ -312,9 +323,9 @@ def send_outputs(
     axes: NDArray[np.void],
     times: NDArray[np.void],
 ) -> bool:
-    """Send the changed outputs, each in the frame of its drive; return whether the bus has accepted all.
+    """Send the outputs that have changed, in one frame per drive. Return True if the bus has accepted all frames.
 
-    `headers` and `frames` are arrays of PackedFrames with one frame per drive, or empty.
+    `headers` and `frames` are the arrays of a PackedFrames with one frame per drive, or are empty.
     """
     for i in range(len(headers)):
         axis = axes[i]
@@ -341,14 +352,14 @@ def exchange_frames(
     lateness: NDArray[np.int64],
     work: NDArray[np.int64],
 ) -> int:
-    """Run cycles that exchange frames without computing, to measure the machine; return the number of frames received.
+    """Run cycles that only exchange frames, to measure the speed of the machine; return the number of received frames.
 
     Parameters
     ----------
     lateness : (n,)
-        Delay of each cycle's start, including the ticks missed before it [ns].
+        Receives the delay of each cycle's start, including the ticks that were missed before it [ns].
     work : (n,)
-        Time from there until the setpoints of each cycle were sent [ns].
+        Receives the time from each cycle's start until its setpoints were sent [ns].
 
     """
     number, deadline_ns = 0, now_ns(moment)

@@ -1,10 +1,12 @@
-"""Fork server: imports the modules that the service's processes share, once, and forks the processes from itself.
+"""Fork server, which imports the shared modules of the service's processes once and forks all of these processes.
 
-The supervisor forks the fork server before it starts a thread, so that shared modules are in memory once. Over a
-SEQPACKET socket the fork server receives requests (`Fork`, with the descriptor for the child's messages), and reports
-each start (`ChildStart`, with a pidfd) and each end (`ChildEnd`). The fork server must not have other threads, since
-fork(2) copies only the calling one. The children that need Zenoh and Rerun therefore import them themselves, because
-both start threads. The fork server compiles nothing; a child compiles the functions that are not in the cache.
+The supervisor forks the fork server before the supervisor starts a thread. Shared modules are therefore in memory only
+once. Over a SEQPACKET socket, the fork server receives requests (`Fork`, with a descriptor for the child's messages).
+The fork server reports each start (`ChildStart`, with a pidfd) and each end (`ChildEnd`) of a child.
+
+The fork server must have only one thread, because fork(2) copies only the calling thread. Zenoh and Rerun start
+threads, and are therefore imported only by the children that need them. The fork server itself compiles nothing. A
+special child compiles the functions that are not in the cache.
 """
 
 from __future__ import annotations
@@ -32,20 +34,23 @@ from trirail.processes.realtime import die_with_parent, name_process
 from trirail.wire.decoding import decoded, prepare
 
 MATHEMATICS = ("loop", "drives", "planner")
-"""Processes that need the compiled modules; the others are forked before these modules are imported."""
+"""Processes that need the compiled modules. The other processes do not wait until these modules are imported."""
 WITH_PARENT: Final = {"loop": signal.SIGTERM, "drives": signal.SIGTERM, "planner": signal.SIGKILL}
-"""Signal that the kernel sends to a child when this process ends. Gateway and recorder have none: they end by
-themselves after the loop, once its last messages are published and on disk."""
+"""Signal that the kernel sends to each child when the fork server ends.
+
+Gateway and recorder receive no signal. They end by themselves after the loop, once the loop's last messages have been
+published and written to disk.
+"""
 TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
-"""Signals that a terminal sends to all of its processes, on Ctrl-C and when it closes."""
+"""Signals that a terminal sends to all of its processes: on Ctrl-C, and when the terminal is closed."""
 ALLOCATOR_ENVIRONMENT: Final = {"MIMALLOC_ARENA_EAGER_COMMIT": "0"}
 """Environment for Rerun's allocator, so that it does not reserve memory in advance."""
 MAX_PACKET_BYTES = 4096
-"""Largest packet on the control socket [bytes]."""
+"""Maximum size of a packet on the control socket [bytes]."""
 
 
 class Fork(msgspec.Struct, frozen=True):
-    """Request to fork the child `name`; `number` is unique, `record` and `again` are as in Order."""
+    """Request to fork the child `name`. `number` is unique; `record` and `again` are the same as in Order."""
 
     number: int
     name: str
@@ -54,14 +59,17 @@ class Fork(msgspec.Struct, frozen=True):
 
 
 class ChildStart(msgspec.Struct, frozen=True, tag=True):
-    """Start of the child of request `number` as process `pid`; its pidfd comes with the packet."""
+    """Report that the child of request `number` has started as process `pid`. The packet also transfers its pidfd."""
 
     number: int
     pid: int
 
 
 class ChildEnd(msgspec.Struct, frozen=True, tag=True):
-    """End of the child of request `number`: its exit code, or the negative number of the signal that killed it."""
+    """Report that the child of request `number` has ended.
+
+    `code` is the exit code of the child, or the negative number of the signal that killed it.
+    """
 
     number: int
     code: int
@@ -83,18 +91,18 @@ class ForkServer:
         self._inherited = inherited
         self._control = inherited.control
         self._requests: list[_Request] = []
-        """Requests for children that have not been forked yet."""
+        """Requests whose children have not been forked yet."""
         self._children: dict[int, int] = {}
-        """Request number of each child, by its pidfd."""
+        """Number of the request of each child, by the pidfd of the child."""
         self._compiler: tuple[int, _Request] | None = None
-        """Pidfd of the compiling child, if any, and the request that needs the compilation."""
+        """Pidfd of the child that compiles, and the request that needs the compilation; None if no child compiles."""
         self._cache_works = True
-        """False if compiled code cannot be cached: each child then compiles for itself."""
+        """False if compiled code cannot be cached. Each child must then compile the functions for itself."""
         self._poll = select.poll()
         self._poll.register(self._control, select.POLLIN)
 
     def serve(self, work: Callable[[Child], int]) -> None:
-        """Serve until the supervisor disconnects; `work` runs a child and returns its exit code."""
+        """Serve requests until the supervisor disconnects. `work` is run in each child, and returns the exit code."""
         while True:
             for descriptor, _ in self._poll.poll():
                 if descriptor != self._control.fileno():
@@ -108,7 +116,7 @@ class ForkServer:
                 self._done(request)
 
     def _receive(self) -> bool:
-        """Receive a request; return False once the supervisor has disconnected."""
+        """Receive a request. Return False if the supervisor has disconnected."""
         try:
             packet, descriptors, _, _ = socket.recv_fds(self._control, MAX_PACKET_BYTES, 1)
         except ConnectionError:
@@ -118,7 +126,7 @@ class ForkServer:
         return bool(packet)
 
     def _can_be_met(self, request: _Request) -> bool:
-        """Return whether the child can be forked now; otherwise it must wait for the compilation."""
+        """Return True if the child can be forked now. Otherwise, start the compilation, for which it must wait."""
         if request.fork.name not in MATHEMATICS or not self._cache_works:
             return True
         if self._compiler is None and not compiling.load():
@@ -133,9 +141,12 @@ class ForkServer:
     def _fork(
         self, request: _Request, work: Callable[[Child], int], with_parent: signal.Signals | None
     ) -> tuple[int, int]:
-        """Fork a child; return its pidfd and process id. The kernel sends it the signal `with_parent` when we end."""
+        """Fork a child; return its pidfd and its process id.
+
+        If `with_parent` is given, the kernel sends this signal to the child when the fork server ends.
+        """
         parent = os.getpid()
-        gc.freeze()  # a child's collector would touch, and so copy, memory shared with this process
+        gc.freeze()  # otherwise, a child's garbage collector would write to shared memory pages, and thereby copy them
         pid = os.fork()
         if pid == 0:
             if with_parent is not None:
@@ -148,7 +159,7 @@ class ForkServer:
         return pidfd, pid
 
     def _become(self, request: _Request, work: Callable[[Child], int]) -> NoReturn:
-        """Run as the child, after closing the descriptors of the other children."""
+        """Run the child's work in the forked process, after closing the descriptors of the other children."""
         code = 1
         try:
             name = request.fork.name
@@ -188,7 +199,7 @@ class ForkServer:
         try:
             socket.send_fds(self._control, [msgspec.json.encode(what)], descriptors)
         except ConnectionError:
-            return  # the supervisor has disconnected; the next read of the socket reports it
+            return  # the supervisor has disconnected, which the next read from the socket will show
 
 
 def _compile(child: Child) -> int:
@@ -204,14 +215,14 @@ class Inheritance(NamedTuple):
     runtime: Path
     heartbeats: Heartbeats
     sockets: list[int]
-    """Sockets that the loop listens on."""
+    """Sockets on which the loop listens."""
 
 
 def serve(inheritance: Inheritance, work: Callable[[Child], int] = run) -> None:
     """Run the fork server until the supervisor disconnects."""
     name_process("fork-server")
     die_with_parent(signal.SIGKILL)
-    # Only the supervisor acts on a terminal's signals; SIGTERM stays pending until the child unblocks it.
+    # Only the supervisor reacts to a terminal's signals. A SIGTERM stays pending until a child unblocks it.
     for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -225,7 +236,7 @@ def fork(inheritance: Inheritance) -> int:
     """Fork the fork server; return its process id. The calling process must have a single thread."""
     supervisor = os.getpid()
     gc.collect()
-    gc.freeze()  # garbage collection in either process would write to shared pages, and so copy them
+    gc.freeze()  # garbage collection in either process would write to shared memory pages, and thereby copy them
     sys.stdout.flush()
     sys.stderr.flush()
     pid = os.fork()
@@ -236,7 +247,7 @@ def fork(inheritance: Inheritance) -> int:
         signal.set_wakeup_fd(-1)
         _keep(inheritance.control.fileno(), inheritance.heartbeats.descriptor, *inheritance.sockets)
         if not sys.flags.safe_path:
-            del sys.path[0]  # no import from the current folder
+            del sys.path[0]  # prevent imports from the current folder
         if os.getppid() == supervisor:
             serve(inheritance)
         code = 0
@@ -247,10 +258,10 @@ def fork(inheritance: Inheritance) -> int:
 
 
 def _keep(*descriptors: int) -> None:
-    """Close all descriptors except these and the standard ones; connect standard input to /dev/null."""
+    """Close all descriptors except `descriptors` and the standard streams; connect standard input to /dev/null."""
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     for entry in os.listdir("/proc/self/fd"):
         if int(entry) not in (0, 1, 2, *descriptors):
-            with suppress(OSError):  # the descriptor of the listing itself is closed already
+            with suppress(OSError):  # the descriptor with which the folder was listed is already closed
                 os.close(int(entry))

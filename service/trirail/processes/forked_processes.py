@@ -1,6 +1,6 @@
-"""Supervisor's side of the fork server and of the processes that it forks.
+"""Supervisor's view of the fork server and of the children that the fork server forks.
 
-Each child writes its ready message and its measurements to a pipe, which closes when the child ends.
+Each child writes its messages to a pipe, which is closed when the child ends.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from trirail.wire.decoding import converted, decoded, prepare
 from trirail.wire.messages import Event
 
 END_REPORT_TIMEOUT_S = 1.0
-"""Longest wait for the fork server's report after a child has ended [s]."""
+"""Maximum time to wait for the fork server's report after a child has ended [s]."""
 IMPORT_TIMEOUT_S = 6.0
-"""The same time-out while the fork server may be importing the compiled modules [s]."""
+"""Maximum time to wait for the report while the fork server may be importing the compiled modules [s]."""
 EXIT_CODE_UNKNOWN = os.EX_UNAVAILABLE
-"""Exit code of a child whose end the fork server does not report; no child returns this code itself."""
+"""Exit code assumed for a child if the fork server does not report its end. No child returns this code itself."""
 
 prepare(ChildStart | ChildEnd)
 
 
 class ServerProcess:
-    """Process of the fork server, with the interface of Popen."""
+    """Process of the fork server, with methods like those of subprocess.Popen."""
 
     def __init__(self, inheritance: Inheritance) -> None:
         self._pid = fork(inheritance)
@@ -56,21 +56,21 @@ class ServerProcess:
         return self._code
 
     def kill(self) -> None:
-        """Kill the process, unless `wait` has returned."""
+        """Kill the process, unless `wait` has returned its exit code."""
         if self._code is None:
             os.kill(self._pid, signal.SIGKILL)
 
 
 class ForkServerLink:
-    """Link to the fork server: starts it, requests children, receives reports of their ends.
+    """Link to the fork server, which starts it, requests children and receives reports of their starts and ends.
 
-    The process that creates the link must have a single thread, since it forks.
+    The process that creates the link must have a single thread, because it forks.
     """
 
     def __init__(self, order: Order, runtime: Path, heartbeats: Heartbeats, sockets: list[int]) -> None:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
-        # Blocked across the fork: a terminal's signals must not end the server before it ignores them.
+        # Blocked during the fork, so that a terminal's signals cannot end the fork server before it ignores them.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
         with theirs:
             self._process = ServerProcess(Inheritance(theirs, order, runtime, heartbeats, sockets))
@@ -79,9 +79,9 @@ class ForkServerLink:
         self._numbers = 0
         self._hung_for = 0.0
         self.report_timeout = IMPORT_TIMEOUT_S
-        """Longest wait for the next message [s]; 0 after a wait that timed out."""
+        """Maximum time to wait for the next message [s]; 0 after a wait that timed out."""
         self.gone = False
-        """Whether the fork server has ended; the kernel has then sent SIGTERM to the loop."""
+        """True if the fork server has ended. The kernel has then sent SIGTERM to the loop."""
 
     def fileno(self) -> int:
         """Return the descriptor to pass to select."""
@@ -98,7 +98,7 @@ class ForkServerLink:
             self._on_end()
 
     def receive(self) -> None:
-        """Receive and process one message, or the end of the fork server, if any."""
+        """Process one message of the fork server or its end, without waiting. Do nothing if nothing has arrived."""
         try:
             packet, descriptors, _, _ = socket.recv_fds(self._control, MAX_PACKET_BYTES, 1)
         except BlockingIOError:
@@ -118,7 +118,7 @@ class ForkServerLink:
             self._requested.pop(message.number).ended(message.code)
 
     def wait_for_message(self) -> bool:
-        """Wait for the next message; return False on a time-out, after which later calls do not wait."""
+        """Wait for the next message. Return False on a time-out; later calls then do not wait."""
         heard = bool(select.select([self], [], [], self.report_timeout)[0])
         self.report_timeout = self.report_timeout if heard else 0.0
         return heard
@@ -128,11 +128,11 @@ class ForkServerLink:
         return describe_exit(self._process.wait(), self._hung_for)
 
     def kill(self) -> None:
-        """Kill the fork server; the loop, if there is one, stops the robot and ends."""
+        """Kill the fork server. If the loop is running, it then stops the robot and ends."""
         self._process.kill()
 
     def kill_hung(self, silent: float) -> None:
-        """Kill the fork server after `silent` seconds without an answer."""
+        """Kill the fork server, because it has not answered for `silent` seconds."""
         self._hung_for = silent
         self.kill()
 
@@ -149,7 +149,7 @@ class ForkServerLink:
 
 
 class ChildProcess:
-    """Child of the fork server, with the interface of Popen and a pipe for its messages."""
+    """Child of the fork server, with methods like those of subprocess.Popen and a pipe for the child's messages."""
 
     def __init__(self, parent: ForkServerLink, name: str, record: str | None, *, again: bool = False) -> None:
         self.name = name
@@ -157,9 +157,9 @@ class ChildProcess:
         self._pidfd: int | None = None
         self._killed = False
         self.pid: int | None = None
-        """Process id; None before the fork."""
+        """Process id; None until the child is forked."""
         self.returncode: int | None = None
-        """Exit code as in Popen; None before the end."""
+        """Exit code as in subprocess.Popen; None until the child has ended."""
         self.began = time.monotonic()
         self.compiling: list[str] = []
         self.events: list[Event] = []
@@ -186,25 +186,25 @@ class ChildProcess:
             self._pidfd = None
 
     def orphaned(self) -> None:
-        """Record that the fork server has ended, so that the end of this child will not be reported."""
+        """Note that the fork server has ended. A child that was not forked yet is then recorded as ended."""
         if self.pid is None and self.returncode is None:
             self.ended(EXIT_CODE_UNKNOWN)
 
     def send_signal(self, number: int) -> None:
-        """Send a signal, unless the child has ended or is not forked yet."""
+        """Send a signal to the child, unless it has ended or has not been forked yet."""
         if self._pidfd is not None:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
 
     def kill(self) -> None:
-        """Kill the child; one that is not forked yet counts as ended, and is killed as soon as it is forked."""
+        """Kill the child. If it has not been forked yet, count it as ended, and kill it as soon as it is forked."""
         self.send_signal(signal.SIGKILL)
         self._killed = True
         if self.pid is None:
             self.returncode = 0
 
     def wait(self, deadline: float) -> bool:
-        """Wait for the end until a time of the monotonic clock; return False on a time-out."""
+        """Wait for the end of the child. Return False if it has not ended at `deadline`, by the monotonic clock [s]."""
         while self.returncode is None:
             watched = [] if self._parent.gone else [self._parent.fileno()]
             watched += [] if self._pidfd is None else [self._pidfd]
@@ -214,11 +214,11 @@ class ChildProcess:
             if self._parent.fileno() in ready:
                 self._parent.receive()
             elif self._parent.gone or not self._parent.wait_for_message():
-                self.ended(EXIT_CODE_UNKNOWN)  # the pidfd is readable, and the fork server does not report
+                self.ended(EXIT_CODE_UNKNOWN)  # the pidfd shows the end, but the fork server does not report it
         return True
 
     def read_messages(self) -> bool:
-        """Read the child's messages; return False once it has ended."""
+        """Read the child's messages that have arrived. Return False if there are none, or if the child has ended."""
         try:
             content = os.read(self.pipe, 65_536)
         except BlockingIOError:
@@ -237,13 +237,16 @@ class ChildProcess:
         return bool(content)
 
     def kill_hung(self, silent: float) -> None:
-        """Kill the child after `silent` seconds without a sign of life; a stopped process would not act on SIGTERM."""
+        """Kill the child, because it has given no sign of life for `silent` seconds.
+
+        SIGTERM would not be enough, because a stopped process does not react to it.
+        """
         self._hung_for = silent
         self.kill()
 
     @property
     def end_description(self) -> str:
-        """Description of how the child ended, for people."""
+        """Description for people of how the child ended."""
         code = self.returncode
         return describe_exit(code, self._hung_for) if code else "another process sent it SIGTERM"
 
@@ -254,9 +257,9 @@ def describe_exit(code: int, hung_for: float) -> str:
     Parameters
     ----------
     code : int
-        Exit code as in Popen.
+        Exit code as in subprocess.Popen.
     hung_for : float
-        Time without a sign of life after which it was killed [s]; 0 if it was not killed for that.
+        Time without a sign of life after which the process was killed [s]; 0 if it was not killed for that reason.
 
     """
     if hung_for and code == -signal.SIGKILL:

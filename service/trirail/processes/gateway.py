@@ -1,4 +1,4 @@
-"""Gateway process between Zenoh and the loop: it checks and translates messages, but makes no decisions."""
+"""Gateway process, which checks and translates messages between Zenoh and the loop, but makes no decisions."""
 
 from __future__ import annotations
 
@@ -60,16 +60,16 @@ from trirail.wire.text import quoted
 from trirail.wire.vocabulary import Mode, NoContent
 
 SWITCH_EVERY = 0.0005
-"""Interval after which a thread yields the interpreter, so that Zenoh's threads can hand over a message [s]."""
+"""Interval after which a thread yields the interpreter [s], short enough for Zenoh's threads to deliver messages."""
 MESSAGES_PER_TURN = 256
-"""Messages from Zenoh handled between two reads of the loop's messages."""
+"""Maximum number of messages from Zenoh that are handled before the loop's messages are read again."""
 NOT_CHECKED = "not a goal to check"
 SUMMARY_EVERY = 1.0
-"""Interval between two summaries [s]."""
+"""Interval between two published summaries [s]."""
 
 
 class Gateway:
-    """Gateway: forwards clients' requests to the loop, answers them, and publishes the loop's messages."""
+    """Gateway, which forwards clients' requests to the loop, answers them, and publishes the loop's messages."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class Gateway:
         *,
         again: bool = False,
     ) -> None:
-        """Connect the gateway's parts; `again` says whether the service has already had a gateway."""
+        """Create and connect the parts of the gateway. `again` is True if the service has already had a gateway."""
         self._log = log
         self._robot = config.robot.name
         self._link = link
@@ -93,7 +93,7 @@ class Gateway:
         self._loop_death = LoopDeath(config.period)
         self._info = info(config)
         self._welcomed = False
-        """Whether the loop has answered, so that clients can be served."""
+        """True once the loop has sent its welcome. Clients are served from then on."""
         self._states = StateMaker(config)
         self._meter = Meter(report_measurements) if config.telemetry.metrics_port else None
         self._state_every = 1.0 / config.telemetry.state_hz
@@ -125,7 +125,7 @@ class Gateway:
         self._publications = Publications(session, self._robot)
 
     def serve(self, ready: Callable[[], None]) -> None:
-        """Serve until `end` is called or the loop disconnects; call `ready` once the loop has sent its welcome."""
+        """Serve clients until `end` is called or the loop disconnects. Call `ready` after the loop's welcome."""
         door = self._guard.stop_door(self._inbox.stop_at_door)
         poll = select.poll()
         poll.register(self._link.fileno(), select.POLLIN)
@@ -141,7 +141,7 @@ class Gateway:
                     self._beat()
                     self._loop_death.record_activity()
                     self._handle_packet(packet, ready)
-                self._requests.send_goals()  # goals that did not fit into the socket before
+                self._requests.send_goals()  # goals that could not be sent earlier because the socket was full
                 self._poses.settle()
                 self._poses.poll()
                 self._routers.poll()
@@ -164,7 +164,7 @@ class Gateway:
             self._replies.close()
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about how the service is run, one line each."""
+        """Return the current warnings of the gateway's parts for the state, with one line per warning."""
         return (
             *self._guard.warnings(),
             *self._poses.warnings(),
@@ -173,14 +173,17 @@ class Gateway:
         )
 
     def end(self) -> None:
-        """Make `serve` return; safe from a signal handler."""
+        """Make `serve` return. This method may be called from a signal handler."""
         self._ending = True
         self._inbox.wake()
 
     # ------------------------------------------------------------------ Zenoh to loop
 
     def _handle(self, incoming: Incoming) -> None:
-        """Handle a message. The reply contains any error, and everyone is notified of it, since a put has no reply."""
+        """Handle a message and answer it.
+
+        An error is sent in the reply and is also announced to all clients, because a put has no reply.
+        """
         try:
             route = ROUTES[incoming.kind]
             if (reply := route.handle(self, route.read(incoming, self._robot))) is not None:
@@ -232,7 +235,7 @@ class Gateway:
             raise RefusedError(RefusalCode.MALFORMED, problem)
 
     def _announce(self, notice: Notice) -> bool:
-        """Request that the loop announces a notice; return whether the loop can accept it now."""
+        """Ask the loop to announce a notice. Return True if the loop's socket has accepted the request."""
         return self._link.send(message(Announcement(notice)))
 
     # ------------------------------------------------------------------ loop to Zenoh
@@ -276,7 +279,7 @@ class Gateway:
                 self._requests.answer(ticket, self._commands.refused(ticket, error))
 
     def _publish(self, batch: memoryview) -> None:
-        """Update from a batch of records and publish it; publish the newest state if it is due."""
+        """Publish a batch of records and update the state from it; publish the newest state if that is due."""
         rows = unpack(batch)
         self._publications.records(bytes(batch))
         self._states.records(rows)
@@ -290,14 +293,17 @@ class Gateway:
             self._publications.state(self._states.newest(self.warnings()))
 
     def _summarize(self) -> None:
-        """Publish the summary if it is due, even while the loop is silent, since it contains the age of the state."""
+        """Publish the summary if that is due.
+
+        The summary is published even while the loop is silent, because it contains the age of the state.
+        """
         now = time.monotonic()
         if now >= self._summary_due and self._states.cycle:
             self._summary_due = now + SUMMARY_EVERY
             self._publications.summary(summary_of(self._states.newest(), now - self._records_at, self._info.version))
 
     def _handle_event(self, event: Event) -> None:
-        """Publish and log an event; for a new lease, withdraw the waiting goals of all users except its holder."""
+        """Publish and log an event. If the lease changes, withdraw the waiting goals of all users except the holder."""
         if event.kind == "lease":
             self._requests.backlog.withdraw_others(event.user, event.message)
         self._publications.event(event)
@@ -306,15 +312,15 @@ class Gateway:
             self._meter.event(event)
 
     def _handle_last_packets(self, ready: Callable[[], None]) -> None:
-        """Handle the loop's last messages, which may include its farewell."""
+        """Handle the last messages of the loop, which may include its farewell."""
         with contextlib.suppress(LinkClosed):
             while (packet := self._link.receive()) is not None:
                 self._loop_death.record_activity()
-                with contextlib.suppress(LinkClosed):  # the loop receives nothing any more
+                with contextlib.suppress(LinkClosed):  # the loop no longer receives anything
                     self._handle_packet(packet, ready)
 
     def _announce_loop_death(self) -> None:
-        """Announce that the loop has died, unless it has sent its farewell."""
+        """Publish the death of the loop as events and as a last state, unless the loop has sent its farewell."""
         for event in self._loop_death.events(self._states.cycle):
             self._handle_event(event)
         if (reason := self._loop_death.reason) and self._states.cycle:
@@ -323,29 +329,29 @@ class Gateway:
 
 
 class RoutedMessage(NamedTuple):
-    """Message with its key and content decoded."""
+    """Message with the names in its key and its decoded content."""
 
     incoming: Incoming
     names: Sequence[str]
-    """Names in its key."""
+    """Names in the key of the message, such as the user's."""
     content: Any
-    """Content, of the route's type."""
+    """Decoded content, of the type that the route defines."""
 
 
 class Route(NamedTuple):
-    """Key that clients query, with the handler of its messages and the type of their content."""
+    """Key that clients query, with the handler for messages on this key and the type of their content."""
 
     names: tuple[str, ...]
-    """Names in the key, the user's first; if there are none, the key of a message is not checked."""
+    """Meanings of the names in the key, of which the user is the first. If empty, a message's key is not checked."""
     handle: Callable[[Gateway, RoutedMessage], msgspec.Struct | None]
-    """Handler that returns the reply; None for a reply that is sent later."""
+    """Handler of a message. It returns the reply, or None if the reply is sent later."""
     content: Any = None
-    """Type of the content; None for content that is ignored or depends on a name."""
+    """Type of the content; None if the content is ignored, or if its type depends on a name in the key."""
     expected: str = ""
-    """Beginning of the refusal of any other content."""
+    """Beginning of the error message for content of another type."""
 
     def read(self, incoming: Incoming, robot: str) -> RoutedMessage:
-        """Decode a message's key and content. Raises RefusedError for invalid ones."""
+        """Decode the key and the content of a message. Raises RefusedError if either is invalid."""
         prefix = zenoh_session.key(robot, incoming.kind)
         names = boundary.names(incoming.key, prefix, self.names) if self.names else ()
         content = incoming.content(self.content, self.expected) if self.content is not None else None
@@ -363,7 +369,7 @@ ROUTES: dict[str, Route] = {
     "forget": Route(("user", "pose"), Gateway._edit_poses, NoContent | None, "forget takes no content"),
     "alignment": Route(("user",), Gateway._forward_look, AlignmentLook, "not a look of an alignment"),
 }
-"""Route of every key that clients query."""
+"""Routes of all keys that clients query, by the kind of message."""
 
 
 def main(
@@ -380,13 +386,13 @@ def main(
     Parameters
     ----------
     ready
-        Called once clients can reach the gateway, with its warnings.
+        Function called with the gateway's warnings when clients can reach the gateway.
     log
-        Called with each event.
+        Function called with each event.
     report_measurements
-        Called each second if the configuration enables metrics.
+        Function called with the measurements once per second, if the configuration enables metrics.
     urgent_section
-        Context in which packets sent to the loop are handled in the cycle of their arrival.
+        Function that returns a context. The loop handles packets sent within it in the cycle in which they arrive.
 
     """
     sys.setswitchinterval(SWITCH_EVERY)

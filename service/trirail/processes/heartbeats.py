@@ -1,11 +1,13 @@
-"""Heartbeats and urgent requests between the service's processes, as counters in shared memory, and detection of hangs.
+"""Heartbeats and urgent requests, as counters in memory that the service's processes share, and detection of hangs.
 
-A beat and a check cost 0.1 µs and never wait. Unlike packets, counters do not queue, so a frozen process fills no
-buffer. A process beats in the thread that does its work, so that a hung process stops beating.
+Counting a beat and checking a counter each take 0.1 µs and never wait. Unlike packets, counters do not fill a buffer
+while a process is frozen. Each process counts its beats in the thread that does its work, so that a hung process stops
+beating.
 
-A process can also be silent because a busy machine keeps it waiting, and killing it would only add load. Silence
-therefore counts only the time in which a process could have beaten: the processor time of its main thread, and the
-checks that found it stopped or asleep. Time spent waiting for a processor or a disk does not count.
+A process can also be silent because the machine is too busy to run it. Killing such a process would only add load. The
+measured silence therefore contains only time in which the process could have beaten: the processor time of its main
+thread, and the intervals at whose end the thread was stopped or asleep. Time spent waiting for a processor or a disk is
+not counted.
 """
 
 from __future__ import annotations
@@ -19,30 +21,30 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 PROCESSES = ("loop", "gateway", "planner", "recorder")
-"""Processes that beat in shared memory; the simulated drives send heartbeats on their bus instead."""
+"""Processes with a heartbeat in shared memory. The simulated drives send heartbeats on their bus instead."""
 URGENT_INDEX = len(PROCESSES)
 """Index of the counter of urgent requests."""
 BEAT_EVERY = 0.05
-"""Longest interval between two beats of a process, even while it is idle [s]."""
+"""Maximum interval between two beats of a process, also while the process is idle [s]."""
 
 
 class Heartbeats:
-    """Shared counters, one per process; a counter is 0 while its process is not expected to beat."""
+    """Counters in shared memory, one per process. A counter is 0 while its process is not expected to beat."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
-        """Descriptor of the shared memory, inherited by all processes."""
+        """Descriptor of the shared memory, which all processes inherit."""
         self._close: Callable[[], object] | None = None
         self._counts = memoryview(mmap.mmap(descriptor, mmap.PAGESIZE)).cast("Q")
 
     @property
     def counts(self) -> memoryview[int]:
-        """All counters, in the order of PROCESSES, then that of urgent requests."""
+        """All counters: those of the processes, in the order of PROCESSES, then the counter of urgent requests."""
         return self._counts
 
     @classmethod
     def create(cls) -> Heartbeats:
-        """Create counters, all 0; their descriptor is closed when the object is collected."""
+        """Create counters that are all 0. Their descriptor is closed when the object is garbage-collected."""
         descriptor = os.memfd_create("trirail-heartbeats")
         os.ftruncate(descriptor, mmap.PAGESIZE)
         created = cls(descriptor)
@@ -50,18 +52,18 @@ class Heartbeats:
         return created
 
     def close(self) -> None:
-        """Close the descriptor if this process has created the counters; the counters stay usable."""
+        """Close the descriptor if this process has created the counters. The counters can still be used."""
         if self._close is not None:
             self._close()
 
     def heart(self, process: str) -> Heart:
-        """Return the counter of a process of PROCESSES."""
+        """Return the heartbeat counter of a process in PROCESSES."""
         return Heart(self._counts, PROCESSES.index(process))
 
     @contextmanager
     def urgent_section(self) -> Iterator[None]:
-        """Mark packets sent inside the context as urgent: the loop handles them in the cycle of their arrival."""
-        # Count before and after the packet: whenever the loop checks, it finds a new count or the packet itself.
+        """Mark packets sent within this context as urgent. The loop handles them in the cycle in which they arrive."""
+        # Count before and after the packet, so that the loop always finds a new count or the packet itself.
         self._counts[URGENT_INDEX] += 1
         yield
         self._counts[URGENT_INDEX] += 1
@@ -79,7 +81,7 @@ class Heart:
         self._counts[self._place] += 1
 
     def rest(self) -> None:
-        """Reset the counter; the process is not expected to beat until its next beat."""
+        """Reset the counter to 0, so that no heartbeat is expected until the next beat."""
         self._counts[self._place] = 0
 
     @property
@@ -89,15 +91,15 @@ class Heart:
 
 
 class UrgentFlag:
-    """Detector of urgent requests, for the loop."""
+    """Detector with which the loop notices urgent requests."""
 
     def __init__(self, heartbeats: Heartbeats) -> None:
         self._counts = heartbeats.counts
         self.seen = 0
-        """Count at the last check."""
+        """Count of urgent requests at the last check."""
 
     def was_raised(self) -> bool:
-        """Return whether there has been an urgent request since the last call."""
+        """Return True if there has been an urgent request since the last call."""
         before, self.seen = self.seen, self._counts[URGENT_INDEX]
         return self.seen != before
 
@@ -105,8 +107,8 @@ class UrgentFlag:
 class Watch:
     """Time-out on the heartbeat of another process.
 
-    The time-out counts the watcher's own checks, not wall time, so that a stalled machine does not look like a frozen
-    process. `patience` is the number of checks without a beat that are tolerated.
+    The time-out is measured in checks by the watching process, not in wall-clock time. A stalled machine is therefore
+    not mistaken for a frozen process. `patience` is the tolerated number of checks without a new beat.
     """
 
     def __init__(self, heart: Heart, patience: int) -> None:
@@ -118,7 +120,7 @@ class Watch:
         """Number of checks since the count last changed."""
 
     def silent(self) -> bool:
-        """Check the heartbeat; return whether it has been missing for more than `patience` checks."""
+        """Check the heartbeat. Return True if it has been missing for more than `patience` checks."""
         count = self._heart.count
         if count == self.seen and count:
             self.silent_turns += 1
@@ -128,54 +130,57 @@ class Watch:
 
     @property
     def has_beat(self) -> bool:
-        """Whether the last check found a beat."""
+        """True if the last check found a new beat."""
         return self.seen > 0 and self.silent_turns == 0
 
 
 READY, ON_DISK = "R", "D"
-"""Thread states of proc(5): running or runnable, and uninterruptible sleep."""
+"""Thread states of proc(5): R is running or runnable, D is uninterruptible sleep, usually for a disk."""
 _STATE, _UTIME, _STIME = 0, 11, 12
-"""Fields of /proc/PID/stat, counted after the name in parentheses, which may contain spaces and parentheses."""
+"""Indices of fields of /proc/PID/stat, counted from the first field after the name.
+
+The name is in parentheses, and may itself contain spaces and parentheses.
+"""
 _TICK: Final = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 class Effort(NamedTuple):
-    """State of a thread in the kernel."""
+    """State of a thread and processor time that it has used, as reported by the kernel."""
 
     state: str
-    """State letter of proc(5)."""
+    """Letter of the state, as in proc(5)."""
     used: float
-    """Processor time since the thread began [s]."""
+    """Processor time that the thread has used since its start [s]."""
 
     @property
     def kept_waiting(self) -> bool:
-        """Whether the thread is running or is ready to run but waits for a processor or a disk."""
+        """True if the thread is running, is ready to run, or waits for a disk."""
         return self.state in (READY, ON_DISK)
 
 
 def effort(pid: int) -> Effort | None:
-    """Return the kernel's state of a process's main thread; None if there is none."""
+    """Return the state and the processor time of a process's main thread; None if the thread does not exist."""
     try:
         stat_line = Path(f"/proc/{pid}/task/{pid}/stat").read_bytes()
-    except OSError:  # it has just ended, or there is no such file system
+    except OSError:  # the process has just ended, or /proc is not mounted
         return None
     fields = stat_line[stat_line.rindex(b")") + 1 :].split()
     return Effort(fields[_STATE].decode(), (int(fields[_UTIME]) + int(fields[_STIME])) * _TICK)
 
 
 class HangWatch:
-    """Detector of a hung process, by its heartbeat and its processor time.
+    """Detector of a hung process, based on the process's heartbeat and on its processor time.
 
     Parameters
     ----------
     heart
         Heartbeat of the process.
     patience
-        Longest silence [s].
+        Tolerated duration of silence [s].
     turn
         Interval between two checks [s].
     effort
-        Function that returns the kernel's state of a process, by process id.
+        Function that returns the Effort of a process's main thread, given the process id.
 
     """
 
@@ -191,7 +196,7 @@ class HangWatch:
         self._used: float | None = None
 
     def hangs(self, pid: int) -> bool:
-        """Check the process; return whether it has been silent for longer than the allowed time."""
+        """Check the process. Return True if it has been silent for longer than the tolerated time."""
         count = self._heart.count
         if count != self._seen or not count:
             self._seen, self._silent_s, self._used = count, 0.0, None

@@ -1,4 +1,4 @@
-"""Inbox for messages from Zenoh: queued by user until they are read, bounded in number and in bytes."""
+"""Inbox of the gateway, which queues messages from Zenoh per user until they are read, up to a maximum size."""
 
 from __future__ import annotations
 
@@ -24,30 +24,33 @@ from trirail.wire.stop_protocol import MAX_LINE, STOPS, StopRequest
 from trirail.wire.text import is_id
 
 MAX_MESSAGES = 8192
-"""Maximum number of unread messages; more are refused. The limit is double for commands, so goals cannot block a stop.
+"""Maximum number of unread messages; further messages are refused.
+
+Twice as many are allowed for commands, so that goals cannot prevent a stop.
 """
 MAX_MESSAGES_OF_USER = 2048
-"""Maximum number of one user's unread messages; the limit is double for commands."""
+"""Maximum number of unread messages of one user. Twice as many are allowed for commands."""
 TOO_MUCH = "too many unread messages: send fewer"
 MAX_MERGED_STOPS = 32
 """Maximum number of consecutive equal stops of one user that are merged into one."""
 
 
 class Inbox:
-    """Inbox of the gateway's keys.
+    """Inbox for all messages on the keys of the gateway.
 
-    Users take turns, each at a limited rate, so that a flood delays only its sender. Stops are recognised by their key
-    and read before all other messages. Messages are numbered: a stop's number shows which goals were sent before it,
-    and a goal sent after a stop is never read before that stop.
+    Users take turns, and the messages of each user are read at a limited rate, so that a flood of messages delays only
+    its sender. Stops are recognised by their key, and are read before all other messages. Messages are numbered in the
+    order of their arrival. The number of a stop shows which goals arrived before the stop. A goal that arrived after a
+    stop is never read before that stop.
 
     Parameters
     ----------
     keys
-        Kinds of queries, each with the number of names in its key.
+        Number of names in the key of each kind of query.
     refuse
-        Called with each message that is not kept, and the error.
+        Function called with each message that is not accepted, and with the error to send.
     clock
-        Monotonic clock [s].
+        Function that returns the monotonic time [s].
 
     """
 
@@ -67,28 +70,28 @@ class Inbox:
         self._budget = Budget(MAX_UNREAD, MAX_UNREAD_OF_ONE)
         self._lock = threading.Lock()
         self._stops: FairQueue[list[Incoming]] = FairQueue()
-        """Stops; each contains the equal stops that were merged into it."""
+        """Waiting stops. Each item is a list of a stop and the equal stops that were merged into it."""
         self._newest: dict[str, list[Incoming]] = {}
-        """Waiting stops that are the newest message of their user, with the equal ones merged into them."""
+        """Item of `_stops` for each user whose newest message is a waiting stop."""
         self._others: FairQueue[Incoming] = FairQueue()
         self._stops_pace, self._others_pace = Pace(), Pace()
-        """Separate rates, so that a user's stops and other messages do not delay each other."""
+        """Separate rate limits for stops and for other messages, so that they do not delay each other."""
         self._number = 0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         weakref.finalize(self, os.close, self._wake)
 
     def fileno(self) -> int:
-        """Return the descriptor to pass to select: readable while messages wait, or after `wake`."""
+        """Return the descriptor to pass to select. It is readable while messages wait, and after `wake`."""
         return self._wake
 
     def wake(self) -> None:
-        """Make the descriptor readable; safe from a signal handler."""
+        """Make the descriptor readable. This method may be called from a signal handler."""
         os.eventfd_write(self._wake, 1)
 
     def declare(self) -> None:
-        """Declare the keys, and so begin to receive."""
+        """Declare the keys in Zenoh. Messages are received from then on."""
 
-        # Not `indirect`: Zenoh calls back as messages arrive, so that they are numbered in the order of arrival.
+        # Not `indirect`: Zenoh's threads call back directly, so that messages are numbered in the order of arrival.
         def declare(kind: str, names: int) -> zenoh.Queryable[None]:
             on_query = zenoh.handlers.Callback(partial(self._on_query, kind), indirect=False)
             return self._session.declare_queryable(key(kind, *"*" * names), on_query)
@@ -102,7 +105,7 @@ class Inbox:
         ]
 
     def next_messages(self, at_most: int) -> Iterator[Incoming]:
-        """Yield at most `at_most` messages that may be read now, stops first; users take turns."""
+        """Yield up to `at_most` messages that may be read now, first stops and then others. Users take turns."""
         for _ in range(at_most):
             with self._lock:
                 incoming = self._next(self._clock())
@@ -115,12 +118,12 @@ class Inbox:
                     os.eventfd_read(self._wake)
 
     def due(self) -> float:
-        """Return the time until a waiting message may be read [s]; infinite if none waits."""
+        """Return the time until a waiting message may be read [s]; infinite if no message is waiting."""
         with self._lock:
             return self._due(self._clock())
 
     def earlier(self, number: int) -> bool:
-        """Return whether a message with a lower number waits to be read."""
+        """Return True if a message other than a stop that arrived before message `number` has not been read yet."""
         with self._lock:
             return any(self._others.first(user).number < number for user in self._others.users)
 
@@ -139,7 +142,7 @@ class Inbox:
         return None
 
     def _readable(self) -> Iterator[str]:
-        """Yield users in the order of their turns, except those whose next message is a goal behind a stop."""
+        """Yield users in the order of their turns. A user whose next message is a goal after a stop is left out."""
         stop = min((self._stops.first(user)[0].number for user in self._stops.users), default=math.inf)
         for user in self._others.users:
             incoming = self._others.first(user)
@@ -152,7 +155,7 @@ class Inbox:
         return min((*stops, *others), default=math.inf)
 
     def stop_at_door(self, request: StopRequest, answer: Answer) -> None:
-        """Enqueue a request from the stop port; safe from any thread."""
+        """Enqueue a request from the stop port. This method may be called from any thread."""
         content = request.content.encode()
         stop = Incoming("cmd", request.key, len(content), content, "", None, time.monotonic_ns(), at_door=answer)
         self._keep(_named(stop._replace(held=len(content) + OVERHEAD), request.id))
@@ -170,7 +173,7 @@ class Inbox:
         self._keep(incoming)
 
     def _keep_nothing(self, large: Incoming) -> None:
-        """Refuse a message that is too large immediately, to free its memory; a stop still takes effect."""
+        """Refuse a message that is too large immediately, which frees its memory. A stop takes effect nevertheless."""
         error = ErrorReply(RefusalCode.TOO_LARGE, boundary.too_large(large.size))
         if _stops(large):
             name = large.key.rpartition("/")[2]
@@ -188,7 +191,7 @@ class Inbox:
             self._refuse(incoming._replace(payload=b""), ErrorReply(RefusalCode.BUSY, TOO_MUCH))
 
     def _has_kept(self, incoming: Incoming) -> bool:
-        """Enqueue a message; return False if there is no room for it."""
+        """Enqueue a message and return True, or return False if there is no space for it."""
         user, room = incoming.user, 2 if incoming.kind == "cmd" else 1
         hold = self._budget.hold(user, incoming.held, room)
         if hold is None:
@@ -207,7 +210,7 @@ class Inbox:
         return fits
 
     def _joins(self, incoming: Incoming) -> bool:
-        """Merge a stop into an equal, waiting one if that is the user's previous message; return whether it was."""
+        """Merge a stop into the user's previous message, if that is an equal, waiting stop. Return True if merged."""
         stops = self._newest.get(incoming.user)
         if (
             not _stops(incoming)
@@ -229,17 +232,21 @@ class Inbox:
 
 
 def _stops(incoming: Incoming) -> bool:
-    """Return whether a message stops the robot, regardless of its content."""
+    """Return True if a message stops the robot, which depends only on its key and not on its content."""
     return incoming.kind == "cmd" and incoming.key.rpartition("/")[2] in STOPS
 
 
 def _named(stop: Incoming, name: str) -> Incoming:
-    """Return a stop with its id, if valid. A stop too large for the stop port has no copy there, and gets no id."""
+    """Return a stop with its id set, if the id is valid.
+
+    The copies of a stop that arrive over Zenoh and at the stop port have the same id. A stop that is too large for the
+    stop port has no copy there, and therefore gets no id.
+    """
     return stop._replace(id=name) if is_id(name) and stop.size <= MAX_LINE else stop
 
 
 def _request_of(stop: Incoming) -> tuple[object, ...]:
-    """Return the request of a stop for comparison; a stop whose payload was not kept equals no other."""
+    """Return a value that is equal for equal stops. A stop whose payload was dropped is not equal to any other stop."""
     known = stop.size == len(stop.payload)
     return stop.key, stop.payload, stop.encoding, None if known else stop.arrived_ns
 
@@ -247,7 +254,7 @@ def _request_of(stop: Incoming) -> tuple[object, ...]:
 def _incoming(
     kind: str, key: str, payload: zenoh.ZBytes | None, encoding: str, query: zenoh.Query | None, beside: int = 0
 ) -> Incoming:
-    """Return a received message; `beside` is the size of its query without the payload [bytes]."""
+    """Return a received message as an Incoming. `beside` is the size of the query without its payload [bytes]."""
     size = len(payload) if payload is not None else 0
     content = payload.to_bytes() if payload is not None and size <= MAX_MESSAGE else b""
     held = len(content) + OVERHEAD + (size + beside if query is not None else 0)
@@ -255,5 +262,5 @@ def _incoming(
 
 
 def _wait(pace: Pace, user: str, now: float) -> float:
-    """Return the time until a user's next message may be read [s]; messages without a user are not limited."""
+    """Return the time until the next message of a user may be read [s]; 0 for messages without a user."""
     return pace.wait(user, now) if user else 0.0

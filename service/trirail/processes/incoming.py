@@ -1,6 +1,7 @@
-"""Queues of the gateway for messages that are not decoded yet and goals that the loop does not have yet.
+"""Queues of the gateway, for messages that have not been decoded and for goals that have not been sent to the loop.
 
-Users take turns. The gateway sends the loop only a few goals at a time, so that it can withdraw the others itself.
+Users take turns. The gateway sends only a few goals to the loop at a time, so that it can withdraw the other goals
+itself.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from trirail.wire.sizes import MAX_UNREAD
 
 
 class Incoming(NamedTuple):
-    """Query or put as received from Zenoh, or a request at the stop port."""
+    """Query or put that was received from Zenoh, or request that was received at the stop port."""
 
     kind: str
-    """Kind, a key of trirail.processes.gateway.ROUTES."""
+    """Kind of message, which is a key of trirail.processes.gateway.ROUTES."""
     key: str
-    """Key expression of the message; it may have wildcards."""
+    """Key expression of the message, which may contain wildcards."""
     size: int
     """Size of the payload [bytes]."""
     payload: bytes
-    """Payload; empty if it is too large to be decoded."""
+    """Payload of the message; empty if the payload is too large to be decoded."""
     encoding: str
     query: zenoh.Query | None
     """Query to answer; None for a put and for a request at the stop port."""
@@ -40,25 +41,28 @@ class Incoming(NamedTuple):
     number: int = 0
     """Sequence number in the order of arrival."""
     id: str = ""
-    """Id of a stop, the same in all of its copies; "" for none."""
+    """Id of a stop, which is the same in all copies of the stop; "" if the message has no id."""
     at_door: Callable[[Any], None] | None = None
-    """Receiver of the answer to a request at the stop port."""
+    """Function that sends the answer to a request at the stop port; None for messages from Zenoh."""
     held: int = 0
-    """Memory that the message holds in Zenoh and in this process: payload, key, parameters and attachment [bytes]."""
+    """Memory that the message occupies in Zenoh and in this process: payload, key, parameters, attachment [bytes]."""
     hold: Reservation | None = None
-    """Reservation of that memory; None for a message that is not kept."""
+    """Reservation of the memory `held`; None if the message is not in the inbox."""
     alike: tuple[Incoming, ...] = ()
-    """Equal stops of the same user that were merged into this one, which is carried out once for all of them."""
+    """Equal stops of the same user that were merged into this stop. The stop is carried out once for all of them."""
 
     @property
     def user(self) -> str:
-        """User named by the key; "" without one, and for a query about a role, whose key may name any user."""
+        """User that the key names; "" if the key names no user.
+
+        It is also "" for a query about a role, because the key of such a query may name any user.
+        """
         return self.key.split("/")[3] if self.kind != "role" and self.key.count("/") > 2 else ""
 
     def content(self, kind: Any, what: str) -> Any:
-        """Return the payload decoded as a type or union `kind`.
+        """Decode the payload as the type or union `kind`.
 
-        Raises RefusedError, with a message that begins with `what`.
+        Raises RefusedError with a message that begins with `what`, if the payload is invalid.
         """
         boundary.check_size(self.size)
         return boundary.decode(self.payload, kind, what, self.encoding)
@@ -69,15 +73,15 @@ class Incoming(NamedTuple):
 
 
 BURST = 400
-"""Number of one user's messages that may be read in a burst."""
+"""Number of messages of one user that may be read in a burst."""
 RATE = 200.0
-"""Rate at which one user's messages are read after a burst [1/s]; ten times that of a stream of goals or a jog."""
+"""Rate at which messages of one user are read after a burst [1/s], ten times that of a jog or a stream of goals."""
 _MAX_BUCKETS = 1000
-"""Number of users above which full buckets are forgotten."""
+"""Number of users above which the full buckets are deleted."""
 
 
 class Pace:
-    """Token bucket for each user, as in the generic cell rate algorithm; it stores a time instead of a count."""
+    """Rate limiter with a token bucket per user, stored as a time as in the generic cell rate algorithm."""
 
     def __init__(self, burst: int = BURST, rate: float = RATE) -> None:
         self._burst, self._rate = burst, rate
@@ -85,12 +89,12 @@ class Pace:
         """Time at which each user's bucket is full again, in seconds of the caller's clock."""
 
     def wait(self, user: str, now: float) -> float:
-        """Return the time until a user's next message may be read; 0 if it may be now [s]."""
-        # Half a message less than the burst: a sum of that many fractions does not end at a whole one.
+        """Return the time until the next message of a user may be read [s]; 0 if it may be read now."""
+        # Half a message less than the burst, because the sum of many intervals has a rounding error.
         return max(0.0, self._full_at.get(user, -math.inf) - now - (self._burst - 0.5) / self._rate)
 
     def count(self, user: str, now: float) -> None:
-        """Take a token from the bucket of a user whose message has been read."""
+        """Take a token from a user's bucket, because a message of that user has been read."""
         self._full_at[user] = max(self._full_at.get(user, now), now) + 1.0 / self._rate
         if len(self._full_at) > _MAX_BUCKETS:
             self._full_at = {user: full for user, full in self._full_at.items() if full > now}
@@ -100,7 +104,7 @@ T = TypeVar("T")
 
 
 class FairQueue(Generic[T]):
-    """Round-robin queue: a served user moves behind the others, and a new user joins behind them."""
+    """Round-robin queue, in which users take turns. A user who is new or has been served is last in the order."""
 
     def __init__(self) -> None:
         self._queues: dict[str, deque[T]] = {}  # in the order of the users' turns, without empty queues
@@ -115,24 +119,27 @@ class FairQueue(Generic[T]):
 
     @property
     def users(self) -> KeysView[str]:
-        """Users with items, in the order of their turns: a view that must not be iterated while the queue changes."""
+        """View of the users with items, in the order of their turns. Do not iterate over it while the queue changes."""
         return self._queues.keys()
 
     def count(self, user: str) -> int:
-        """Return the number of a user's items."""
+        """Return the number of items of a user."""
         return len(self._queues.get(user, ()))
 
     def put(self, user: str, item: T) -> None:
-        """Append an item to those of its user."""
+        """Append an item to the items of a user."""
         self._queues.setdefault(user, deque()).append(item)
         self._length += 1
 
     def first(self, user: str) -> T:
-        """Return the user's first item. Raises KeyError if there is none."""
+        """Return the first item of a user. Raises KeyError if the user has no item."""
         return self._queues[user][0]
 
     def pop(self, user: str) -> T:
-        """Remove and return the first item of a user, and move the user behind the others. Raises KeyError."""
+        """Remove and return the first item of a user. That user is then last in the order.
+
+        Raises KeyError if the user has no item.
+        """
         waiting = self._queues.pop(user)
         item = waiting.popleft()
         self._length -= 1
@@ -141,30 +148,33 @@ class FairQueue(Generic[T]):
         return item
 
     def change(self, make: Callable[[T], T]) -> None:
-        """Replace each item."""
+        """Replace each item by the result of `make`, called with the item."""
         self._queues = {user: deque(map(make, waiting)) for user, waiting in self._queues.items()}
 
 
 GOALS = 5_000
-"""Maximum number of waiting goals; more are refused."""
+"""Maximum number of waiting goals; further goals are refused."""
 GOALS_OF_ONE = 1_250
-"""Maximum number of one user's waiting goals; it leaves room for other users."""
+"""Maximum number of waiting goals of one user. It leaves space for the goals of other users."""
 GOAL_PATIENCE = 8.0
-"""Longest time that a goal waits for those before it [s]; it is then withdrawn, as its sender gives up soon after."""
+"""Maximum time that a goal waits for earlier goals [s].
+
+After that time, the goal is withdrawn, because its sender stops waiting for the reply soon afterwards.
+"""
 
 
 class WaitingGoal(NamedTuple):
-    """A goal and the message that contained it, without the payload."""
+    """Goal that waits to be sent to the loop, and the message that contained it, without the payload."""
 
     incoming: Incoming
     request: GoalRequest
 
 
 class Backlog:
-    """Queue of goals, bounded in number and in bytes. A user's goals keep their order of arrival; users take turns.
+    """Queue of goals, which limits their number and their size. Users take turns.
 
-    Each goal leaves the queue exactly once, by `drop_first`. A withdrawn goal keeps its place, so that the loop reports
-    its end in the right order.
+    The goals of a user stay in the order of their arrival. Each goal leaves the queue exactly once, by `drop_first`. A
+    withdrawn goal remains in its place in the queue, so that the loop reports its end in the right order.
     """
 
     def __init__(self) -> None:
@@ -172,7 +182,7 @@ class Backlog:
         self._bytes = 0
         self._stop = 0, ""
         self._stopped: dict[str, tuple[int, str]] = {}
-        """Stops of single goals, by goal id, the newest last: the number of the stop's message, and the reason."""
+        """Stops of single goals, by goal id. The values are the number of the stop's message, and the reason."""
 
     def __iter__(self) -> Iterator[WaitingGoal]:
         return iter(self._goals)
@@ -183,7 +193,7 @@ class Backlog:
         return list(self._goals.users)
 
     def check_room(self, user: str, size: int) -> None:
-        """Raise RefusedError if there is no room for another goal of this size [bytes]."""
+        """Raise RefusedError if there is no space for another goal of this size [bytes]."""
         own = self._goals.count(user)
         if own >= GOALS_OF_ONE:
             raise RefusedError(RefusalCode.BUSY, f"{own} goals of {user} are waiting already: send fewer")
@@ -191,7 +201,10 @@ class Backlog:
             raise RefusedError(RefusalCode.BUSY, f"{len(self._goals)} goals are waiting already: send fewer")
 
     def add(self, incoming: Incoming, request: GoalRequest) -> None:
-        """Enqueue a goal behind the user's others, withdrawn if it arrived before a stop that applies to it."""
+        """Enqueue a goal after the user's other goals.
+
+        If the goal arrived before a stop that applies to it, it is enqueued as withdrawn.
+        """
         for before, reason in (self._stop, self._stopped.get(request.id, (0, ""))):
             if incoming.number < before:
                 request = structs.replace(request, withdrawn=reason)
@@ -199,7 +212,10 @@ class Backlog:
         self._bytes += incoming.size
 
     def first(self, user: str) -> WaitingGoal:
-        """Return the next goal of a user, withdrawn if it has waited too long. Raises KeyError if there is none."""
+        """Return the next goal of a user. If it has waited too long, it is returned as withdrawn.
+
+        Raises KeyError if the user has no goal.
+        """
         incoming, request = self._goals.first(user)
         if request.withdrawn is None and time.monotonic_ns() - request.received_ns > GOAL_PATIENCE * 1e9:
             waited = f"it has waited longer than {GOAL_PATIENCE:g} s"
@@ -208,35 +224,35 @@ class Backlog:
         return WaitingGoal(incoming, request)
 
     def drop_first(self, user: str) -> None:
-        """Remove the user's first goal, which has been sent to the loop."""
+        """Remove the first goal of a user, because it has been sent to the loop."""
         self._bytes -= self._goals.pop(user).incoming.size
 
     def withdraw(self, goal_id: str, reason: str) -> bool:
-        """Withdraw the goal with this id; return whether it was waiting."""
+        """Withdraw the goal with this id. Return True if it was waiting."""
         is_waiting = any(goal.request.id == goal_id for goal in self._goals)
         if is_waiting:
             self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.request.id == goal_id else goal)
         return is_waiting
 
     def withdraw_coming(self, goal_id: str, reason: str, before: int) -> None:
-        """Withdraw the goal with this id if it is read later, and arrived before the message numbered `before`."""
+        """Withdraw a goal that has not been read yet, if it arrived before the message numbered `before`."""
         self._stopped.pop(goal_id, None)
         self._stopped[goal_id] = before, reason
         if len(self._stopped) > GOALS:
             del self._stopped[next(iter(self._stopped))]
 
     def withdraw_all(self, reason: str, before: int) -> None:
-        """Withdraw every goal that arrived before the message numbered `before`, including those read later."""
-        if before >= self._stop[0]:  # stops may be read in another order than they arrived
+        """Withdraw every goal that arrived before the message numbered `before`, including goals not read yet."""
+        if before >= self._stop[0]:  # stops may be read in an order other than that of their arrival
             self._stop = before, reason
         self._goals.change(lambda goal: _withdrawn(goal, reason) if goal.incoming.number < before else goal)
 
     def withdraw_others(self, user: str | None, reason: str) -> None:
-        """Withdraw the goals of all other users."""
+        """Withdraw the goals of all users except `user`."""
         self._goals.change(lambda goal: goal if goal.request.user == user else _withdrawn(goal, reason))
 
 
 def _withdrawn(goal: WaitingGoal, reason: str) -> WaitingGoal:
-    """Return a goal as withdrawn; the first reason is kept."""
+    """Return a withdrawn copy of a goal. A goal that is already withdrawn is returned unchanged."""
     request = goal.request
     return goal if request.withdrawn else goal._replace(request=structs.replace(request, withdrawn=reason))

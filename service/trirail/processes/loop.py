@@ -1,4 +1,4 @@
-"""Control loop: the only process with deadlines, which waits for nothing except its next tick."""
+"""Control loop, which is the only process with deadlines and never waits for anything except its next tick."""
 
 from __future__ import annotations
 
@@ -29,17 +29,23 @@ from trirail.wire.records import MAX_PART_NS, Part
 from trirail.wire.vocabulary import Mode
 
 DECISION_BUDGET_NS = 300_000
-"""Time that handling requests needs before the next tick [ns]; with less, they wait until its setpoints are sent."""
+"""Time needed to handle requests before the next tick [ns].
+
+If less time is left, the requests wait until the setpoints of the next cycle have been sent.
+"""
 REPORT_BUDGET_NS = 150_000
-"""Time that sending events and answers needs before the next tick [ns]."""
+"""Time needed to send events and answers before the next tick [ns]."""
 MIN_GATEWAY_TIMEOUT_CYCLES = 3
-"""Shortest time-out of the gateway, in cycles."""
+"""Minimum time-out for the gateway's heartbeat, in cycles."""
 MAX_SHUTDOWN_S = 3.0
-"""Longest controlled stop at the end of the service [s]; after this time the drives stop by themselves."""
+"""Maximum duration of the controlled stop when the service ends [s].
+
+After this time the loop ends, and the drives stop by themselves.
+"""
 
 
 class Loop:
-    """Control loop: connects the control, the drives, the ticks and the neighbours."""
+    """Control loop, which connects the control, the drives, the ticks and the neighbouring processes."""
 
     def __init__(
         self,
@@ -53,16 +59,16 @@ class Loop:
         quiet: bool = True,
         now: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Connect the loop's parts.
+        """Create and connect the parts of the loop.
 
         Parameters
         ----------
         lacking
-            Rights that the loop lacks, for its welcome.
+            Real-time rights that the loop could not acquire, which it reports in its welcome.
         quiet
-            Whether the compiled call runs the cycles without events; otherwise Python runs every cycle.
+            True if the compiled call runs the cycles without events, False if Python runs every cycle.
         now
-            Clock of the ticks [ns].
+            Clock from which the time left before the next tick is calculated [ns].
 
         """
         self._now = now
@@ -77,7 +83,7 @@ class Loop:
         self.control = Control(config, drives, self._planner)
         self._reports = Reports(config, self.control, drives, ports.gateway, ports.recorder, capture, lacking)
         self.ending = False
-        """Flag to set from outside: the loop then stops the robot, disables the drives and returns."""
+        """Set this to True from outside to make the loop stop the robot, disable the drives and return."""
         self._ending_since: int | None = None
         self._overruns = Overruns(config.watchdogs.max_overruns)
         self._heart = heartbeats.heart("loop")
@@ -85,9 +91,9 @@ class Loop:
         self._poll_set = PollSet(ports)
         self._never_listens = self._period_ns <= SPARE_NS
         self._listened = self._never_listens
-        """Whether no further call is served before the next tick."""
+        """True if no further call is served before the next tick."""
         self._reports_postponed = False
-        """Whether events and answers wait because too little time was left before a tick."""
+        """True if events and answers have not been sent yet, because too little time was left before a tick."""
         self._quiet: QuietCycles | None = None
         if quiet and isinstance(drives, Lender):
             beside = self._reports, heartbeats, ports.gateway, self._poll_set, watch, self._urgent_flag
@@ -98,7 +104,7 @@ class Loop:
         self._parts_ns: MutableSequence[int] = [0] * len(Part) if self._quiet is None else self._quiet.parts_ns
 
     def run(self, ticker: Ticker) -> None:
-        """Run cycles until `ending` is set and the robot is at rest and unpowered."""
+        """Run cycles until `ending` is set, and then until the drives are unpowered or MAX_SHUTDOWN_S has passed."""
         self.begin()
         while not self._has_ended():
             self.turn(ticker)
@@ -106,9 +112,9 @@ class Loop:
         self._flush()
 
     def begin(self) -> None:
-        """Accept waiting peers and read the drives, before the first cycle."""
+        """Accept the processes that wait to connect, and read the drives, before the first cycle."""
         self._planner.accept()
-        self._reports.accept_peers()  # before the first cycle, so that a connected recorder receives every cycle
+        self._reports.accept_peers()  # before the first cycle, so that a waiting recorder receives every cycle
         self._drives.sync()
         self.control.start(self._drives.read())
 
@@ -118,10 +124,10 @@ class Loop:
         return self._quiet.cycles if self._quiet is not None else 0
 
     def turn(self, ticker: Ticker) -> None:
-        """Run the cycles without events by the compiled call, or one cycle with an event; then handle requests.
+        """Run cycles without events in compiled code, or one cycle with an event in Python; then handle requests.
 
-        If a neighbour calls during the wait for a tick, serve only that call, and at most one such call before each
-        tick.
+        If a neighbour calls during the wait for a tick, only serve that call. At most one such call is served before
+        each tick.
         """
         quiet, newest = self._quiet, None
         disturbed = self.ending or self._gateway.frozen or not self._planner.idle
@@ -152,14 +158,14 @@ class Loop:
                 quiet.add(Part.DECIDE)
 
     def cycle(self, tick: Tick) -> None:
-        """Run one cycle. Nothing in it waits, and any failure in it stops the robot."""
+        """Run one cycle in Python. Nothing in a cycle waits, and any failure in a cycle stops the robot."""
         self._marked_ns = time.perf_counter_ns()
         self._drives.sync()
         self._mark(Part.SYNC)
         self._continue_after_sync(tick)
 
     def _continue_after_sync(self, tick: Tick) -> None:
-        """Run the rest of a cycle after its SYNC: setpoints are sent before any decision that can wait."""
+        """Run the rest of a cycle after its SYNC. Setpoints are sent before any decision that can wait."""
         now_ns = tick.deadline_ns + tick.lateness_ns
         if self._urgent_flag.was_raised() or self._gateway.ended:
             self._gateway.read(URGENT_REQUESTS_A_CYCLE)
@@ -172,7 +178,7 @@ class Loop:
         self._end(tick)
 
     def _end(self, tick: Tick) -> None:
-        """Record a cycle whose setpoints have been sent, then handle its results and requests."""
+        """Record a cycle after its setpoints have been sent, then handle its results and the waiting requests."""
         self._listened = self._never_listens
         self._reports.record(tick, self._overruns.all, self._parts_ns)
         self._mark(Part.RECORD)
@@ -189,20 +195,20 @@ class Loop:
 
     @property
     def _postponed(self) -> bool:
-        """Whether work was postponed until the newest setpoints have been sent, for lack of time."""
+        """True if requests or reports wait because too little time was left before a tick."""
         return self._reports_postponed or self._gateway.postponed
 
     def _decide(self, next_ns: int, called: bool = True) -> None:
         """Handle requests and send reports before the next tick.
 
-        Work without enough time before that tick is postponed, once, until its setpoints have been sent.
+        If too little time is left, the work is postponed once, until the setpoints of the next cycle have been sent.
 
         Parameters
         ----------
         next_ns
             Deadline of the next tick [ns].
         called
-            Whether a neighbour has called.
+            Whether a neighbour may have called. If it is False, and nothing was postponed, there is nothing to do.
 
         """
         waited = self._gateway.postponed
@@ -225,7 +231,7 @@ class Loop:
         self._reports.pass_on()
 
     def _serve_call(self, ticker: Ticker) -> None:
-        """Handle requests that arrive during the wait for the next tick, so that they take effect at that tick."""
+        """Handle requests that arrived during the wait for the next tick, so that they take effect at that tick."""
         self._listened = True
         self._gateway.read()
         if inputs := list(self._noted(ticker.deadline_ns + self._period_ns, self._gateway.requests(), waiting=True)):
@@ -233,19 +239,22 @@ class Loop:
         self._send_reports()
 
     def _noted(self, now_ns: int, requests: Iterable[Request], *, waiting: bool = False) -> Iterator[TimedInput]:
-        """Yield requests and the planner's answers, noting each for the recorder."""
+        """Yield the requests and the planner's answers, each with the time `now_ns`, and note each for the recorder."""
         for what in itertools.chain(requests, self._planner.answers()):
             self._reports.note(now_ns, what, waiting=waiting)
             yield what, now_ns
 
     def _mark(self, part: Part) -> None:
-        """Record the duration of a part of the cycle, at its end; 0 if a simulated clock was ahead."""
+        """Record the duration of a part of the cycle at the end of the part; 0 if a simulated clock was ahead."""
         now = time.perf_counter_ns()
         self._parts_ns[part] = min(max(0, now - self._marked_ns), MAX_PART_NS)
         self._marked_ns = now
 
     def _watch(self, tick: Tick, feedback: Feedback) -> Iterator[Disturbance]:
-        """Check for disturbances: yield late ticks, a lost gateway and a request to end; note changes of the drives."""
+        """Yield a disturbance for late ticks, for a lost gateway and for a request to end the service.
+
+        Also note changes of the drives' fault and readiness for the recorder.
+        """
         fault = feedback.fault
         unready = tuple(name for name, each in zip(NAMES, feedback.unready, strict=True) if each is not None)
         if fault is not self._fault or unready != self._unready:
@@ -272,7 +281,7 @@ class Loop:
         return stands or (control.cycles - self._ending_since) * self._period > MAX_SHUTDOWN_S
 
     def _flush(self) -> None:
-        """Count a heartbeat, send the batch of records, and accept new peers."""
+        """Count a heartbeat, send the batch of records, and accept processes that want to connect."""
         self._heart.beat()
         self._planner.accept()
         self._reports.flush()

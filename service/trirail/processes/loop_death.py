@@ -1,6 +1,6 @@
-"""Events that report the death of the loop, which normally issues all events.
+"""Events that report the death of the loop. Normally, the loop itself issues all events.
 
-Gateway and recorder receive the same messages from the loop, so each can derive the missing events by itself.
+Gateway and recorder receive the same messages from the loop. Each of them can therefore derive the missing events.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from trirail.wire.packets import Answer, ControlInput, EventReport, Farewell, Go
 from trirail.wire.vocabulary import FaultCause, Mode
 
 FROZEN, CYCLES = 0.5, 3
-"""Silence before the loop's end that shows that it was frozen [s, cycles]; it sends records every 20 ms, or every
-cycle."""
+"""Duration of silence before the loop's end that shows that the loop was frozen [s, cycles].
+
+The larger of the two durations applies. A running loop sends records every 20 ms, or every cycle if that is longer.
+"""
 
 
 class LoopDeath:
-    """Observer of the loop's messages that derives the missing events when the loop has died."""
+    """Observer of the loop's messages, which derives the missing events if the loop dies."""
 
     def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._period = period
@@ -32,12 +34,12 @@ class LoopDeath:
         self._greeted = False
 
     def record_activity(self) -> None:
-        """Record that a message of the loop has arrived."""
+        """Record that a message from the loop has arrived."""
         self._heard = self._clock()
         self._greeted = True
 
     def follow(self, message: Answer | GoalRequest) -> None:
-        """Follow a message from the loop, or a goal sent to it."""
+        """Track goals, events and the farewell, given a message from the loop or a goal that was sent to the loop."""
         match message:
             case ControlInput(given=GoalRequest() as request) | (GoalRequest() as request):
                 self._record_begin(request.id, request.user)
@@ -51,7 +53,7 @@ class LoopDeath:
                 self._farewell = True
 
     def _record_begin(self, goal_id: str, user: str | None) -> None:
-        if goal_id not in self._ended:  # the loop refuses an id that is in use, and reports that itself
+        if goal_id not in self._ended:  # the loop itself reports that it refuses an id that was used before
             self._open.setdefault(goal_id, user)
 
     def _record_end(self, goal_id: str) -> None:
@@ -62,7 +64,7 @@ class LoopDeath:
 
     @property
     def reason(self) -> EventText | None:
-        """Cause of the loop's end, for people; None if the loop has said farewell, or has never run."""
+        """Text for people with the cause of the loop's end; None if the loop ended with a farewell or never ran."""
         if self._farewell or not self._greeted:
             return None
         frozen = self._clock() - self._heard > max(FROZEN, CYCLES * self._period)
@@ -71,7 +73,10 @@ class LoopDeath:
         return coded(f"the loop {how}: the drives stop by their own watchdogs", code)
 
     def events(self, cycle: int) -> list[Event]:
-        """Return the events of the loop's death, in the last known cycle; none if the loop ended normally."""
+        """Return events that report the loop's death and the faulted goals; empty if the loop ended normally.
+
+        `cycle` is the last known cycle, which determines the time of the events.
+        """
         reason = self.reason
         if reason is None:
             return []

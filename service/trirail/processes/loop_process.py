@@ -1,7 +1,8 @@
-"""Loop process: rehearses, connects the drives, acquires real-time rights, and runs the loop until it must end.
+"""Loop process, which runs a rehearsal, connects the drives, acquires real-time rights and runs the loop.
 
-Before the first cycle on the real drives, everything that must happen without delay runs once on simulated drives of
-the configured kind: stop, quick stop, fault, lost gateway and end. Its memory pages are then loaded and locked.
+Before the first cycle with the real drives, the loop runs a rehearsal with simulated drives of the configured kind. The
+rehearsal executes everything that must later happen without delay: stop, quick stop, fault, lost gateway and end. The
+memory pages that these need are thereby loaded, and are then locked in memory.
 """
 
 from __future__ import annotations
@@ -39,21 +40,21 @@ from trirail.wire.plan_packets import decode_plan_request, encode
 from trirail.wire.vocabulary import Command, Mode
 
 PLANNER_WITHIN = 120.0
-"""Longest time for the planner to come up [s]: the first start compiles the kinematics."""
+"""Maximum time to wait until the planner has started [s]. The first start compiles the kinematics."""
 STEP_WITHIN = 500
-"""Maximum number of cycles of a step; the rehearsal of a robot that needs more ends at this step."""
+"""Maximum number of cycles for one step of the rehearsal. If a step needs more cycles, the rehearsal ends."""
 IN_MOTION = 20
-"""Number of cycles of a jog before it is stopped."""
+"""Number of cycles for which the robot jogs in the rehearsal."""
 SLOW = 0.1
-"""Velocity of a jog along x, as a fraction of the limit."""
+"""Velocity of the jog along x in the rehearsal, as a fraction of the limit."""
 
 
 class _UnfinishedError(Exception):
-    """Raised when a step has taken more than STEP_WITHIN cycles."""
+    """Error raised if a step of the rehearsal needs more than STEP_WITHIN cycles."""
 
 
 class _RehearsedTime:
-    """Monotonic clock that advances by whole cycles during the rehearsal, so that a busy machine causes no delays."""
+    """Clock that advances by one period per cycle during the rehearsal, so that a busy machine causes no delays."""
 
     def __init__(self) -> None:
         self._now: float | None = None
@@ -67,12 +68,12 @@ class _RehearsedTime:
         self._now = self() + seconds
 
     def release(self) -> None:
-        """Follow the monotonic clock again, so that waits for a deadline end."""
+        """Follow the monotonic clock again, so that code which waits for a deadline does not wait forever."""
         self._offset, self._now = self() - time.monotonic(), None
 
 
 class _Rehearsal:
-    """Rehearsal of the loop without waiting for ticks; it simulates gateway, planner and drives."""
+    """Rehearsal, which runs the loop without waiting for ticks, with simulated gateway, planner and drives."""
 
     def __init__(self, config: Config, folder: Path) -> None:
         self._config = config
@@ -85,7 +86,8 @@ class _Rehearsal:
         gateway, recorder, planner = listening
         self._ports = Ports(Port(gateway), Port(recorder), Port(planner))
         self._heartbeats = Heartbeats.create()
-        # Python runs each cycle, since its code needs the rehearsal: compiled code has its pages after its first cycle.
+        # Python runs each cycle, because only Python code needs the rehearsal. The memory pages of compiled code are
+        # all loaded in its first cycle.
         self._loop = Loop(config, self._drives, self._ports, self._heartbeats, quiet=False, now=lambda: self._now_ns)
         self._planner_link = links.connect(folder / "planner")
         self._planner = MotionPlanner(config)
@@ -95,7 +97,7 @@ class _Rehearsal:
         self._steps = self._script()
 
     def run(self) -> None:
-        """Run all steps."""
+        """Run all steps of the rehearsal."""
         try:
             self._drives.configure(self._config.period, self._config.limits.slider.fastest)
             self._loop.run(Ticker(round(self._config.period * 1e9), lambda: self._now_ns, self._pass))
@@ -109,7 +111,7 @@ class _Rehearsal:
                 port.close()
 
     def _pass(self, deadline_ns: int) -> None:
-        """Advance the clock by one period, and do the work of the other processes."""
+        """Advance the clock by one period, answer the loop's requests for plans, and continue the script."""
         self._clock.advance(self._config.period)
         self._now_ns = deadline_ns
         while (packet := self._planner_link.receive()) is not None:
@@ -132,16 +134,16 @@ class _Rehearsal:
         self._hang_up()
         yield from self._wait_until(lambda: self._mode is Mode.HOLDING)
         self._loop.ending = True
-        yield from self._wait_until(lambda: False)  # the loop returns first
+        yield from self._wait_until(lambda: False)  # the loop returns before this wait times out
 
     def _reset(self) -> Iterator[None]:
-        """Reset the fault once the drives are unpowered."""
+        """Wait until the drives are unpowered, and reset the fault."""
         yield from self._wait_until(lambda: not self._loop.control.measured.powered)
         self._send_command(Command.RESET)
         yield from self._wait_until(lambda: self._mode is Mode.DISABLED)
 
     def _jog(self) -> Iterator[None]:
-        """Jog the robot, after connecting a gateway and enabling the drives if needed."""
+        """Jog the robot. If necessary, first connect a simulated gateway and enable the drives."""
         if self._gateway is None:
             self._gateway = links.connect(self._folder / "gateway")
             yield from self._wait_until(lambda: self._ports.gateway.connected)
@@ -159,7 +161,7 @@ class _Rehearsal:
         return self._loop.control.state.mode
 
     def _wait_until(self, condition: Callable[[], bool]) -> Iterator[None]:
-        """Run cycles until a condition holds. Raises _UnfinishedError."""
+        """Run cycles until a condition is true. Raises _UnfinishedError after STEP_WITHIN cycles."""
         for _ in range(STEP_WITHIN):
             yield
             if self._gateway is not None:
@@ -185,7 +187,7 @@ class _Rehearsal:
 
 
 def rehearse(config: Config) -> tuple[str, ...]:
-    """Rehearse stops, faults and the end; return the reason if the rehearsal failed, otherwise nothing."""
+    """Rehearse stops, faults and the end of the loop. If the rehearsal fails, return the reason, otherwise nothing."""
     each = {name: structs.replace(drive, homing=None) for name, drive in zip(NAMES, config.drives.each, strict=True)}
     config = structs.replace(config, drives=structs.replace(config.drives, **each))
     with files.temporary_folder() as folder:
@@ -208,9 +210,9 @@ def main(
     Parameters
     ----------
     bus
-        Function that waits for the drives' bus and returns its [can] section.
+        Function that waits for the bus of the drives, and returns the [can] section for connecting to that bus.
     ready
-        Called just before the first cycle, with the rights that the loop lacks.
+        Function called immediately before the first cycle, with the rights that the loop lacks and the bus load.
 
     """
     drives: DriveGroup | None = None
@@ -220,7 +222,7 @@ def main(
         unrehearsed = rehearse(config)
         ports.planner.await_peer(PLANNER_WITHIN)
         capture = Capture() if config.telemetry.capture_can else None
-        # Simulated drives that have died return only with the next start of the service, so do not wait for them.
+        # Simulated drives that have died are restarted only with the whole service, so do not wait for them.
         awaits = config.can.interface != "simulated"
         drives = connect(bus(), config.drives, capture=capture, awaits=awaits, io=config.drive_io)
         drives.configure(config.period, config.limits.slider.fastest, awaits=True)
@@ -235,7 +237,7 @@ def main(
         loop.run(Ticker(round(config.period * 1e9)))
         ended_normally = True
     finally:
-        heartbeats.heart("loop").rest()  # closing the drives may take longer than the watchdog allows
+        heartbeats.heart("loop").rest()  # closing the drives may take longer than the time-out of the heartbeat
         if drives is not None:
             drives.close()
         for port in (ports.gateway, ports.recorder):

@@ -1,4 +1,4 @@
-"""Budget for the memory held by messages in the gateway, and trimming of the heap after a burst."""
+"""Budget for the memory that messages occupy in the gateway, and trimming of the heap after a burst of messages."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from typing import Final
 from trirail.processes.realtime import return_free_memory
 
 OVERHEAD: Final = 1024
-"""Memory that a message needs in addition to its content, for Zenoh's query and this process's objects [bytes]."""
+"""Memory that a message needs in addition to its content, for Zenoh's query and for Python's objects [bytes]."""
 
 
 class Reservation:
-    """Reserved bytes of a budget, released when the object is collected; copies of a message share it."""
+    """Reservation of memory for a message. Copies of the message share it.
+
+    The memory is released when the object is garbage-collected.
+    """
 
     __slots__ = ("_release",)
 
@@ -29,22 +32,22 @@ class Reservation:
 
 
 class Budget:
-    """Budget of bytes that may be held at one time, in total and per user."""
+    """Limit on the bytes that may be reserved at one time, in total and per user."""
 
     def __init__(self, total: int, of_one: int) -> None:
         self._total, self._of_one = total, of_one
         self._held: Counter[str] = Counter()
         self._all = 0
-        # Reentrant: garbage collection may release a reservation in a thread that holds the lock.
+        # Reentrant, because garbage collection may release a reservation in a thread that already holds the lock.
         self._lock = threading.RLock()
 
     @property
     def held(self) -> int:
-        """Bytes held now, in total."""
+        """Number of bytes that are currently reserved, in total."""
         return self._all
 
     def hold(self, user: str, size: int, room: int = 1) -> Reservation | None:
-        """Reserve bytes for a message of a user; return None if that exceeds `room` times the budget."""
+        """Reserve `size` bytes for a message of a user. Return None if that would exceed `room` times the budget."""
         with self._lock:
             if self._all + size > room * self._total or self._held[user] + size > room * self._of_one:
                 self._forget(user)
@@ -67,11 +70,11 @@ class Budget:
 TRIM_EVERY: Final = 1.0
 """Interval between two checks of this process's memory [s]."""
 TRIM_ABOVE: Final = 8_000_000
-"""Growth above which the heap is trimmed [bytes]."""
+"""Growth of the resident memory above which the heap is trimmed [bytes]."""
 
 
 class HeapTrim:
-    """Periodic trimming of the heap after a burst of messages; malloc would keep the free memory."""
+    """Periodic check that trims the heap after a burst of messages. Otherwise malloc would not return free memory."""
 
     def __init__(
         self,
@@ -85,7 +88,7 @@ class HeapTrim:
         self._due = clock()
 
     def poll(self) -> None:
-        """Trim the heap if it has grown since the last check."""
+        """Trim the heap if the resident memory is TRIM_ABOVE larger than its smallest value; check every TRIM_EVERY."""
         now = self._clock()
         if now < self._due:
             return
@@ -97,5 +100,5 @@ class HeapTrim:
 
 
 def _resident() -> int:
-    """Return the resident memory of this process [bytes]; proc(5)."""
+    """Return the resident memory of this process [bytes], from /proc/self/statm, proc(5)."""
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")

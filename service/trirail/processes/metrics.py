@@ -1,8 +1,9 @@
 """HTTP server for /metrics (Prometheus) and /healthz, in threads of the supervisor.
 
-The supervisor outlives the other processes and sees their heartbeats, so that it can report dead and frozen ones. They
-send it their measurements, so that a scrape disturbs no process. The server uses plain HTTP on the loopback; on other
-addresses it uses TLS, for users with a role, as with `zenoh.listen`.
+The supervisor outlives the other processes and checks their heartbeats. It can therefore report dead and frozen
+processes. The other processes send their measurements to the supervisor, so that a scrape does not disturb them. The
+server uses plain HTTP on the loopback interface. On other addresses, it uses TLS and serves only users with a role, as
+with `zenoh.listen`.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from trirail.wire.vocabulary import MODES
 
 PREFIX: Final = "trirail"
 Values = Mapping[Any, float]
-"""Values by label value, or by a tuple of label values if a metric has several labels."""
+"""Values of a metric, by the value of its label, or by a tuple of label values if the metric has several labels."""
 NONE_YET: Final[Values] = {}
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 TICKS: Final = os.sysconf("SC_CLK_TCK")
@@ -53,7 +54,7 @@ class ServiceMetrics(Collector):
         self._health = health
 
     def collect(self) -> Iterator[Metric]:
-        """Yield every metric; values not measured yet are left out."""
+        """Yield all metrics. Values that have not been measured yet are omitted."""
         words = "The robot and the software that runs."
         yield _gauge("service_info", words, ["robot", "version"], {(self._robot, self._version): 1.0})
         yield from self._processes()
@@ -136,7 +137,7 @@ def _use(use: ResourceUse) -> Iterator[Metric]:
 
 
 def _gauge(name: str, words: str, labels: list[str], values: Values = NONE_YET) -> GaugeMetricFamily:
-    """Return a gauge with a value for each value of its labels."""
+    """Return a gauge with one value for each combination of label values."""
     made = GaugeMetricFamily(f"{PREFIX}_{name}", words, labels=labels)
     for each, value in values.items():
         made.add_metric([each] if isinstance(each, str) else each, value)
@@ -163,7 +164,7 @@ def _histogram(name: str, words: str, values: Histogram) -> HistogramMetricFamil
 
 
 def _used(pid: int) -> tuple[float, float] | None:
-    """Return memory [bytes] and processor time [s] of a process, from proc(5); None if it has just ended."""
+    """Return the memory [bytes] and the processor time [s] of a process, from proc(5); None if it has just ended."""
     try:
         pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
@@ -173,15 +174,18 @@ def _used(pid: int) -> tuple[float, float] | None:
 
 
 REQUEST_TIMEOUT_S: Final = 2.0
-"""Longest time for a connection to send a request [s]."""
+"""Maximum time for a client to send its request [s]."""
 MAX_CONNECTIONS: Final = 16
-"""Maximum number of connections served at a time; more are closed."""
+"""Maximum number of connections served at the same time; further connections are closed."""
 
 _Start = Callable[..., Any]
 
 
 class MetricsServer:
-    """HTTP server that runs inside its context. Raises ServiceError for a used port or an invalid certificate."""
+    """HTTP server, used as a context manager, within which it serves requests.
+
+    Raises ServiceError if the port is in use, or if the certificate is invalid.
+    """
 
     def __init__(self, config: Config, health: Health) -> None:
         telemetry = config.telemetry
@@ -217,13 +221,13 @@ class MetricsServer:
                 "set telemetry.metrics_port to a free port, or to 0 for no metrics"
             ) from error
         if self._tls is not None:
-            # Not start_http_server of prometheus_client: it does the handshake in the accepting thread, where one
-            # silent connection blocks all others, and it does not pass on the name in the certificate.
+            # start_http_server of prometheus_client is not used, because it does the handshake in the accepting thread,
+            # where one silent connection blocks all others. It also does not provide the name in the certificate.
             server.socket = self._tls.wrap_socket(server.socket, server_side=True, do_handshake_on_connect=False)
         return server
 
     def _answer(self, environ: Mapping[str, Any], start: _Start) -> Iterable[bytes]:
-        """Answer a request, as a WSGI application."""
+        """Answer an HTTP request. This method is a WSGI application."""
         if self._tls is not None and environ[USER] not in self._users:
             return _respond(start, HTTPStatus.FORBIDDEN, {"error": f"{environ[USER] or 'nobody'} has no role"})
         match environ["PATH_INFO"]:
@@ -241,7 +245,7 @@ class MetricsServer:
 
 
 USER: Final = "trirail.user"
-"""WSGI key of the user named in the client's certificate."""
+"""Key in the WSGI environment for the user that the client's certificate names."""
 
 
 class _Handler(WSGIRequestHandler):
@@ -270,7 +274,7 @@ class _Handler(WSGIRequestHandler):
 
 class _Server(ThreadingWSGIServer):
     def server_bind(self) -> None:
-        # Not HTTPServer.server_bind, which looks the host name up in the network.
+        # HTTPServer.server_bind is not used, because it looks up the host name in the network.
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
         self.setup_environ()

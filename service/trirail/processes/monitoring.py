@@ -1,7 +1,8 @@
-"""Measurements of gateway and recorder, and the health of all processes, kept by the supervisor for monitoring.
+"""Measurements of gateway and recorder, and health of all processes, which the supervisor provides for monitoring.
 
-Measurements are totals since the loop began, sent once a second. The supervisor checks all processes periodically.
-Separate threads answer monitoring requests, so that they can report a blocked supervisor as well.
+Measurements are totals since the start of the loop, and are sent to the supervisor once per second. The supervisor also
+checks all processes periodically. Monitoring requests are answered in separate threads, which can therefore also report
+that the supervisor is blocked.
 """
 
 from __future__ import annotations
@@ -21,23 +22,26 @@ from trirail.wire.messages import Event, FaultDetail
 from trirail.wire.state import FrameCounts, State
 
 MEASUREMENT_PERIOD_S: Final = 1.0
-"""Interval between two measurements [s]."""
+"""Interval at which measurements are sent [s]."""
 CYCLE_BOUNDS: Final = (1e-6, 2e-6, 5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
-"""Bounds of the histograms of lateness and cycle [s]."""
+"""Bounds of the histograms of lateness and of cycle time [s]."""
 SETTLE_BOUNDS: Final = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Bounds of the histogram of settle times [s]."""
 MAX_FAULT_KINDS: Final = 20
-"""Maximum number of faults distinguished by cause, drive and code; all others count as OTHER."""
+"""Maximum number of different faults, by cause, drive and code, that are counted separately.
+
+Further faults are counted as OTHER.
+"""
 OTHER: Final = FaultDetail("other")
 
 
 class Histogram(Struct):
-    """Histogram of values."""
+    """Numbers of values between given bounds, and the sum of all values."""
 
     bounds: tuple[float, ...]
-    """Upper bounds, rising."""
+    """Upper bounds of the bins, in rising order."""
     counts: list[int]
-    """Number of values up to each bound and above the previous one; the last count is for values above all bounds."""
+    """Number of values in each bin, whose upper bound is included. The last bin is for values above all bounds."""
     total: float = 0.0
     """Sum of all values."""
 
@@ -47,7 +51,7 @@ class Histogram(Struct):
         return cls(bounds, [0] * (len(bounds) + 1))
 
     def add(self, values: NDArray[np.float64]) -> None:
-        """Add values, (n,)."""
+        """Count values, (n,)."""
         places = np.searchsorted(self.bounds, values)  # the first bound that is not below the value
         more = np.bincount(places, minlength=len(self.counts)).tolist()
         self.counts = [count + n for count, n in zip(self.counts, more, strict=True)]
@@ -62,49 +66,52 @@ class FaultCount(Struct, frozen=True):
 
 
 class ServiceMeasurements(Struct, frozen=True):
-    """Measurements of the gateway."""
+    """Measurements that the gateway sends."""
 
     mode: str
-    """A trirail.wire.vocabulary.Mode."""
+    """Mode of the robot, from trirail.wire.vocabulary.Mode."""
     cycles: int
-    """This field and those up to `bus_load_measured` are as in trirail.wire.state.LoopState."""
+    """This field and the next three are the same as in trirail.wire.state.LoopState."""
     overruns: int
     bus_load: float
     bus_load_measured: float
     traffic: tuple[FrameCounts, FrameCounts, FrameCounts]
-    """Frames of each drive that were late or lost."""
+    """Numbers of frames of each drive that were late or lost."""
     lateness: Histogram
     """Delay of each cycle after its deadline [s]."""
     cycle: Histogram
     """Duration of each cycle's work [s]."""
     settle: Histogram
-    """Time until each goal that is done was in position [s]."""
+    """Time from the end of the path until the robot was in position, for each goal that is done [s]."""
     goals: dict[str, int]
-    """Number of ended goals, by outcome."""
+    """Number of goals that have ended, by outcome."""
     faults: tuple[FaultCount, ...]
     use: ResourceUse
-    """Use of limited resources."""
+    """Use of resources that are limited, such as file descriptors."""
     warnings: tuple[str, ...]
     """Warnings about resources that are nearly used up."""
     outputs: dict[str, bool] = {}
-    """Value of each output of the configuration."""
+    """Value of each configured output, by name."""
     inputs: dict[str, bool] = {}
-    """Value of each input of the configuration."""
+    """Value of each configured input, by name."""
 
 
 class RecorderMeasurements(Struct, frozen=True):
-    """Measurements of the recorder: data missing since its start."""
+    """Measurements that the recorder sends, which count the data that has been lost since the recorder's start."""
 
     lost: int
-    """Batches not written to the disk."""
+    """Number of batches that were not written to the disk."""
     skipped: int
-    """Batches dropped because the live view was too slow."""
+    """Number of batches that were dropped because the live view was too slow."""
     absent: int
-    """Cycles dropped because the recorder was too slow."""
+    """Number of cycles that are missing because the recorder was too slow."""
 
 
 class Meter:
-    """Counter of the gateway's measurements; after a restart, cycles count from 0 and past events arrive again."""
+    """Counter for the gateway's measurements.
+
+    After a restart of the gateway, the histograms of cycles begin at 0. Past events are sent again, and are counted.
+    """
 
     def __init__(self, send: Callable[[Struct], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._send = send
@@ -116,12 +123,12 @@ class Meter:
         self._faults: dict[FaultDetail, int] = {}
 
     def records(self, rows: NDArray[np.void]) -> None:
-        """Count a batch of records."""
+        """Add a batch of records to the measurements."""
         self._lateness.add(rows["lateness_ns"] * 1e-9)
         self._cycle.add(rows["parts_ns"].sum(axis=1) * 1e-9)
 
     def event(self, event: Event) -> None:
-        """Count an event."""
+        """Add an event to the measurements."""
         if event.outcome is not None:
             self._goals[event.outcome] = self._goals.get(event.outcome, 0) + 1
             if event.settle is not None:
@@ -133,7 +140,7 @@ class Meter:
             self._faults[fault] = self._faults.get(fault, 0) + 1
 
     def publish(self, newest: Callable[[], State], use: ResourceUse, warnings: tuple[str, ...]) -> None:
-        """Send all measurements if they are due."""
+        """Send all measurements if MEASUREMENT_PERIOD_S has passed since they were last sent."""
         now = self._clock()
         if now < self._due:
             return
@@ -162,31 +169,34 @@ class Meter:
 
 
 MEASURED_BY: Final = {"gateway": ServiceMeasurements, "recorder": RecorderMeasurements}
-"""Type of each process's measurements."""
+"""Type of the measurements of each process."""
 prepare(*MEASURED_BY.values())
 
 MAX_SILENCE_S: Final = 3.0
-"""Silence after which a process is reported as frozen [s]; the supervisor has killed most hung processes before."""
+"""Duration of silence after which a process is reported as frozen [s].
+
+The supervisor kills most hung processes earlier.
+"""
 MIN_SILENT_CYCLES: Final = 3
-"""Shortest time-out of the loop's heartbeat, in cycles."""
+"""Minimum time-out for the loop's heartbeat, in cycles."""
 
 
 class Running(NamedTuple):
     """State of a process, as seen by the supervisor."""
 
     pid: int | None
-    """Process id; None if it is not running."""
+    """Process id; None if the process is not running."""
     ready: bool
-    """Whether the process has sent its ready message."""
+    """True if the process has sent its ready message."""
     restarts: int
-    """Number of restarts."""
+    """Number of times that the process was restarted."""
 
 
 NOT_RUNNING: Final = Running(None, ready=False, restarts=0)
 
 
 class Health:
-    """Result of the newest check of every process, and the newest measurements; any thread may read them."""
+    """Result of the newest check of every process, and the newest measurements. Any thread may read them."""
 
     def __init__(
         self, heartbeats: Heartbeats, period: float, turn: float, clock: Callable[[], float] = time.monotonic
@@ -197,14 +207,14 @@ class Health:
         silent = dict.fromkeys(PROCESSES, MAX_SILENCE_S) | {"loop": max(MAX_SILENCE_S, MIN_SILENT_CYCLES * period)}
         self._watches = {name: Watch(heartbeats.heart(name), round(silent[name] / turn)) for name in PROCESSES}
         self.processes: Mapping[str, Running] = dict.fromkeys(PROCESSES, NOT_RUNNING)
-        """State of each process at the newest check."""
+        """State of each process in the newest check."""
         self._troubles: Mapping[str, str] = dict.fromkeys(PROCESSES, "starting")
         self._stored_at: dict[str, float] = {}
         self.service: ServiceMeasurements | None = None
         self.recorder: RecorderMeasurements | None = None
 
     def poll(self, processes: Mapping[str, Running]) -> None:
-        """Check all processes; to be called in every turn of the supervisor."""
+        """Check all processes. The supervisor calls this method at a fixed interval."""
         self._troubles = {name: self._trouble(name, running) for name, running in processes.items()}
         self.processes = processes
         self._checked_at = self._clock()
@@ -215,7 +225,7 @@ class Health:
         self._ending = True
 
     def store(self, process: str, content: Mapping[str, Any]) -> None:
-        """Store a process's measurements."""
+        """Store measurements that a process has sent."""
         measured = converted(content, MEASURED_BY[process])
         if isinstance(measured, ServiceMeasurements):
             self.service = measured
@@ -224,11 +234,11 @@ class Health:
         self._stored_at[process] = self._clock()
 
     def ages(self) -> dict[str, float]:
-        """Return the age of the measurements, by process [s]."""
+        """Return the age of the newest measurements of each process [s]."""
         return {name: self._clock() - stored_at for name, stored_at in self._stored_at.copy().items()}
 
     def troubles(self) -> dict[str, str]:
-        """Return the problem of each process, including the supervisor; "" for none."""
+        """Return the problem of each process, including the supervisor; "" if a process has no problem."""
         held_up = self._clock() - self._checked_at > MAX_SILENCE_S
         supervisor = "the service is ending" if self._ending else "no sign of life" if held_up else ""
         return {**self._troubles, "supervisor": supervisor}

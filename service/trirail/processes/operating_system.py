@@ -1,6 +1,6 @@
-"""The service's use of the operating system: programs, processes by name, signals, and reports to systemd.
+"""Use of the operating system: commands to run, process ids by name, signals, and notifications of systemd.
 
-Reports to systemd, if it asks for them, follow sd_notify(3) and sd_watchdog_enabled(3).
+Notifications are sent only if systemd has requested them. They follow sd_notify(3) and sd_watchdog_enabled(3).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from trirail.processes.heartbeats import Heart
 
 
 def python(*arguments: str) -> list[str]:
-    """Return the command that runs this interpreter without the current folder on its path.
+    """Return the command that runs this Python interpreter with arguments, and without the current folder on its path.
 
     With `-m` and `-c`, Python would otherwise import a file such as `msgspec.py` from the current folder.
     """
@@ -28,13 +28,16 @@ def python(*arguments: str) -> list[str]:
 
 
 ONE_THREAD: Final = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Environment in which numpy's libraries start no threads: a fork would lose them, and the matrices are small."""
+"""Environment in which numpy's libraries start no threads.
+
+A fork would not copy the threads, and threads would not be faster, because the matrices are small.
+"""
 TITLE = "trirail: "
-"""Prefix of the names of the service's processes in `ps` and the like."""
+"""Prefix of the names of the service's processes, as shown by `ps` and similar programs."""
 
 
 def processes(service: int) -> dict[str, int]:
-    """Return the process ids of a service's processes by name; `service` is the supervisor's."""
+    """Return the process ids of a service's processes, by name. `service` is the process id of the supervisor."""
     pids = {"supervisor": service}
     for pid in [grandchild for parent in _children(service) for grandchild in (parent, *_children(parent))]:
         with contextlib.suppress(OSError):
@@ -45,7 +48,7 @@ def processes(service: int) -> dict[str, int]:
 
 
 def child(service: int, name: str) -> int:
-    """Return the process id of one of a service's processes. Raises ServiceError if there is none."""
+    """Return the process id of one of a service's processes. Raises ServiceError if no process has that name."""
     try:
         return processes(service)[name]
     except KeyError:
@@ -53,7 +56,7 @@ def child(service: int, name: str) -> int:
 
 
 def title(name: str) -> str:
-    """Return the name of one of the service's processes in `ps` and the like."""
+    """Return the name of one of the service's processes, as shown by `ps` and similar programs."""
     return TITLE + name
 
 
@@ -64,10 +67,11 @@ def _children(process: int) -> list[int]:
 
 
 class Signals:
-    """Source of SIGTERM, SIGINT and SIGHUP for select; SIGHUP stays ignored under nohup.
+    """Receiver of SIGTERM, SIGINT and SIGHUP, whose socket `reader` can be passed to select.
 
-    The kernel may deliver a signal to any thread, but only the main thread runs Python's handlers, and a signal in
-    another thread does not wake it from a lock. A socket pair does.
+    Under nohup, SIGHUP is still ignored. The kernel may deliver a signal to any thread, but Python runs its handlers
+    only in the main thread, which may be waiting for a lock. A signal in another thread would not wake the main thread.
+    Data in a socket does.
     """
 
     def __enter__(self) -> Signals:
@@ -81,7 +85,7 @@ class Signals:
         return self
 
     def first(self) -> signal.Signals:
-        """Wait for a signal, and return the first that has arrived."""
+        """Wait for a signal, and return the first signal that has arrived."""
         return signal.Signals(self.reader.recv(1)[0])
 
     def __exit__(self, *_: object) -> None:
@@ -93,16 +97,16 @@ class Signals:
 
 
 SEND_WITHIN = 0.3
-"""Longest wait for systemd to accept a notification [s]."""
+"""Maximum time to wait until systemd accepts a notification [s]."""
 FEEDS = 4
-"""Notifications within the watchdog's time-out; systemd recommends at least two."""
+"""Number of notifications within the time-out of systemd's watchdog. systemd recommends at least two."""
 
 
 def notify(state: str) -> None:
     """Notify systemd of a state, such as `READY=1`."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
-        # A failure of systemd must not prevent a stop of the robot.
+        # Errors are ignored, because a failure of systemd must not prevent a stop of the robot.
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, contextlib.suppress(OSError):
             sender.settimeout(SEND_WITHIN)
             sender.connect("\0" + address[1:] if address.startswith("@") else address)
@@ -110,7 +114,10 @@ def notify(state: str) -> None:
 
 
 class Watchdog:
-    """Client of systemd's watchdog: notifies it as long as all hearts beat; otherwise systemd ends the service."""
+    """Client of systemd's watchdog, which sends notifications as long as all given heartbeats continue.
+
+    Without notifications, systemd ends the service.
+    """
 
     def __init__(
         self,
@@ -125,7 +132,7 @@ class Watchdog:
         self._fed = [0] * len(hearts)
 
     def feed(self) -> None:
-        """Notify systemd if it is time and all hearts have beaten since the last notification."""
+        """Notify systemd if a notification is due and all hearts have beaten since the last notification."""
         now = self._clock()
         counts = [heart.count for heart in self._hearts]
         beating = all(count and count != before for count, before in zip(counts, self._fed, strict=True))
@@ -135,6 +142,6 @@ class Watchdog:
 
 
 def _microseconds(environment: Mapping[str, str]) -> int:
-    """Return the time-out of systemd's watchdog [µs]; 0 if there is none for this process."""
+    """Return the time-out of systemd's watchdog [µs]; 0 if systemd has no watchdog for this process."""
     wanted, process = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", str(os.getpid()))
     return int(wanted) if wanted.isdecimal() and process == str(os.getpid()) else 0

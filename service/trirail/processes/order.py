@@ -1,4 +1,4 @@
-"""Orders to the processes of a service."""
+"""Data with which the supervisor starts the processes of a service."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from trirail.wire.credentials import Admission
 
 
 class Order(msgspec.Struct, frozen=True):
-    """Order to a child process, with the content of all files that it needs, read when the service started."""
+    """Data for a child process, including the content of all files that it needs.
+
+    The files are read once, when the service starts.
+    """
 
     config: Config
     record: str | None
-    """Recording file to write; None for a file named by the time."""
+    """Recording file to write; None to write a file that is named after the robot and the time."""
     admission: Admission | None = None
-    """Credentials and roles, for a service with certificates."""
+    """Credentials and roles; None for a service without certificates."""
     again: bool = False
-    """Whether this is a restart of the process."""
+    """True if the process is being restarted."""

@@ -1,4 +1,4 @@
-"""Ports of the loop for the other processes, and the loop's links to gateway and planner."""
+"""Ports on which the loop accepts the other processes, and the loop's links to the gateway and the planner."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trirail.wire.plan_packets import PlanAnswer, PlanRequest, decode_plan_answe
 
 
 class Ports(NamedTuple):
-    """Ports on which the other processes connect to the loop."""
+    """Ports on which the loop accepts connections of the other processes."""
 
     gateway: Port
     recorder: Port
@@ -23,16 +23,19 @@ class Ports(NamedTuple):
 
 
 REQUESTS_A_CYCLE = 4
-"""Maximum number of requests handled in one cycle; at 1 kHz this is more than the gateway sends on average."""
+"""Maximum number of requests handled in one cycle. At 1 kHz, this is more than the gateway sends on average."""
 URGENT_REQUESTS_A_CYCLE = 128
-"""Maximum number of requests handled in a cycle with an urgent stop. The gateway never has more requests in progress,
-so the stop does not wait for earlier requests, and none of them begins after it."""
+"""Maximum number of requests handled in a cycle with an urgent stop.
+
+The gateway never has more requests in progress. Therefore the stop does not wait for earlier requests, and no earlier
+request is handled after the stop.
+"""
 ANSWERS_A_CYCLE = 2
-"""Maximum number of the planner's packets handled in one cycle; the planner has one request at a time."""
+"""Maximum number of the planner's packets handled in one cycle. The planner works on one request at a time."""
 
 
 class GatewayLink:
-    """Link to the gateway: receives its requests, and detects its loss."""
+    """Link to the gateway, which receives requests and detects the loss of the gateway."""
 
     def __init__(self, port: Port, watch: Watch, timeout: float) -> None:
         self._port = port
@@ -40,23 +43,23 @@ class GatewayLink:
         self._timeout = timeout
         self._in_hand: list[Request] = []
         self.frozen = False
-        """Whether its heartbeat is missing."""
+        """True if the heartbeat of the gateway is missing."""
 
     @property
     def ended(self) -> bool:
-        """Whether the gateway has disconnected and no receive or send has noticed it yet."""
+        """True if the gateway has disconnected, but no attempt to receive or send has noticed that yet."""
         return self._port.ended
 
     @property
     def postponed(self) -> bool:
-        """Whether requests have been read but not handled."""
+        """True if requests have been read but not handled."""
         return bool(self._in_hand)
 
     def read(self, limit: int = REQUESTS_A_CYCLE) -> None:
-        """Read at most `limit` requests, as many as a cycle has time for.
+        """Read at most `limit` requests, by default as many as can be handled in one cycle.
 
-        Nothing is read from a frozen gateway until its heartbeat returns. A gateway that sends an invalid packet is
-        disconnected; the supervisor then restarts it.
+        Nothing is read from a frozen gateway until its heartbeat returns. If the gateway sends an invalid packet, it is
+        disconnected. The supervisor then restarts the gateway.
         """
         for _ in range(0 if self.frozen else limit):
             packet = self._port.receive()
@@ -68,14 +71,15 @@ class GatewayLink:
                 self._port.hang_up()
 
     def requests(self) -> Iterator[Request]:
-        """Yield the requests that have been read."""
+        """Yield the requests that have been read but not handled; none while the gateway is frozen."""
         while self._in_hand and not self.frozen:
             yield self._in_hand.pop(0)
 
     def lost(self) -> EventText | None:
-        """Check the gateway, once per cycle; return a message if it was lost in this cycle, else None.
+        """Check the gateway, once per cycle. Return a message if the gateway was lost in this cycle, else None.
 
-        Requests that were read but not handled are dropped, because no client could stop their effects.
+        If the gateway has disconnected, requests that were read but not handled are dropped, because no client could
+        stop their effects.
         """
         if self._port.clear_lost():
             self.frozen = False
@@ -92,7 +96,7 @@ class GatewayLink:
 
 
 class PlannerLink:
-    """Link to the planner: implements trirail.control.plan_requests.PlannerPort."""
+    """Link to the planner, which implements trirail.control.plan_requests.PlannerPort."""
 
     def __init__(self, port: Port) -> None:
         self._port = port
@@ -101,11 +105,11 @@ class PlannerLink:
 
     @property
     def idle(self) -> bool:
-        """Whether all failures to send a request have been reported."""
+        """True if every failure to send a request has been reported."""
         return self._unsent is None
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Send a request; a failure is reported in the next cycle."""
+        """Send a request to the planner. If that fails, `answers` reports the failure in the next cycle."""
         if not self._port.connected:
             self._unsent = "the planner is not running, it is being restarted"
         elif not self._port.send(encode(request)):
@@ -114,7 +118,7 @@ class PlannerLink:
             self._awaited = request.number
 
     def answers(self) -> Iterator[PlanAnswer | PlannerLost]:
-        """Yield the planner's answers and losses to the control; ignore answers without a request."""
+        """Yield the planner's answers, and reports that a request was lost. Ignore answers without a request."""
         if self._unsent is not None:
             unsent, self._unsent = self._unsent, None
             yield PlannerLost(unsent)
@@ -126,7 +130,7 @@ class PlannerLink:
                 continue
             try:
                 answer = decode_plan_answer(packet)
-            except msgspec.DecodeError as error:  # a planner that sends such packets is started again
+            except msgspec.DecodeError as error:  # the supervisor restarts a planner that sends invalid packets
                 self._port.hang_up()
                 self._awaited = None
                 yield PlannerLost(f"the planner has sent an invalid packet, {error}")
@@ -139,5 +143,5 @@ class PlannerLink:
             yield PlannerLost("the planner has died")
 
     def accept(self) -> None:
-        """Accept a new planner."""
+        """Accept the connection of a new planner, if one is waiting."""
         self._port.accept()

@@ -1,4 +1,4 @@
-"""File of taught poses in the service's state directory; a power cut during a write leaves it intact."""
+"""File of taught poses in the service's state directory. A power cut during a write does not damage the file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NAME = "poses.json"
 
 
 class TaughtPose(NamedTuple):
-    """Taught pose; stored as an array in the file."""
+    """Taught pose, which the file stores as an array."""
 
     x: Coordinate
     """[m]."""
@@ -31,7 +31,7 @@ class TaughtPose(NamedTuple):
     phi: Coordinate
     """[rad]."""
     geometry: str = ""
-    """Checksum of the [geometry] with which the pose was taught; "" in files of earlier versions."""
+    """Checksum of the [geometry] section with which the pose was taught; "" in files of earlier versions."""
 
     @property
     def pose(self) -> Coordinates:
@@ -45,7 +45,10 @@ prepare(Taught)
 
 
 def state_directory(robot: str) -> Path:
-    """Return the directory of a robot's persistent data: in systemd's state directory, if set, else in the user's."""
+    """Return the directory of a robot's persistent data.
+
+    It is in the state directory of the systemd unit if there is one, otherwise in that of the user.
+    """
     of_unit = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if of_unit:
         return Path(of_unit) / robot
@@ -54,13 +57,13 @@ def state_directory(robot: str) -> Path:
 
 
 class PoseFile:
-    """File of taught poses; `read` and `change` raise ServiceError with the path and the remedy."""
+    """File of taught poses. `read` and `change` raise ServiceError, whose message contains the path of the file."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
 
     def read(self) -> Taught:
-        """Return the taught poses; none if there is no file."""
+        """Return the taught poses; an empty dict if there is no file."""
         try:
             return decoded(files.text(self.path), Taught) if self.path.exists() else {}
         except (FileError, OSError) as error:
@@ -70,7 +73,7 @@ class PoseFile:
             raise ServiceError(f"{self.path}: {problem}; mend it, or move it away and teach the poses again") from error
 
     def set_aside(self) -> Path:
-        """Rename the file without replacing another one; return the new path. Raises OSError."""
+        """Rename the file to an unused name and return the new path. Raises OSError if that fails."""
         with _alone_in(self.path.parent):
             names = (self.path.with_name(f"{NAME}.broken{number or ''}") for number in itertools.count())
             aside = next(name for name in names if not os.path.lexists(name))
@@ -79,23 +82,23 @@ class PoseFile:
 
     @property
     def gone(self) -> bool:
-        """Whether the file was deleted or moved away.
+        """True if the file does not exist although its folder exists, because the file was deleted or moved.
 
-        Its folder must exist; removing the last pose does not delete it.
+        Removing the last pose does not delete the file.
         """
         return self.path.parent.is_dir() and not self.path.exists()
 
     def change(self, name: str, pose: TaughtPose | None, known: Taught | None = None) -> None:
-        """Save a pose under a name, or remove the name; return once the change is on the disk.
+        """Save a pose under a name, or remove a pose. Return when the change has been written to the disk.
 
-        Poses that another service of the same robot has written in the meantime are kept.
+        Poses that another service of the same robot has written in the meantime stay in the file.
 
         Parameters
         ----------
         pose
-            Pose to save; None to remove the name.
+            Pose to save; None to remove the pose with this name.
         known
-            Poses to write as well if the file has been deleted.
+            Poses to write in addition if the file has been deleted.
 
         """
         try:
@@ -113,7 +116,7 @@ class PoseFile:
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Lock a folder against other callers."""
+    """Lock a folder within the context, so that no other process changes the file at the same time."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

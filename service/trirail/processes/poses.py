@@ -1,7 +1,7 @@
-"""Named poses in the gateway: those of [poses] in the configuration, and taught ones, which are saved in a file.
+"""Named poses in the gateway: poses in the [poses] section of the configuration, and taught poses in a file.
 
-A separate thread writes taught poses, since a write to the disk may take longer than the gateway may be silent. A
-taught pose is confirmed, announced and usable in goals once it is on the disk.
+A separate thread writes taught poses, because writing to the disk may take longer than the time-out of the gateway's
+heartbeat. A taught pose is confirmed, announced and usable in goals when it has been written to the disk.
 """
 
 from __future__ import annotations
@@ -33,16 +33,19 @@ from trirail.wire.vocabulary import MODES, Mode
 MAX_TAUGHT_POSES = 1000
 """Maximum number of taught poses."""
 MAX_CHANGES_UNDER_WAY = 32
-"""Maximum number of changes in progress; more are refused."""
+"""Maximum number of changes in progress; further changes are refused."""
 CHECK_PERIOD_S = 2.0
 """Interval between two checks that the file of taught poses exists [s]."""
 MAX_CLOSURE_ERROR_M = 1e-3
-"""Maximum error between the measured sliders and those computed from a measured pose [m]. With a larger error the
-present sliders do not close the loops, so the pose is that of an earlier cycle."""
+"""Maximum difference between measured slider positions and those calculated from the measured pose [m].
+
+If the difference is larger, no pose matches the present slider positions, and the measured pose is that of an earlier
+cycle.
+"""
 
 
 class _Change(NamedTuple):
-    """Pose to teach, or to remove if `pose` is None."""
+    """Request to teach a pose, or to remove it if `pose` is None."""
 
     incoming: Incoming
     user: str
@@ -51,22 +54,22 @@ class _Change(NamedTuple):
 
 
 class Poses:
-    """Handler of …/poses, …/teach and …/forget, which also resolves the names in goals.
+    """Handler of queries on …/poses, …/teach and …/forget, which also replaces names in goals by poses.
 
     Parameters
     ----------
     reply, refuse, announce
-        Functions that answer a message, refuse it, and publish a notice.
+        Functions that answer a message, refuse a message, and publish a notice.
     wake
-        Function that makes the gateway call `settle` soon; safe from any thread.
+        Function that makes the gateway call `settle` soon. It may be called from any thread.
     again
-        Whether the gateway is restarted: it then serves the robot without taught poses if their file cannot be read,
-        and renames that file.
+        True if the gateway is being restarted. If the file of taught poses cannot be read, a restarted gateway renames
+        the file and serves the robot without taught poses.
 
     Raises
     ------
     ServiceError
-        If the taught poses cannot be read at the first start.
+        The file of taught poses cannot be read at the first start.
 
     """
 
@@ -86,7 +89,7 @@ class Poses:
         self._configured = config.poses
         self._file = PoseFile(state_directory(config.robot.name))
         self._lacking = ""
-        """Reason why the taught poses are missing; empty if they have been read."""
+        """Reason why the taught poses are missing; empty if the file has been read."""
         self._taught = self._read(again=again)
         self._reply, self._refuse, self._announce, self._wake = reply, refuse, announce, wake
         self._to_measure: deque[_Change] = deque()
@@ -100,7 +103,7 @@ class Poses:
         """Warning that the file of taught poses has been deleted; empty while it exists."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about taught poses, one line each."""
+        """Return warnings about taught poses, with one line per warning."""
         both = sorted(self._taught.keys() & self._configured.keys())
         foreign = sorted(name for name in self._taught.keys() - both if self._is_foreign(self._taught[name]))
         other = (
@@ -134,12 +137,12 @@ class Poses:
             if not again:
                 raise
             self._lacking = f"{error}; there are no taught poses now"
-            with contextlib.suppress(OSError):  # the file keeps its name, and changes are refused
+            with contextlib.suppress(OSError):  # if the file cannot be renamed, changes of poses will be refused
                 self._lacking += f"; the file is kept as {self._file.set_aside()}"
             return {}
 
     def _lost_warning(self) -> str:
-        """Return the warning that the file has been deleted."""
+        """Return the text of the warning that the file has been deleted."""
         if not self._taught:
             return f"{self._file.path} has gone: taught poses, if there were any, are lost"
         known = ", ".join(sorted(self._taught))
@@ -149,7 +152,7 @@ class Poses:
         )
 
     def table(self) -> NamedPoses:
-        """Return all poses."""
+        """Return all named poses. If a configured and a taught pose have the same name, return the configured pose."""
         named = {name: self._named(name, pose) for name, pose in self._taught.items()}
         named |= {name: NamedPose(name, *pose, taught=False) for name, pose in self._configured.items()}
         return NamedPoses(tuple(named[name] for name in sorted(named)))
@@ -158,7 +161,7 @@ class Poses:
         return NamedPose(name, *pose.pose, taught=True, other_geometry=self._is_foreign(pose))
 
     def resolve_name(self, goal: Goal) -> Goal:
-        """Return the pose goal for a named goal; return other goals, and goals with an unknown name, unchanged."""
+        """Convert a named goal to a pose goal. Return other goals, and goals with an unknown name, unchanged."""
         if not isinstance(goal, NamedGoal):
             return goal
         taught = self._taught.get(goal.name)
@@ -166,7 +169,7 @@ class Poses:
         return goal if pose is None else pose_in_place_of(goal, *pose)
 
     def edit(self, incoming: Incoming, user: str, name: str) -> None:
-        """Handle a query on …/teach or …/forget. Raises RefusedError for an invalid one."""
+        """Handle a query on …/teach or …/forget. Raises RefusedError if the query is invalid."""
         if self._under_way >= MAX_CHANGES_UNDER_WAY:
             raise RefusedError(RefusalCode.BUSY, f"{self._under_way} poses are being taught already: send fewer")
         if incoming.kind == "forget":
@@ -185,7 +188,7 @@ class Poses:
         self._to_measure.append(_Change(incoming, user, name, None))
 
     def measure(self, record: np.void) -> None:
-        """Measure each pose to be taught from a record, which must be newer than the request."""
+        """Teach the requested poses at the pose in a record, which must be newer than the requests."""
         while self._to_measure:
             wanted = self._to_measure.popleft()
             self._under_way -= 1
@@ -203,7 +206,7 @@ class Poses:
                 return
             self._under_way -= 1
             pose = change.pose or self._taught.get(change.name)
-            if failure is not None or pose is None:  # None if two clients have removed it at the same time
+            if failure is not None or pose is None:  # None if two clients have removed the pose at the same time
                 why = f"{change.name} is as it was: {failure or 'it has been removed already'}"
                 self._refuse(change.incoming, RefusedError(RefusalCode.FAILED, why))
                 continue
@@ -216,7 +219,7 @@ class Poses:
             self._announce(Notice("pose", "info", text.text, user=change.user, **text.fields))
 
     def close(self) -> None:
-        """Finish and answer all pending changes; answer an error to requests that wait for a record."""
+        """Finish and answer all pending changes. Requests that wait for a record are answered with an error."""
         for wanted in self._to_measure:
             self._reply(wanted.incoming, ErrorReply(RefusalCode.ENDED, "the service has ended"))
         self._to_measure.clear()
@@ -235,7 +238,7 @@ class Poses:
         raise RefusedError(RefusalCode.UNKNOWN_POSE, f"no pose {name!r} was taught: there is {there_are}")
 
     def _measured(self, record: np.void) -> Coordinates:
-        """Return the measured pose. Raises RefusedError if the robot moves or its pose is unknown."""
+        """Return the measured pose. Raises RefusedError if the robot is in fault or moves, or its pose is unknown."""
         mode = MODES[record["mode"]]
         if mode is Mode.FAULT:
             raise RefusedError(RefusalCode.FAULT, "the robot is in fault: remove the cause, then send reset")
@@ -256,7 +259,7 @@ class Poses:
         self._writer.submit(self._keep, change)
 
     def _keep(self, change: _Change) -> None:
-        """Write a change, in the writer's thread."""
+        """Write a change to the file. This method runs in the writer's thread."""
         failure = None
         try:
             self._file.change(change.name, change.pose, dict(self._taught))

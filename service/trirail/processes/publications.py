@@ -1,4 +1,4 @@
-"""Publications of the gateway for one robot: state, summary, records, events with their history, and the info reply."""
+"""Publications of the gateway: state, summary, records and events with their history; and the reply on …/info."""
 
 from __future__ import annotations
 
@@ -36,14 +36,17 @@ from trirail.wire.state import (
 from trirail.wire.vocabulary import MODES, Mode
 
 EVENTS_KEPT = 1000
-"""Number of past events that a new client can request."""
+"""Number of past events that a newly connected client can request."""
 _HISTORY_REPLIES = RepliesConfig(
     priority=zenoh.Priority.BACKGROUND, congestion_control=zenoh.CongestionControl.BLOCK, express=False
 )
 
 
 class Publications:
-    """Publishers on a robot's keys. A slow subscriber loses states and records; events wait for it."""
+    """Publishers on a robot's keys.
+
+    States, summaries and records that a slow subscriber cannot receive are dropped. Events wait for the subscriber.
+    """
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         def dropping(name: str, encoding: str, priority: zenoh.Priority) -> zenoh.Publisher:
@@ -61,7 +64,7 @@ class Publications:
             session,
             zenoh_session.key(robot, "event"),
             encoding=boundary.JSON,
-            # The history is sent as one burst in a queue of its own, so that a slow subscriber delays nothing else.
+            # The history is sent in a separate queue, so that a slow subscriber does not delay anything else.
             cache=CacheConfig(max_samples=EVENTS_KEPT, replies_config=_HISTORY_REPLIES),
             sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             publisher_detection=True,
@@ -76,35 +79,35 @@ class Publications:
         self._summary.put(msgspec.json.encode(summary))
 
     def records(self, batch: bytes) -> None:
-        """Publish packed records, laid out as in wire.records."""
+        """Publish packed records in the format of wire.records."""
         self._records.put(batch)
 
     def event(self, event: Event) -> None:
-        """Publish an event, and keep it for later subscribers."""
+        """Publish an event, and store it for clients that subscribe later."""
         self._event.put(msgspec.json.encode(event))
 
 
 def _bits(named: Mapping[str, tuple[int, int]], words: NDArray[np.uint32]) -> dict[str, bool]:
-    """Return the values of named bits, each with the index of its drive and its mask."""
+    """Return the values of bits by name. `named` contains the index of the drive and the mask of each bit."""
     return {name: bool(int(words[axis]) & bit) for name, (axis, bit) in named.items()}
 
 
 WINDOW = 60.0
-"""Span of the timing statistics [s]."""
+"""Period over which the timing statistics are calculated [s]."""
 
 _ENABLED = [MODES.index(mode) for mode in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING)]
 _NONE = Percentiles(0.0, 0.0, 0.0, 0.0)
 
 
 def wall_offset_ns() -> int:
-    """Return wall-clock time minus monotonic time, now, since the wall clock may be set while the service runs."""
+    """Return the present wall-clock time minus the monotonic time [ns]; it changes if the wall clock is set."""
     return time.time_ns() - time.monotonic_ns()
 
 
 class StateMaker:
-    """Builder of states from the newest record and the loop's other messages, with timing statistics.
+    """Builder of states from the newest record, from the loop's other messages, and from timing statistics.
 
-    `offset_ns` returns wall-clock time minus monotonic time [ns].
+    `offset_ns` is a function that returns wall-clock time minus monotonic time [ns].
     """
 
     def __init__(self, config: Config, offset_ns: Callable[[], int] = wall_offset_ns) -> None:
@@ -125,17 +128,18 @@ class StateMaker:
         self._status = Status(None, 1.0, None)
 
     def update(self, news: Status | Welcome) -> None:
-        """Update from a status or a welcome of the loop."""
+        """Store a status or a welcome from the loop for the following states."""
         if isinstance(news, Welcome):
             self._welcome = news
         else:
             self._status = news
 
     def records(self, rows: NDArray[np.void]) -> None:
-        """Update from a batch of records."""
+        """Store the newest record of a batch, and update the velocities and the statistics."""
         newest, before = rows[-1], self._newest
         if before is not None:
-            # Differences over a batch and not over a cycle: at 1 kHz one encoder count is a large step of velocity.
+            # Velocities are differences over a batch, not over a cycle: at 1 kHz, one encoder count per cycle would be
+            # a large step in velocity.
             span = (int(newest["cycle"]) - int(before["cycle"])) * self._period
             velocity = (newest["pose"] - before["pose"]) / span
             self._acceleration = (velocity - self._velocity) / span
@@ -154,21 +158,21 @@ class StateMaker:
 
     @property
     def lease(self) -> str | None:
-        """Holder of the lease; None if it is free."""
+        """User who holds the lease; None if the lease is free."""
         return self._status.lease
 
     @property
     def cycle(self) -> int:
-        """Cycle of the newest record; 0 before the first."""
+        """Cycle of the newest record; 0 before the first record has arrived."""
         return 0 if self._newest is None else int(self._newest["cycle"])
 
     def newest(self, warnings: tuple[str, ...] = ()) -> State:
-        """Return the state according to the newest record, with the given warnings."""
+        """Return the state at the newest record, with the given warnings."""
         row = self._newest
         lateness, cycle, setpoints = self._statistics
         goal, target = self._status.goal, self._status.target
         a, b, c = self._status.counts
-        offset = row["backlash"]  # part of the drives' positions, not of the sliders'
+        offset = row["backlash"]  # contained in the positions of the drives, but not in those of the sliders
         return State(
             seq=int(row["cycle"]),
             t=round(int(row["cycle"]) * self._period, 9),
@@ -248,7 +252,7 @@ def _triple(values: NDArray[np.float64]) -> Triple:
 
 
 def info(config: Config) -> Info:
-    """Return the reply on …/info for a configuration."""
+    """Return the reply to queries on …/info for a configuration."""
     live = config.telemetry.live_port
     legs: list[dict[str, Any]] = []
     for name, leg in zip(NAMES, geometry(config.geometry).each, strict=True):

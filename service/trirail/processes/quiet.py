@@ -1,12 +1,14 @@
-"""Cycles without events ("quiet" cycles) as one compiled call, which runs from cycle to cycle until Python is needed.
+"""Compiled call that runs cycles without events ("quiet" cycles), one after the other, until Python is needed.
 
-A cycle consists of wait, SYNC, received frames, `observe`, then `command`, `hold` or `follow`, the last gate, setpoints
-and record. The call decides nothing. If a decision must precede the setpoints (a drive sends anything but its position,
-a request is urgent, a neighbour has disconnected, the last gate refuses), the call returns at that stage, and Python
-continues from there. Other work is left to Python after the setpoints have been sent.
+In each cycle, the call waits for the tick, sends the SYNC, receives frames and calls `observe`. It then calls
+`command`, `hold` or `follow`, applies the last gate to the setpoints, and writes setpoints and record. The call makes
+no decisions. Some decisions must be made before the setpoints are sent: if a drive sends anything other than its
+position, a request is urgent, a neighbour has disconnected, or the last gate refuses a setpoint. In these cases the
+call returns at the stage that it has reached, and Python continues from there. If other work is due, the call returns
+after the setpoints have been sent.
 
-A signal does not end a wait: Python's handlers run once the call has returned, at the end of a batch of records at the
-latest.
+A signal does not end a wait. Python's signal handlers run when the call has returned, which is at the end of a batch of
+records at the latest.
 """
 
 from __future__ import annotations
@@ -41,21 +43,24 @@ from trirail.processes.heartbeats import URGENT_INDEX
 from trirail.wire.records import MAX_PART_NS, Part
 
 _PEER_GONE: Final = (0x008 | 0x010) << 16
-"""POLLERR and POLLHUP of poll.h, in the bits of `revents`."""
+"""POLLERR and POLLHUP of poll.h, shifted to the position of `revents` in a struct pollfd."""
 
 
 class Reached(IntEnum):
-    """Stage reached by the newest cycle."""
+    """Stage that the newest cycle has reached when the compiled call returns."""
 
     WAITED = 0
-    """The tick is due; frames may have been received."""
+    """The tick is due. Frames may have been received before the SYNC."""
     SYNCED = 1
-    """The SYNC has been sent, as far as the bus accepts it; frames may have been received."""
+    """The SYNC has been sent, as far as the bus has accepted it. Frames may have been received."""
     OBSERVED = 2
-    """A following error exceeds its limit."""
+    """The feedback has been evaluated, and a following error exceeds its limit."""
     SOLVED = 3
-    """The sliders are solved, but the last gate has refused, the cycle is late, a setpoint does not fit into its frame,
-    or an output must be set by SDO."""
+    """The setpoints have been calculated, but not sent.
+
+    The reason is that the last gate has refused a setpoint, the cycle is late, a setpoint does not fit into its frame,
+    or an output must be set by SDO.
+    """
     WRITTEN = 4
     """The cycle is complete, except for setpoints or outputs that the bus has not accepted."""
     DONE = 5
@@ -65,59 +70,59 @@ class Reached(IntEnum):
 
 
 FOLLOW, HOLD, COMMAND = 0, 1, 2
-"""Sources of the setpoints."""
+"""Sources of the setpoints: FOLLOW for the measured positions, HOLD for a platform at rest, COMMAND for a motion."""
 
 STATE = np.dtype(
     [
         ("period_ns", "<i8"),
-        ("period", "<f8"),  # the same [s]
-        ("injected_ns", "<i8"),  # the time, for tests; negative: the monotonic clock
-        ("deadline_ns", "<i8"),  # of the newest tick
+        ("period", "<f8"),  # period [s]
+        ("injected_ns", "<i8"),  # time of an injected clock in tests; negative to use the monotonic clock
+        ("deadline_ns", "<i8"),  # time at which the newest tick was due
         ("lateness_ns", "<i8"),
-        ("synced", "<f8"),  # time at which its SYNC was sent [s]
-        ("marked_ns", "<i8"),  # time at which its newest part ended
+        ("synced", "<f8"),  # time at which the SYNC of the newest cycle was sent [s]
+        ("marked_ns", "<i8"),  # time at which the newest part of the cycle ended
         ("cycle", "<i8"),
-        ("until", "<i8"),  # the last cycle that may be run
-        ("due", "<i8"),  # the cycle after which a decision is due
-        ("overruns", "<i8"),  # ticks that have been missed
-        ("in_a_row", "<i8"),  # those before the newest, and their maximum
-        ("allowed", "<i8"),
-        ("missed", "<i8"),  # those before the newest tick
+        ("until", "<i8"),  # last cycle that may be run
+        ("due", "<i8"),  # cycle after which a decision is due
+        ("overruns", "<i8"),  # number of missed ticks since the start
+        ("in_a_row", "<i8"),  # number of consecutive missed ticks before the newest tick
+        ("allowed", "<i8"),  # tolerated maximum of in_a_row
+        ("missed", "<i8"),  # number of ticks missed immediately before the newest tick
         ("parts_ns", "<i4", len(Part)),
-        ("mode", "u1"),  # as in a record
+        ("mode", "u1"),  # number of the mode, as in a record
         ("source", "u1"),  # FOLLOW, HOLD or COMMAND
-        ("held", "u1"),  # as in trirail.control.cycle.follow
-        ("at_rest", "u1"),  # as in trirail.control.cycle.observe
-        ("in_sliders", "u1"),  # of the path
+        ("held", "u1"),  # argument of trirail.control.cycle.follow
+        ("at_rest", "u1"),  # argument of trirail.control.cycle.observe
+        ("in_sliders", "u1"),  # property of the path
         ("behind", "<i8"),  # result of trirail.control.cycle.observe
         ("code", "<i8"),  # result of trirail.control.cycle.command
-        ("time", "<f8"),  # of the law [s], and the rate that it leads to
-        ("target", "<f8"),
-        ("course", "<f8", 3),  # trirail.motion.runs.GoalSpan
-        ("fastest", "<f8"),  # as in trirail.control.cycle.observe
-        ("limit", "<f8"),
-        ("step", "<f8"),  # as in trirail.control.cycle.follow
-        ("settles", "u1"),  # whether a goal waits for the robot to be in position, and the cycle of its time-out
-        ("timeout", "<i8"),
-        ("urgent_seen", "<u8"),  # the count of urgent requests at the last check
-        ("listens", "u1"),  # whether a call during the wait for the next tick is served immediately
-        ("called", "u1"),  # whether a decision is due after the newest cycle
-        ("gateway_seen", "<u8"),  # trirail.processes.heartbeats.Watch
+        ("time", "<f8"),  # time in the law of the motion [s]
+        ("target", "<f8"),  # rate to which the law leads
+        ("course", "<f8", 3),  # values of a trirail.motion.runs.GoalSpan
+        ("fastest", "<f8"),  # argument of trirail.control.cycle.observe
+        ("limit", "<f8"),  # argument of trirail.control.cycle.observe
+        ("step", "<f8"),  # argument of trirail.control.cycle.follow
+        ("settles", "u1"),  # 1 if a goal waits until the robot is in position
+        ("timeout", "<i8"),  # cycle at which that wait times out
+        ("urgent_seen", "<u8"),  # count of urgent requests at the last check
+        ("listens", "u1"),  # 1 if a call during the wait for the next tick is served immediately
+        ("called", "u1"),  # 1 if a decision is due after the newest cycle
+        ("gateway_seen", "<u8"),  # this and the next two: state of a trirail.processes.heartbeats.Watch
         ("gateway_turns", "<i8"),
         ("gateway_patience", "<i8"),
-        ("gateway_place", "<i8"),
-        ("batched", "<i8"),  # records in the batch
-        ("handled", "<i8"),  # frames that have been processed
-        ("arrived", "<i8"),  # frames that have been received; Python must process those not handled
-        ("error", "<i8"),  # of receiving frames: a number of errno.h
-        ("sent", "<i8"),  # setpoints that the bus has accepted
-        ("logged", "<i8"),  # rows in the log of switches, and the cycle after which they are reported
-        ("report_due", "<i8"),
-        ("report_after", "<i8"),
+        ("gateway_place", "<i8"),  # index of the gateway's heartbeat
+        ("batched", "<i8"),  # number of records in the batch
+        ("handled", "<i8"),  # number of frames that have been processed
+        ("arrived", "<i8"),  # number of frames that have been received; Python must process those not handled
+        ("error", "<i8"),  # error of receiving frames, a number of errno.h
+        ("sent", "<i8"),  # number of setpoints that the bus has accepted
+        ("logged", "<i8"),  # number of rows in the log of switches
+        ("report_due", "<i8"),  # cycle after which the log of switches is reported
+        ("report_after", "<i8"),  # number of cycles from the first row of the log to its report
     ],
     align=True,
 )
-"""State of the compiled call between cycles, and its results."""
+"""State of the compiled call between cycles, with its settings and its results."""
 
 _STATE = from_dtype(STATE)[::1]
 
@@ -131,7 +136,7 @@ def _now_ns(state: NDArray[np.void], moment: NDArray[np.int64]) -> int:
 
 @compiled()
 def _wait(state: NDArray[np.void], moment: NDArray[np.int64], pollfds: NDArray[np.int32]) -> bool:
-    """Wait for the deadline; return whether a neighbour's call must be served before it."""
+    """Wait for the deadline. Return True if a neighbour has called and the call must be served before the deadline."""
     if state[0].injected_ns >= 0:
         return bool(state[0].listens and called(pollfds))
     if state[0].listens:
@@ -142,7 +147,7 @@ def _wait(state: NDArray[np.void], moment: NDArray[np.int64], pollfds: NDArray[n
 
 @compiled()
 def _mark(state: NDArray[np.void], moment: NDArray[np.int64], part: int) -> None:
-    """Record the duration of a part of the cycle, at its end."""
+    """Record the duration of a part of the cycle at the end of the part."""
     now = _now_ns(state, moment)
     state[0].parts_ns[part] = min(now - state[0].marked_ns, MAX_PART_NS)
     state[0].marked_ns = now
@@ -160,7 +165,7 @@ def _receive(
     times: NDArray[np.void],
     t: float,
 ) -> bool:
-    """Receive and process frames; return whether all of them were expected and none is left."""
+    """Receive and process frames. Return True if there was no error, all frames were expected and no frame is left."""
     s.arrived, s.error = receive_frames(bus, arrivals, arrived, moment)
     s.handled = process_frames(arrived, s.arrived, expected, axes, times, t)
     return bool(s.error == 0 and s.handled == s.arrived and s.arrived < MOST_FRAMES)
@@ -233,28 +238,28 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
     words: NDArray[np.int64],
     log: NDArray[np.void],
 ) -> int:
-    """Run cycles; return the stage that the newest has reached, a Reached.
+    """Run cycles until Python is needed; return the stage that the newest cycle has reached, as a number of Reached.
 
-    Parameters not listed are as in control.cycle and cycle_frames.
+    The parameters that are not listed here are the same as in control.cycle and cycle_frames.
 
     Parameters
     ----------
     moment : (2,)
-        Room for a struct timespec.
+        Memory for a struct timespec.
     bus : (3,)
-        A BusAccess.
+        BusAccess of the bus.
     pins, switchings
-        Frames of the drives' outputs, and their headers.
+        Frames for the outputs of the drives, and the headers of these frames.
     pollfds : (n, 2)
-        Array of struct pollfd, the gateway's first.
+        Array of struct pollfd, of which the first is that of the gateway.
     hearts
         Counters of trirail.processes.heartbeats.
     batch : (n, SIZE)
-        Room for records.
+        Memory for packed records.
     made : (SIZE,)
         Bytes of `record`.
     switches, planned, words, log
-        Tables of outputs, as in control.outputs.switch.
+        Tables of outputs, the same as in control.outputs.switch.
 
     """
     s, row = state[0], record[0]
@@ -288,7 +293,7 @@ def run(  # noqa: PLR0912, PLR0915 - a cycle in its order
         _mark(state, moment, Part.SYNC)
 
         called_now = called(pollfds)
-        count = hearts[s.gateway_place]  # as trirail.processes.heartbeats.Watch checks it
+        count = hearts[s.gateway_place]  # the same check as in trirail.processes.heartbeats.Watch
         turns = s.gateway_turns + 1 if count == s.gateway_seen and count else 0
         if hearts[URGENT_INDEX] != s.urgent_seen or pollfds[0, 1] & _PEER_GONE != 0 or turns > s.gateway_patience:
             return Reached.SYNCED

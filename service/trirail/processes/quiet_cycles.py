@@ -1,4 +1,4 @@
-"""Python side of the compiled call that runs the cycles without events."""
+"""Python code that prepares and calls the compiled function, which runs the cycles without events."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ from trirail.wire.vocabulary import MODES
 
 _NAMES = quiet.STATE.names or ()
 _MAX_CYCLES = 1 << 40
-"""Limit of cycles per call, larger than any batch."""
+"""Maximum number of cycles per call. It is larger than any batch, so that the batch ends the call."""
 _NO_CYCLE = 1 << 62
 """Number of a cycle that is never reached."""
 _IDLE_LAW = constant_law(1.0)
 _EMPTY_PATH = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
-"""Law and path for compiled code without a motion."""
+"""Law and path that are passed to compiled code if there is no motion."""
 
 
 class QuietResult(NamedTuple):
-    """Result of the compiled call: the newest cycle that it has begun."""
+    """Result of the compiled call, which describes the newest cycle that the call has begun."""
 
     reached: Reached
     deadline_ns: int
     lateness_ns: int
     missed: int
-    """Number of ticks that were skipped before the cycle and are not counted yet."""
+    """Number of ticks that were skipped before the cycle."""
     marked_ns: int
-    """Time at which the cycle's newest part ended [ns]."""
+    """Time at which the newest part of the cycle ended [ns]."""
     called: bool
-    """Whether a neighbour has called, or messages must be sent."""
+    """True if a neighbour has called, or if a decision is due."""
     behind: int
-    """Result of trirail.control.cycle.observe, if the cycle stopped there."""
+    """Result of trirail.control.cycle.observe, if the cycle stopped after that function."""
     code: int
-    """Result of trirail.control.cycle.command, if the cycle stopped there."""
+    """Result of trirail.control.cycle.command, if the cycle stopped after that function."""
 
 
 class QuietCycles:
-    """Caller of the compiled call, with the arrays that it works on; `run` may be called between two cycles."""
+    """Caller of the compiled function, with the arrays that this function uses. Call `run` only between two cycles."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class QuietCycles:
         urgent_flag: UrgentFlag,
     ) -> None:
         self.cycles = 0
-        """Number of cycles run by the compiled call."""
+        """Number of cycles that the compiled function has run."""
         self._control = control
         self._drives = drives
         self._reports = reports
@@ -77,33 +77,35 @@ class QuietCycles:
         self._poll_set = poll_set
         self._lent: Cyclic | None = None
         self._orders = 0
-        """Number of orders sent to the drives before they lent their tables."""
+        """Number of orders that the control had given to the drives when the drives lent their tables."""
         self._decided = False
-        """Whether Python has handled anything since the newest cycle."""
+        """True if Python may have changed the motion or the mode since the arguments were prepared."""
         self._steady: SteadyState | None = None
         self._tables: tuple[Any, ...] = ()
         self._motion: tuple[Any, ...] = ()
-        """Arguments of the compiled call, kept until the drives lend other tables or the motion changes."""
+        """Arguments of the compiled function, valid until the drives lend other tables or the motion changes."""
         self._nothing = np.zeros(1)
         measured, setpoints = control.measured, control.setpoints
         self._made = measured.record.view(np.uint8)
         state = self._state[0]
         self.parts_ns: MutableSequence[int] = state["parts_ns"]
-        """Durations of the newest cycle's parts [ns], in the memory that compiled code writes."""
+        """Durations of the parts of the newest cycle [ns], in the memory to which compiled code writes."""
         state["period"], state["period_ns"] = control.period, round(control.period * 1e9)
         state["injected_ns"] = -1
         state["fastest"], state["limit"], state["step"] = measured.fastest, measured.limit, setpoints.step
         state["gateway_place"], state["gateway_patience"] = PROCESSES.index("gateway"), watch.patience
 
     def run(self, ticker: Ticker, overruns: Overruns, *, listens: bool, once: bool) -> QuietResult | None:
-        """Run cycles until an event or the end of a batch; return the newest, or None if Python must run the cycle.
+        """Run cycles until an event or the end of a batch, and return the result for the newest cycle.
+
+        Return None if no cycle was run, because Python must run the next cycle.
 
         Parameters
         ----------
         listens
-            Whether a call during the wait for the first tick is served before that tick.
+            True if a call during the wait for the first tick must be served before that tick.
         once
-            Whether to run a single cycle, since messages wait to be sent after it.
+            True to run only one cycle, because messages wait to be sent after that cycle.
 
         """
         control, state = self._control, self._state[0]
@@ -125,7 +127,7 @@ class QuietCycles:
         state["logged"], state["report_due"] = control.outputs.logged, control.outputs.report_due
         self._poll_set.refresh()
         reached = Reached(quiet.run(*self._tables, *self._motion))
-        left = dict(zip(_NAMES, state.item(), strict=True))  # faster than reading field by field
+        left = dict(zip(_NAMES, state.item(), strict=True))  # faster than reading each field separately
         overruns.all, overruns.in_a_row = left["overruns"], left["in_a_row"]
         watch.seen, watch.silent_turns = left["gateway_seen"], left["gateway_turns"]
         self._reports.batched, ticker.deadline_ns = left["batched"], left["deadline_ns"]
@@ -144,15 +146,15 @@ class QuietCycles:
         return QuietResult(reached, *tick, left["marked_ns"], called, left["behind"], left["code"])
 
     def leave(self, handled: int = 0, arrived: int = 0, *, synced: float | None = None, error: int = 0) -> None:
-        """Return the lent tables to the drives, as in trirail_drivers.driver.cyclic.Lender.reclaim."""
+        """Return lent tables to the drives, with the parameters of trirail_drivers.driver.cyclic.Lender.reclaim."""
         if self._lent is not None:
             self._control.measured.feedback = self._drives.reclaim(handled, arrived, synced=synced, error=error)
             self._lent = None
 
     def _tables_ready(self) -> bool:
-        """Prepare the tables of the compiled call; return False if Python must run the next cycle.
+        """Prepare the arguments of the compiled function. Return False if Python must run the next cycle.
 
-        Tables stay lent by the drives as long as decisions concern only the motion and not the drives.
+        The drives lend their tables until a decision of the control concerns the drives, and not only the motion.
         """
         if self._lent is not None and not self._decided:
             return True
@@ -171,7 +173,7 @@ class QuietCycles:
         return self._lent is not None
 
     def add(self, part: Part) -> None:
-        """Add the time since the newest cycle to a part of it; nothing if a simulated clock is ahead."""
+        """Add the time since the newest cycle to the duration of one of its parts; 0 if a simulated clock is ahead."""
         passed = max(0, time.perf_counter_ns() - int(self._state[0]["marked_ns"]))
         self.parts_ns[part] = min(int(self.parts_ns[part]) + passed, MAX_PART_NS)
 
@@ -189,7 +191,7 @@ class QuietCycles:
             state["in_sliders"], state["target"], state["course"] = run.path.in_sliders, run.target, run.goal_span
 
     def _table_arguments(self, lent: Cyclic) -> tuple[Any, ...]:
-        """Return the arguments of the compiled call that stay the same while the drives lend their tables."""
+        """Return the arguments of the compiled function that stay the same while the drives lend their tables."""
         measured, setpoints, schedule = self._control.measured, self._control.setpoints, self._control.schedule
         return (
             *(self._state, self._moment, lent.bus),
@@ -204,7 +206,7 @@ class QuietCycles:
         )
 
     def _motion_arguments(self, run: Run | None) -> tuple[Any, ...]:
-        """Return the arguments of the compiled call for a motion."""
+        """Return the arguments of the compiled function that depend on the motion."""
         path, law = (run.path, run.law) if run is not None else (_EMPTY_PATH, _IDLE_LAW)
         furthest = run.furthest if run is not None else self._nothing
         outputs = self._control.outputs

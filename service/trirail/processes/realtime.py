@@ -1,6 +1,6 @@
-"""Real-time rights of the loop: scheduling, locked memory, a processor of its own, no garbage collection.
+"""Real-time rights of the loop: real-time scheduling, locked memory, a separate processor and no garbage collection.
 
-Functions for all processes release memory that is needed only at their start.
+The module also contains functions with which every process releases the memory that it needs only at its start.
 """
 
 from __future__ import annotations
@@ -26,34 +26,35 @@ _libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
 def trim() -> None:
-    """Collect garbage, and return free memory to the system."""
+    """Collect garbage, and return free memory to the operating system."""
     gc.collect()
     return_free_memory()
 
 
 def return_free_memory() -> None:
-    """Return malloc's free memory to the system."""
+    """Return the free memory of malloc to the operating system."""
     _libc.malloc_trim(0)
 
 
 def bound_heap() -> None:
-    """Keep bursts of large blocks from fragmenting the heap; call before the first thread starts."""
-    # mallopt(3): by default malloc raises its threshold for mapping a block to the largest block that was freed, and
-    # each of Zenoh's threads gets an arena that keeps its greatest size.
+    """Prevent bursts of large blocks from fragmenting the heap. Call this function before the first thread starts."""
+    # mallopt(3): by default, malloc maps only blocks that are larger than any block that was freed before, and each of
+    # Zenoh's threads has an arena that never becomes smaller.
     _libc.mallopt(_M_MMAP_THRESHOLD, 131_072)
     _libc.mallopt(_M_ARENA_MAX, 2)
 
 
 def release_startup_memory() -> None:
-    """Trim the heap, and drop the pages of libraries that can be read from their files again."""
-    # Loading a library touches most of it, LLVM's 68 MB for instance; pages needed later come from the page cache.
+    """Trim the heap, and release those memory pages of libraries that can be read from their files again."""
+    # Loading a library reads most of it into memory, for example 68 MB of LLVM. Pages that are needed later are read
+    # again from the page cache.
     trim()
     for start, end in _clean():
         _libc.madvise(start, end - start, _MADV_DONTNEED)
 
 
 def _clean() -> Iterator[tuple[int, int]]:
-    """Yield the address range of each library mapping that is read-only and has no private pages."""
+    """Yield the address range of each mapping of a library that is read-only and has no private pages."""
     path, rights, start, end = "", "", 0, 0
     for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
         first, *rest = line.split()
@@ -70,7 +71,10 @@ _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 PLANNER_BELOW = 10
 """Difference between the priorities of the loop and the planner."""
 DRIVES_BELOW = 5
-"""Difference between the priorities of loop and simulated drives; drives must answer while the planner works."""
+"""Difference between the priorities of the loop and the simulated drives.
+
+It is smaller than that of the planner, because the drives must answer while the planner works.
+"""
 
 
 def _call(name: str, *arguments: int) -> None:
@@ -80,12 +84,12 @@ def _call(name: str, *arguments: int) -> None:
 
 
 def die_with_parent(signal_number: int) -> None:
-    """Make the kernel send this process a signal when its parent ends."""
+    """Make the kernel send a signal to this process when the parent process ends."""
     _call("prctl", _PR_SET_PDEATHSIG, signal_number)
 
 
 def name_process(name: str) -> None:
-    """Set the name of this process in `ps`; a forked process would keep its parent's."""
+    """Set the name of this process in `ps`. Otherwise, a forked process would have the name of its parent."""
     setproctitle(title(name))
 
 
@@ -95,12 +99,12 @@ def _fifo(loop: LoopTable) -> None:
 
 def _lock_memory(_: LoopTable) -> None:
     """Lock all current and future pages in memory."""
-    # mlockall(2) with MCL_ONFAULT: all mapped pages would be five times as much memory as those in use.
+    # mlockall(2) with MCL_ONFAULT locks only pages in use. All mapped pages would need five times as much memory.
     _call("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
 
 
 def processor(loop: LoopTable) -> int:
-    """Return the number of the loop's processor."""
+    """Return the number of the processor on which the loop runs."""
     return max(os.sched_getaffinity(0)) if loop.cpu is None else loop.cpu
 
 
@@ -109,7 +113,7 @@ def _pin(loop: LoopTable) -> None:
 
 
 def _stay_awake(_: LoopTable) -> None:
-    # Documentation/power/pm_qos_interface: the request holds for as long as the file stays open.
+    # Documentation/power/pm_qos_interface: the request is valid as long as the file stays open.
     handle = os.open("/dev/cpu_dma_latency", os.O_WRONLY | os.O_CLOEXEC)
     os.write(handle, struct.pack("i", 0))
 
@@ -126,9 +130,9 @@ _MEASURES: tuple[tuple[str, Callable[[LoopTable], None], str], ...] = (
 
 
 def stay_beside(loop: LoopTable, below: int) -> tuple[str, ...]:
-    """Move this process off the loop's processor, if there is another, and set its priority; return failures.
+    """Move this process away from the loop's processor, if there is another processor, and set its priority.
 
-    `below` is the difference between the priorities of the loop and of this process.
+    `below` is the difference between the priorities of the loop and of this process. Return a message for each failure.
     """
     trim()
     gc.freeze()
@@ -146,11 +150,12 @@ def stay_beside(loop: LoopTable, below: int) -> tuple[str, ...]:
 
 
 def acquire(loop: LoopTable) -> tuple[str, ...]:
-    """Acquire the real-time rights that the configuration requests; return those that failed, each with its remedy.
+    """Acquire the real-time rights that the configuration requests.
 
-    Raises ServiceError if one fails with `realtime = "enforce"`.
+    Return a message with the remedy for each right that could not be acquired. Raises ServiceError if a right cannot be
+    acquired and `realtime = "enforce"` is set.
     """
-    _call("prctl", _PR_SET_TIMERSLACK, 1)  # 50 µs by default for tasks that are not real-time
+    _call("prctl", _PR_SET_TIMERSLACK, 1)  # the default is 50 µs for tasks without real-time scheduling
     trim()
     gc.freeze()
     gc.disable()

@@ -1,4 +1,4 @@
-"""Recorder process: passes the loop's packets to the recorder and to the black box."""
+"""Recorder process, which passes the loop's packets to the recorder and to the black box."""
 
 from __future__ import annotations
 
@@ -41,15 +41,20 @@ from trirail.wire.packets import (
 from trirail.wire.records import last_cycle
 
 GATHER = 0.14
-"""Pause in which packets accumulate before they are read [s]; waking up for each packet costs more than processing it.
-Killing the recorder loses less than 0.2 s of data: the packets of this pause and the loop's batch."""
+"""Pause in which packets accumulate before they are read [s]. Waking up for each packet costs more than processing it.
+
+If the recorder is killed, less than 0.2 s of data is lost: the packets of this pause, and the batch in the loop.
+"""
 
 NOT_FOR_OTHERS = 0o027
-"""Umask of recordings: the owner may write them, the group may read them."""
+"""Umask for recordings: the owner may read and write them, and the group may read them."""
 
 
 class Intake:
-    """Intake of the loop's packets for the recorder and the black box, with notices to the loop."""
+    """Receiver of the loop's packets, which passes them to the recorder and to the black box.
+
+    It also sends notices to the loop, for example if data cannot be written.
+    """
 
     def __init__(self, config: Config, record: str | None, link: PacketLink, ready: Callable[[object], None]) -> None:
         self._link = link
@@ -59,7 +64,7 @@ class Intake:
         self._loop_death = LoopDeath(config.period)
         path = Path(record) if record else None
         directory = Path(config.telemetry.directory)
-        sidecars = path is None  # a user who names a single file does not expect others beside it
+        sidecars = path is None  # a user who names a single file does not expect further files next to it
         self.recorder = recorder = Recorder(config, directory, path=path, sidecars=sidecars, warn=self._warn)
         folder = recorder.path.parent
 
@@ -69,7 +74,7 @@ class Intake:
         self._box = BlackBox(config.loop.rate_hz, box, self._warn)
 
     def on_packet(self, packet: bytes) -> None:
-        """Process a packet of the loop."""
+        """Process a packet from the loop."""
         self._loop_death.record_activity()
         content = packet[1:]
         if packet[0] == Kind.RECORDS:
@@ -82,14 +87,14 @@ class Intake:
             self._handle_answer(decode_answer(content))
 
     def save(self) -> None:
-        """Write the processed packets; report to the loop when writing begins to fail, and when it works again."""
+        """Write the processed packets. Report to the loop when writing begins to fail, and when it works again."""
         self.recorder.save()
-        what, why = self.recorder.unrecorded  # compare only `what`: the reason has the free space, which changes
+        what, why = self.recorder.unrecorded  # only `what` is compared: `why` contains the free space, which changes
         if what != self._reported_unrecorded and self._send(Unrecorded(what and f"{what}: {why}")):
             self._reported_unrecorded = what
 
     def loop_gone(self) -> None:
-        """Record the end of the loop, unless the loop has said farewell."""
+        """Record the death of the loop as events, unless the loop has sent its farewell."""
         for event in self._loop_death.events(self._cycle):
             self._handle_answer(EventReport(event))
 
@@ -120,17 +125,17 @@ class Intake:
                 self._ready({"recording": str(recorder.path), "live": recorder.live_url})
 
     def _warn(self, text: EventText) -> None:
-        """Write a warning to the service's log, and announce it to everyone."""
+        """Write a warning to the service's log, and announce it to all clients."""
         with contextlib.suppress(OSError):  # the log may be on the full disk
             print(f"trirail: recorder: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the log
         self._announce("warning", text)
 
     def _announce(self, level: Level, text: EventText) -> None:
-        """Make the loop announce a notice."""
+        """Ask the loop to announce a notice."""
         self._send(Announcement(Notice("service", level, text.text, **text.fields)))
 
     def _send(self, packet: RecorderMessage) -> bool:
-        """Send a packet to the loop; return False if its queue is full, or it has disconnected."""
+        """Send a packet to the loop. Return False if the queue is full, or if the loop has disconnected."""
         with contextlib.suppress(LinkClosed):
             return self._link.send(message(packet))
         return False
@@ -144,9 +149,9 @@ def main(
     ready: Callable[[object], None],
     report_measurements: Callable[[msgspec.Struct], None],
 ) -> int:
-    """Run the recorder process until the loop disconnects, or SIGTERM; return its exit code.
+    """Run the recorder process until the loop disconnects or SIGTERM arrives; return the exit code.
 
-    `report_measurements` is called each second if the configuration enables metrics.
+    `report_measurements` is called once per second, if the configuration enables metrics.
     """
     os.umask(NOT_FOR_OTHERS | os.umask(NOT_FOR_OTHERS))
     intake = Intake(config, record, link, ready)
@@ -176,6 +181,6 @@ def main(
     except LinkClosed:
         intake.loop_gone()
     finally:
-        heart.rest()  # completing the files may take longer than a heartbeat allows
+        heart.rest()  # completing the files may take longer than the time-out of the heartbeat
         intake.close()
     return 0

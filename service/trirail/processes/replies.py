@@ -1,8 +1,9 @@
 """Replies to queries, sent by separate threads, and announcements of refusals at a limited rate.
 
-A client that does not read its replies does not block other clients. A client sends each stop both over Zenoh and to
-the stop port; the service carries it out once, and both copies get the same reply. The slower copy may arrive when the
-robot moves again, and must not stop goals that were sent after the first copy was confirmed.
+Because of the threads, a client that does not read its replies does not block other clients. A client sends each stop
+both over Zenoh and to the stop port. The service carries the stop out once, and answers both copies with the same
+reply. The slower copy may arrive after the robot has begun to move again. It must not stop goals that were sent after
+the first copy was confirmed.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from trirail.wire.sizes import MAX_REFUSED
 from trirail.wire.text import is_name, quoted
 
 REMEMBERED_S = 60.0
-"""Time for which the reply to a stop is kept for later copies [s]; no client waits longer."""
+"""Time for which the reply to a stop is stored for later copies [s]. No client waits longer than this for a reply."""
 COPIES_KEPT = 4096
-"""Maximum number of stops remembered; the oldest are forgotten first."""
+"""Maximum number of stored stops. If there are more, the oldest are deleted."""
 
 _Id = tuple[str, str, bytes]
 
 
 class _Stop:
-    """State of one stop, shared by its copies."""
+    """State of a stop, which is common to all of its copies."""
 
     def __init__(self, came: float) -> None:
         self.came = came
@@ -45,14 +46,20 @@ class _Stop:
 
 
 class Copies:
-    """Registry of stops that have arrived, by key, id and content; a stop without an id has no copies."""
+    """Registry of stops that have arrived. Copies of a stop have the same key, id and content.
+
+    A stop without an id is never regarded as a copy.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._stops: dict[_Id, _Stop] = {}  # in the order of arrival
 
     def first(self, incoming: Incoming) -> bool:
-        """Register a stop; return False for a later copy, whose reply is `known` or will be that of the first."""
+        """Register a stop, and return True if it is the first copy.
+
+        The reply to a later copy is `known`, or the copy is stored until the first copy is answered.
+        """
         if not incoming.id:
             return True
         if (stop := self._stops.get(_id(incoming))) is not None:
@@ -64,12 +71,15 @@ class Copies:
         return True
 
     def known(self, incoming: Incoming) -> msgspec.Struct | None:
-        """Return the reply to the first copy of a stop; None if it has not been answered yet."""
+        """Return the reply to the first copy of a stop; None if the first copy has not been answered yet."""
         stop = self._stops.get(_id(incoming))
         return stop.answer if stop is not None else None
 
     def answered(self, incoming: Incoming, content: msgspec.Struct) -> list[Incoming]:
-        """Store the reply to a stop, and return the copies that wait for it; forget a stop that was not carried out."""
+        """Store the reply to a stop, and return the copies that wait for the reply.
+
+        If the stop was refused because the service was busy, delete it, so that a later copy is carried out.
+        """
         stop = self._stops.get(_id(incoming))
         if stop is None or stop.answer is not None:
             return []
@@ -80,7 +90,7 @@ class Copies:
         return waiting
 
     def _forget(self) -> None:
-        """Forget stops that are too old, or too many."""
+        """Delete the oldest stops, if they are older than REMEMBERED_S or there are COPIES_KEPT stops."""
         while self._stops:
             name, oldest = next(iter(self._stops.items()))
             if len(self._stops) < COPIES_KEPT and self._clock() - oldest.came < REMEMBERED_S:
@@ -93,22 +103,26 @@ def _id(stop: Incoming) -> _Id:
 
 
 THREADS = 32
-"""Number of threads; as many clients can block on their replies without delaying others."""
+"""Number of threads. Other clients are delayed only if this number of clients do not read their replies."""
 CLOSE_WITHIN = 2.0
-"""Longest time for sending the last replies [s]."""
+"""Maximum time for sending the last replies [s]."""
 
 
 class Replies:
-    """Sender of replies, in order for each client; a reply is kept until the transport closes the client's session."""
+    """Sender of replies, which sends the replies to each client in order.
+
+    A reply that a client does not read is stored until the transport closes the client's session.
+    """
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
         self.copies = Copies()
         self._changed = threading.Condition()
-        # Not bounded: dropping a query sends a final message to the client, which may block as long as a reply.
+        # The queues are not limited. Dropping a query would not help: it sends a final message to the client, which may
+        # block as long as a reply.
         self._queues: dict[str, deque[tuple[Incoming, msgspec.Struct]]] = {}
         self._idle: deque[str] = deque()
-        """Clients with waiting replies of which none is being sent, in the order of their turns."""
+        """Names of queues from which no reply is being sent at the moment, in the order of their turns."""
         self._closed = False
         self._threads = [threading.Thread(target=self._run, name="replies", daemon=True) for _ in range(THREADS)]
         for thread in self._threads:
@@ -116,18 +130,21 @@ class Replies:
 
     @property
     def waiting(self) -> int:
-        """Number of waiting replies."""
+        """Number of replies that have not been sent yet."""
         with self._changed:
             return sum(map(len, self._queues.values()))
 
     def send(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Enqueue the reply to a message, without its copies; safe from any thread. A put gets no reply."""
+        """Enqueue the reply to a message, but not to its copies. A put gets no reply.
+
+        This method may be called from any thread.
+        """
         if incoming.at_door is not None:
             incoming.at_door(content)
         if incoming.query is None:
             return
-        # One queue per kind and user: a user who does not read one reply does not read the next ones either.
-        # Queries about a role share one queue for all users.
+        # There is one queue per kind of message and user, because a user who does not read one reply will not read the
+        # next replies either. Queries about a role have a common queue for all users.
         asker = f"{incoming.kind}/{incoming.user}"
         with self._changed:
             if asker not in self._queues:
@@ -137,7 +154,7 @@ class Replies:
             self._queues[asker].append((incoming, content))
 
     def send_now(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Send the reply to a message from this thread; block until the client reads it."""
+        """Send the reply to a message from the calling thread. This may block until the client reads the reply."""
         if incoming.at_door is not None:
             incoming.at_door(content)
         if incoming.query is not None:
@@ -145,16 +162,17 @@ class Replies:
                 self._answer(incoming, incoming.query, content)
 
     def answer(self, incoming: Incoming, content: msgspec.Struct) -> None:
-        """Answer a message, the equal messages merged into it, and the copies of each."""
+        """Answer a message, the equal messages that were merged into it, and the copies of all of these."""
         for each in (incoming, *incoming.alike):
             self.send(each, content)
             for copy in self.copies.answered(each, content):
                 self.send(copy, content)
 
     def without_copies(self, incoming: Incoming) -> Incoming | None:
-        """Return a stop without the copies merged into it; None if all of them are copies.
+        """Remove copies of earlier stops from a stop and the equal stops merged into it; return None if none is left.
 
-        Copies get the reply of the first copy. The number of the returned stop is the newest.
+        The removed copies are answered with the reply to their first copy. The returned stop has the number of the
+        newest stop that is left.
         """
         fresh = []
         for each in (incoming, *incoming.alike):
@@ -167,7 +185,7 @@ class Replies:
         return fresh[0]._replace(number=fresh[-1].number, alike=tuple(fresh[1:]))
 
     def close(self) -> None:
-        """Send the waiting replies, for at most CLOSE_WITHIN."""
+        """Send the replies that are waiting, but give up after CLOSE_WITHIN."""
         deadline = time.monotonic() + CLOSE_WITHIN
         with self._changed:
             self._closed = True
@@ -184,7 +202,7 @@ class Replies:
                 asker = self._idle.popleft()
                 incoming, content = self._queues[asker].popleft()
             self.send_now(incoming._replace(at_door=None), content)
-            del incoming, content  # dropping the last reference to the query completes it
+            del incoming, content  # deleting the last reference to the query completes the query
             with self._changed:
                 if self._queues[asker]:
                     self._idle.append(asker)
@@ -198,23 +216,26 @@ class Replies:
         except RefusedError:
             encoding = boundary.JSON
         payload = boundary.encode(content, encoding)
-        with query:  # complete the query; the client would otherwise wait for more replies until its time-out
+        with query:  # complete the query, because otherwise the client waits for further replies until its time-out
             if isinstance(content, ErrorReply):
                 query.reply_err(payload, encoding=encoding)
             else:
-                of_robot = incoming.kind in ("info", "poses")  # the key of the query may have wildcards
+                of_robot = incoming.kind in ("info", "poses")  # the key of such a query may contain wildcards
                 key = zenoh_session.key(self._robot, incoming.kind) if of_robot else incoming.key
                 query.reply(key, payload, encoding=encoding)
 
 
 REFUSALS_PER_SECOND = 10
-"""Number of one user's refusals per second that are announced to everyone; more get only their error reply."""
+"""Maximum number of refusals per second and user that are announced to all clients.
+
+The sender of a refused message receives an error reply in any case.
+"""
 REFUSALS_OF_ALL = 50
-"""The same for all users."""
+"""Maximum number of refusals per second of all users that are announced to all clients."""
 
 
 class Refusals:
-    """Refusals: error replies, and announcements to everyone, since a put has no reply."""
+    """Sender of refusals, as an error reply and as an announcement to all clients, because a put has no reply."""
 
     def __init__(self, link: PacketLink, replies: Replies) -> None:
         self._link = link
@@ -225,10 +246,11 @@ class Refusals:
         self._budget = Budget(MAX_REFUSED, MAX_REFUSED)
 
     def not_kept(self, incoming: Incoming, error: ErrorReply) -> None:
-        """Refuse a message that the inbox does not keep; safe from any thread. `announce_unkept` announces it later.
+        """Refuse a message that the inbox has not accepted. `announce_unkept` announces the refusal later.
 
-        If such refusals hold too much memory, this one is sent from the calling thread of Zenoh, so that nothing more
-        is received from a sender that does not read its replies.
+        This method may be called from any thread. If the refusals that wait to be sent occupy too much memory, this
+        refusal is sent from the calling thread of Zenoh. Nothing more is then received from a sender that does not read
+        its replies.
         """
         self._unkept.append((incoming.user, error))
         hold = self._budget.hold(incoming.user, incoming.held)
@@ -238,19 +260,19 @@ class Refusals:
             self._replies.send(incoming._replace(hold=hold), error)
 
     def announce_unkept(self) -> None:
-        """Announce the refusals of messages that were not kept."""
+        """Announce the refusals of messages that the inbox has not accepted."""
         while self._unkept:
             user, why = self._unkept.popleft()
             self.warn_everyone(why.message, user if is_name(user) else "", why.code)
 
     def refuse(self, incoming: Incoming, refusal: RefusedError) -> None:
-        """Refuse a message, and announce that to everyone."""
+        """Refuse a message, and announce the refusal to all clients."""
         text = quoted(str(refusal))
         self._replies.answer(incoming, ErrorReply(refusal.code, text))
         self.warn_everyone(text, incoming.user if is_name(incoming.user) else "", refusal.code)
 
     def warn_everyone(self, text: str, user: str = "", code: RefusalCode = RefusalCode.INTERNAL) -> None:
-        """Make the loop announce a refusal, at a limited rate."""
+        """Ask the loop to announce a refusal, at a limited rate."""
         now = time.monotonic()
         if now - self._announced_since >= 1.0:
             self._announced.clear()

@@ -1,4 +1,4 @@
-"""Messages of the loop to gateway and recorder, and the recorder's messages to the loop."""
+"""Messages from the loop to the gateway and the recorder, and messages from the recorder to the loop."""
 
 from __future__ import annotations
 
@@ -36,17 +36,20 @@ from trirail.wire.vocabulary import MODES
 BATCHES_PER_SECOND = 50
 ANSWERS_A_CYCLE = 8
 PROGRESS_EVERY = 0.1
-"""Interval between two progress reports of drives that are being configured [s]."""
+"""Minimum interval between two progress reports while drives are being configured [s]."""
 INPUTS_KEPT = 8
-"""Maximum number of control inputs that wait for the next batch of records; the recorder does not need them earlier."""
+"""Maximum number of control inputs that wait for the next batch of records.
+
+They normally wait, because the recorder does not need them earlier.
+"""
 EVENTS_KEPT = 1000
-"""Events kept for a restarted gateway, since the previous one may not have published all of them."""
+"""Number of events stored for a restarted gateway, because the previous gateway may not have published all of them."""
 
 
 class Reports:
-    """Reports of the loop: records in batches, events, answers, and the status that records do not contain.
+    """Sender of the loop's records in batches, events, answers, and status, which contains what is not in the records.
 
-    No call waits: packets for a slow gateway are kept, and packets for a slow recorder are lost.
+    No method waits. Events and answers for a slow gateway are stored, and packets for a slow recorder are lost.
     """
 
     def __init__(
@@ -79,10 +82,10 @@ class Reports:
         self._inputs = 0
         self._unsent_inputs: list[ControlInput] = []
         self._postponed = 0, 0
-        """Number of waiting events that belong to an earlier cycle than the events after them, and that cycle."""
+        """Number of waiting events that belong to an earlier cycle than later events, and the number of that cycle."""
         self._batch_size = max(1, config.loop.rate_hz // BATCHES_PER_SECOND)
         self._made = control.measured.record.view(np.uint8).data
-        """Bytes of the cycle's record, filled by the control."""
+        """Bytes of the newest cycle's record, which the control fills."""
         self._batch = memoryview(bytearray(1 + self._batch_size * SIZE))
         self._batch[0] = Kind.RECORDS
         self.batched = 0
@@ -91,16 +94,16 @@ class Reports:
         self._unrecorded = ""
 
     def note(self, now_ns: int, content: GivenInput, *, urgent: bool = False, waiting: bool = False) -> None:
-        """Keep an input of the control for the recorder.
+        """Store an input to the control until it is sent to the recorder.
 
         Parameters
         ----------
         now_ns
-            Time at which the control has received it [ns].
+            Time at which the control received the input [ns].
         urgent
-            Whether the input applies to the present cycle; otherwise it applies to the next.
+            True if the input applies to the present cycle, False if it applies to the next cycle.
         waiting
-            As in ControlInput.
+            The same as in ControlInput.
 
         """
         self._inputs += 1
@@ -109,7 +112,7 @@ class Reports:
         )
 
     def record(self, tick: Tick, overruns: int, parts_ns: Sequence[int]) -> None:
-        """Append the newest cycle's record."""
+        """Complete the record of the newest cycle, and append it to the batch."""
         control = self._control
         ticks = control.modes.cycle, tick.deadline_ns, tick.lateness_ns, overruns
         control.outputs.stamp(tick.deadline_ns)
@@ -120,23 +123,24 @@ class Reports:
 
     @property
     def full(self) -> bool:
-        """Whether the batch is full and must be sent."""
+        """True if the batch is full and must be sent."""
         return self.batched == self._batch_size
 
     @property
     def idle(self) -> bool:
-        """Whether all events and answers have been sent."""
+        """True if all events and answers have been sent."""
         return not (self._answers or self._sent_events < self._events)
 
     @property
     def batch(self) -> NDArray[np.uint8]:
-        """Array for the records of a batch, (n, SIZE) bytes, of which the first `batched` are filled."""
+        """Array for the records of a batch, (n, SIZE) bytes, of which the first `batched` rows are filled."""
         return np.frombuffer(self._batch, np.uint8)[1:].reshape(-1, SIZE)
 
     def pass_on(self) -> None:
-        """Send events and answers, if there are any, after the control's inputs.
+        """Send the inputs to the control, then the events and the answers, if there are any.
 
-        An event is stamped with the first cycle that shows its effect: the present one or, after its end, the next.
+        The number of an event's cycle is that of the first cycle that shows its effect. This is the present cycle or,
+        after the end of the present cycle, the next cycle.
         """
         if self._control.ledger.answers or self._control.ledger.notices or len(self._unsent_inputs) > INPUTS_KEPT:
             self._publish()
@@ -144,11 +148,11 @@ class Reports:
             self._send_answers()
 
     def postpone(self) -> None:
-        """Postpone events until after the next cycle; they keep the present cycle's number."""
+        """Postpone events until after the next cycle. They are still reported with the number of the present cycle."""
         self._postponed = len(self._control.ledger.notices), self._control.modes.cycle
 
     def flush(self) -> None:
-        """Send the batch, accept new peers, and send them the events kept for them."""
+        """Send the batch of records and captured frames, accept new peers, and send events that have not been sent."""
         self._send_inputs()
         if self.batched:
             batch = self._batch[: 1 + self.batched * SIZE]
@@ -165,7 +169,7 @@ class Reports:
         self._send_events()
 
     def accept_peers(self) -> None:
-        """Accept new peers."""
+        """Accept new connections of the gateway and the recorder, and send them the welcome and the status."""
         for port in (self._gateway, self._recorder):
             if port.accept():
                 port.send(message(self._welcome))
@@ -174,21 +178,21 @@ class Reports:
                     self._sent_events = 0
 
     def report_protections(self) -> None:
-        """Report to the gateway which protections the drives lack, if that has changed."""
+        """Report to the gateway which protections the drives lack, if these have changed."""
         missing = self._drives.missing_protections
         if missing != self._welcome.missing_protections:
             self._welcome = msgspec.structs.replace(self._welcome, missing_protections=missing)
             self._gateway.send(message(self._welcome))
 
     def _report_progress(self) -> None:
-        """Publish the progress of the drives' configuration, at intervals of PROGRESS_EVERY."""
+        """Send the status with the progress of the drives' configuration, at most every PROGRESS_EVERY."""
         cycles = self._control.cycles
         if (cycles - self._progress_at) * self._period >= PROGRESS_EVERY:
             self._progress_at, self._unready = cycles, self._control.measured.feedback.unready
             self._publish_status()
 
     def _measure_bus_load(self) -> None:
-        """Compute and report the fraction of the bus capacity in use, once a second."""
+        """Calculate and report the fraction of the bus capacity that is in use, once per second."""
         cycles = self._control.cycles - self._bus_measured_at
         if cycles * self._period >= 1.0:
             bits, self._bits = self._drives.traffic - self._bits, self._drives.traffic
@@ -197,7 +201,7 @@ class Reports:
             self._publish_status()
 
     def listen(self) -> None:
-        """Receive a message of the recorder, if any, and announce it; announce the loss of the recorder."""
+        """Process a message from the recorder, if one has arrived, and announce it or the loss of the recorder."""
         packet = self._recorder.receive()
         if self._recorder.clear_lost() and self._recorded:
             self._recorded = False
@@ -223,7 +227,7 @@ class Reports:
         self._publish_status()
 
     def _publish(self) -> None:
-        """Send the control's inputs, number and send the events, and enqueue the answers."""
+        """Send the inputs to the control, number and send the events, and enqueue the answers."""
         control, ledger = self._control, self._control.ledger
         self._send_inputs()
         (postponed, earlier), self._postponed = self._postponed, (0, 0)
@@ -241,13 +245,13 @@ class Reports:
         ledger.answers.clear()
 
     def _send_inputs(self) -> None:
-        """Send the control's inputs to the recorder."""
+        """Send the stored inputs to the control to the recorder."""
         for control_input in self._unsent_inputs:
             self._recorder.send(message(control_input))
         self._unsent_inputs.clear()
 
     def _publish_status(self) -> None:
-        """Send the status, if it has changed."""
+        """Send the status to the gateway and the recorder, if it has changed."""
         control, goal = self._control, self._control.ledger.goal
         goal_id, counts = goal.id if goal else None, control.measured.feedback.counts
         fault, lag = quoted(control.fault) if control.fault else None, goal.lag if goal else None
@@ -259,7 +263,7 @@ class Reports:
             self._recorder.send(packet)
 
     def _send_answers(self) -> None:
-        """Send at most ANSWERS_A_CYCLE answers; they wait for a slow gateway, and are dropped for a lost one."""
+        """Send at most ANSWERS_A_CYCLE answers. Answers wait for a slow gateway; if the gateway is lost, drop them."""
         if not self._gateway.connected:
             self._answers.clear()
         for _ in range(min(len(self._answers), ANSWERS_A_CYCLE)):
@@ -268,7 +272,7 @@ class Reports:
             self._answers.popleft()
 
     def _send_events(self) -> None:
-        """Send the gateway every kept event that it has not received."""
+        """Send to the gateway all stored events that have not been sent to it."""
         self._sent_events = max(self._sent_events, self._events - len(self._kept))
         while self._sent_events < self._events and self._gateway.send(self._kept[self._sent_events - self._events]):
             self._sent_events += 1

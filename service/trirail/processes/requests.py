@@ -1,7 +1,7 @@
-"""Requests of clients to the loop, each answered exactly once, and alignment reports.
+"""Requests from clients to the loop, each of which is answered exactly once, and reports of alignments.
 
-The gateway sends goals in turn, and commands and checks immediately. A command that stops the robot is carried out even
-if its content cannot be read.
+The gateway sends goals to the loop in the order of the users' turns, and sends commands and checks immediately. A
+command that stops the robot is carried out even if its content cannot be decoded.
 """
 
 from __future__ import annotations
@@ -34,20 +34,24 @@ from trirail.wire.text import quoted
 from trirail.wire.vocabulary import AcquireLease, Command, CommandContent, Stop
 
 MAX_GOALS_OF_USER = 3
-"""Maximum number of a user's goals in the loop: one being planned, the next one, and one more, which replaces the next
-one if both have the same target. Further goals wait in the gateway, where commands overtake them and a stop withdraws
-them."""
+"""Maximum number of goals of one user in the loop.
+
+One goal is being planned, one goal is next, and one more goal may replace the next goal if both have the same target.
+Further goals wait in the gateway, where commands overtake them and a stop withdraws them.
+"""
 MAX_GOALS = 16
-"""Maximum number of all users' goals in the loop, as many as it reads in four cycles."""
+"""Maximum number of goals of all users in the loop, which is the number that the loop reads in four cycles."""
 MAX_COMMANDS_OF_USER = 8
-"""Maximum number of one user's commands and checks in the loop; more are refused, except stops."""
+"""Maximum number of commands and checks of one user in the loop. Further ones are refused, except stops."""
 MAX_COMMANDS = 64
-"""The same for all users."""
+"""Maximum number of commands and checks of all users in the loop. Further ones are refused, except stops."""
 REPLY_TIMEOUT_S = 15.0
-"""Time-out of a command in the loop, after which an error is returned to the sender [s]."""
+"""Maximum time for the loop to answer a request [s]. After that time, the sender receives an error."""
 LOOK_BURST, LOOKS_PER_SECOND = 50, 20.0
-"""Number of one user's alignment looks accepted in a burst, and then per second. This is three times the number that an
-alignment without a camera sends."""
+"""Maximum number of alignment looks of one user that are accepted in a burst, and afterwards per second.
+
+This is three times the rate at which an alignment without a camera sends looks.
+"""
 
 
 class _PendingRequest(NamedTuple):
@@ -56,7 +60,10 @@ class _PendingRequest(NamedTuple):
 
 
 class Requests:
-    """Goals and commands in the loop, by ticket; forwards requests to the loop and answers to their senders."""
+    """Forwarder of requests to the loop, and of the loop's answers to the senders of the requests.
+
+    A ticket, which is a unique number, identifies each request.
+    """
 
     def __init__(
         self,
@@ -67,7 +74,10 @@ class Requests:
         loop_death: LoopDeath,
         urgent_section: Callable[[], AbstractContextManager[None]],
     ) -> None:
-        """Connect the parts; packets sent inside `urgent_section` are handled in the cycle of their arrival."""
+        """Connect the parts.
+
+        `urgent_section` returns a context. The loop handles packets sent within it in the cycle in which they arrive.
+        """
         homing = [drive.homing.timeout for drive in config.drives.each if drive.homing is not None]
         self._home_within = REPLY_TIMEOUT_S + sum(homing)
         self._takeover = config.control.takeover
@@ -77,7 +87,7 @@ class Requests:
         self._replies = replies
         self._loop_death = loop_death
         self.backlog = Backlog()
-        """Goals not sent to the loop yet."""
+        """Goals that have not been sent to the loop yet."""
         self._goals: dict[int, str] = {}
         """User of each goal in the loop, by ticket."""
         self._commands: dict[int, str] = {}
@@ -93,7 +103,7 @@ class Requests:
     # ------------------------------------------------------------------ goals
 
     def goal(self, incoming: Incoming, user: str, goal: Goal) -> None:
-        """Enqueue a goal behind the user's others. Raises RefusedError if too many are waiting."""
+        """Enqueue a goal after the user's other goals. Raises RefusedError if too many goals are waiting."""
         self.backlog.check_room(user, incoming.size)
         self._tickets += 1
         goal_id = goal.id or uuid.uuid4().hex[:12]
@@ -120,10 +130,10 @@ class Requests:
     # ------------------------------------------------------------------ commands
 
     def command(self, incoming: Incoming, user: str, name: Command, content: CommandContent | None) -> int:
-        """Send a command to the loop; return its ticket.
+        """Send a command to the loop; return the ticket of the command.
 
-        Raises RefusedError if too many commands are in progress, or if the user's role does not allow taking over the
-        lease.
+        Raises RefusedError if too many commands are in progress, or if the command takes over the lease and the role of
+        the user does not allow that.
         """
         if not name.stops:
             self._check_command_count(user)
@@ -136,13 +146,13 @@ class Requests:
         return request.ticket
 
     def check(self, incoming: Incoming, user: str, goal: LoopGoal) -> None:
-        """Request a plan for a goal without moving. Raises RefusedError if too many requests are in progress."""
+        """Ask the loop to plan a goal without moving. Raises RefusedError if too many requests are in progress."""
         self._check_command_count(user)
         self._tickets += 1
         self._send(incoming, CheckRequest(self._tickets, user, goal), REPLY_TIMEOUT_S)
 
     def _send(self, incoming: Incoming, request: CommandRequest | CheckRequest, within: float) -> None:
-        """Send the loop a request with a time-out [s]. Raises RefusedError if the loop's queue is full."""
+        """Send a request to the loop, with a time-out `within` [s]. Raises RefusedError if the loop's queue is full."""
         if not self._link.send(message(request)):
             raise RefusedError(RefusalCode.BUSY, "too many requests: send it again")
         self._commands[request.ticket] = request.user
@@ -159,7 +169,7 @@ class Requests:
     # ------------------------------------------------------------------ answers
 
     def answer(self, ticket: int, content: msgspec.Struct) -> None:
-        """Answer the request with this ticket, and send the next goal to the loop."""
+        """Answer the request with this ticket. If the request was a goal, send the next goals to the loop."""
         waiting = self._pending.pop(ticket, None)
         self._commands.pop(ticket, None)
         if waiting is not None:
@@ -168,14 +178,14 @@ class Requests:
             self.send_goals()
 
     def expire(self) -> None:
-        """Reply with a time-out error to requests that the loop has not carried out in time."""
+        """Answer requests that the loop has not answered in time with a time-out error."""
         now = time.monotonic()
         for ticket in [ticket for ticket, waiting in self._pending.items() if waiting.deadline < now]:
             self.answer(ticket, ErrorReply(RefusalCode.TIMEOUT, "not carried out in time"))
 
 
 class CommandReader:
-    """Decoder of commands, which passes valid ones to Requests and refuses the others."""
+    """Decoder of commands, which passes valid commands to Requests and refuses all others."""
 
     def __init__(
         self,
@@ -191,7 +201,7 @@ class CommandReader:
         self._inbox = inbox
         self._refuse = refuse
         self._of_unread: set[int] = set()
-        """Tickets of stops of a single goal that may still be in an unread message."""
+        """Tickets of stops that apply to a single goal, if that goal may be in a message that has not been read yet."""
 
     def read(self, incoming: Incoming, user: str, command: str) -> None:
         """Carry out a command, unless it is a copy of an earlier one. Raises RefusedError for an unknown command."""
@@ -214,15 +224,16 @@ class CommandReader:
         except RefusedError as refusal:
             if name not in STOPS:
                 raise
-            # A malformed stop is still meant as a stop: carry it out as if it had no content.
+            # The sender of a malformed stop wants to stop the robot. Carry the stop out as if it had no content.
             self._carry_out(incoming.unanswered(), user, name, None)
             raise RefusedError(refusal.code, f"{refusal}; {name} takes effect nevertheless") from refusal
         self._carry_out(incoming, user, name, content)
 
     def refused(self, ticket: int, error: ErrorReply) -> CommandReply | ErrorReply:
-        """Return the reply to a command that the loop refuses.
+        """Return the reply to a command that the loop has refused.
 
-        A stop of a goal that the loop does not know yet is confirmed if the goal may be unread: it will be withdrawn.
+        The loop refuses a stop of a goal that it does not know. If the goal may not have been read yet, the stop is
+        confirmed nevertheless, because the goal will be withdrawn when it is read.
         """
         unread = ticket in self._of_unread
         self._of_unread.discard(ticket)
@@ -231,7 +242,7 @@ class CommandReader:
         return error
 
     def _stopped(self) -> CommandReply:
-        """Return the reply to a stop of a goal that never reaches the loop."""
+        """Return the reply to a stop of a goal that is withdrawn before the loop begins it."""
         newest = self._states.newest()
         return CommandReply(Command.STOP, newest.mode, newest.seq)
 
@@ -243,7 +254,7 @@ class CommandReader:
         goal = content.goal if isinstance(content, Stop) else None
         reason = f"{name} by {user}"
         backlog = self._requests.backlog
-        if goal is not None and backlog.withdraw(goal, reason):  # before the loop has it
+        if goal is not None and backlog.withdraw(goal, reason):  # the goal has not been sent to the loop
             self._replies.answer(incoming, self._stopped())
             return
         ticket = self._requests.command(incoming, user, name, content)
@@ -255,7 +266,7 @@ class CommandReader:
 
 
 class Looks:
-    """Forwarder of the alignment looks that clients report, which the loop publishes as events."""
+    """Forwarder of alignment looks, which clients report and the loop publishes as events."""
 
     def __init__(self, announce: Callable[[Notice], bool], clock: Callable[[], float] = time.monotonic) -> None:
         self._announce = announce
@@ -263,7 +274,7 @@ class Looks:
         self._pace = Pace(LOOK_BURST, LOOKS_PER_SECOND)
 
     def forward(self, user: str, received: AlignmentLook) -> AlignmentLook:
-        """Forward a look, and return it. Raises RefusedError if there are too many."""
+        """Forward a look of a user to the loop, and return it. Raises RefusedError if the user sends too many looks."""
         look = structs.replace(received, words=quoted(received.words))
         now = self._clock()
         if self._pace.wait(user, now) > 0.0:

@@ -1,4 +1,4 @@
-"""Access control of the gateway's Zenoh session and its stop port, from [zenoh] of the configuration."""
+"""Access control for the gateway's Zenoh session and its stop port, according to [zenoh] in the configuration."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ _DOOR_REMEDY = "a flood of the other ports then keeps new stops out; free that p
 
 
 class Guard:
-    """Opener of the session and the stop port, which also checks users' roles.
+    """Guard, which opens the Zenoh session and the stop port, and checks the roles of users.
 
     Raises ServiceError if the certificates cannot be used.
     """
 
     def __init__(self, config: Config, admission: Admission | None = None) -> None:
-        """Read the configuration; `admission` holds credentials read before, else they are read from the files."""
+        """Read the configuration. `admission` contains the credentials; if it is None, they are read from the files."""
         self._robot = config.robot.name
         self._listen, self._connect, self._router = config.zenoh.listen, config.zenoh.connect, config.zenoh.router
         self._credentials: Credentials | None = None
         self.users: dict[str, Role] = {}
-        """Role of each user that has one."""
+        """Role of each user who has a role."""
         self._gone: list[str] = []
         telemetry = config.telemetry
         self._others = (("127.0.0.1", telemetry.live_port), (telemetry.metrics_address, telemetry.metrics_port))
@@ -66,7 +66,7 @@ class Guard:
         return opened
 
     def stop_door(self, take: Callable[[StopRequest, Answer], None]) -> StopDoor:
-        """Open the stop port beside each endpoint; `warnings` lists the endpoints where that failed."""
+        """Open a stop port for each endpoint. `warnings` lists the endpoints for which that failed."""
 
         def ask(shown: str, request: StopRequest, answer: Answer) -> None:
             user, command = command_of(request, self._robot)
@@ -91,34 +91,40 @@ class Guard:
         return door
 
     def links(self, opened: zenoh.Session) -> dict[str, str | None]:
-        """Return the certificate's name of each link, by address; None for a link without a certificate."""
+        """Return the name in the certificate of each link, by address; None for a link without a certificate."""
         return {str(link.dst): link.auth_identifier for link in opened.info.links()}
 
     def unopened(self, linked: Iterable[str]) -> Counter[str]:
-        """Return the number of connections without a session on TLS endpoints, by host; `linked` have a session."""
+        """Return the number of connections to TLS endpoints that have not opened a session, by host.
+
+        `linked` contains the addresses that have a session.
+        """
         ports = {at[1] for at in map(tcp_address, self._listen) if at is not None} if self._credentials else set()
         known = {at[1] for at in map(tcp_address, linked) if at is not None}
         return Counter(host for host, port in (connections(ports) if ports else ()) if port not in known)
 
     def disconnect(self, addresses: Iterable[str]) -> None:
-        """End the sessions of these addresses."""
-        # Zenoh cannot close a session of a peer: shut down its connection.
+        """End the sessions of the peers at these addresses."""
+        # Zenoh has no function that closes a peer's session, so shut down the peer's connection.
         disconnect(set(filter(None, map(tcp_address, addresses))))
 
     def linked(self, opened: zenoh.Session) -> set[str]:
-        """Return the endpoints of `connect` at which the session is linked to the configured router."""
+        """Return those endpoints in `connect` at which the session has a link to the configured router."""
         return zenoh_session.linked(opened, self._connect, self._router)
 
     def why_not_linked(self, endpoint: str) -> str:
-        """Return why there is no link to an endpoint, or "" if no reason is found; may take seconds."""
+        """Return the reason why there is no link to an endpoint, or "" if none is found. This may take seconds."""
         return connection_problem(endpoint, self._credentials, self._router)
 
     def role(self, user: str) -> Role | None:
-        """Return a user's role, or None without one; without certificates, every user has the highest role."""
+        """Return the role of a user, or None if the user has no role.
+
+        If the service does not use certificates, every user has the highest role.
+        """
         return Role.MAINTAINER if self._credentials is None else self.users.get(user)
 
     def check(self, user: str, needed: Role, action: str) -> None:
-        """Raise RefusedError if a user's role does not allow an action."""
+        """Raise RefusedError if a user's role does not include the role `needed` for an action."""
         role = self.role(user)
         if role is None or not role.includes(needed):
             state = f"is {role}" if role is not None else "has no role"
@@ -126,7 +132,7 @@ class Guard:
             raise RefusedError(RefusalCode.NOT_ALLOWED, problem)
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about insecure endpoints, the stop port and certificates, one line each, with the remedy."""
+        """Return warnings about insecure endpoints, the stop port and certificates, as lines that state the remedy."""
         insecure = [
             f"insecure: everyone who reaches {endpoint} can move the robot; trirail keys init makes certificates"
             for endpoint in (*self._listen, *self._connect)
@@ -135,7 +141,7 @@ class Guard:
         return (*insecure, *self._without_door, *self.certificate_warnings())
 
     def certificate_warnings(self) -> tuple[str, ...]:
-        """Return warnings about a certificate that expires soon, and about revoked users with a role."""
+        """Return warnings about a certificate that expires soon, and about revoked users in the configuration."""
         soon = [] if self._credentials is None else [self._credentials.warning()]
         gone = [f"{user} is revoked and has no role; remove this user from [zenoh.users]" for user in self._gone]
         return (*filter(None, soon), *gone)

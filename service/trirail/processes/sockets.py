@@ -1,4 +1,4 @@
-"""Sockets of the gateway, and file descriptors: their limit, and a reserve for connections that must not lack them."""
+"""Sockets of the gateway, the limit of file descriptors, and a reserve of descriptors for important connections."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from typing import Any
 from trirail.wire.stop_protocol import StopAddress
 
 SOCKET_MODE = 0o660
-"""Mode of a Unix socket: owner and group may connect, which needs write permission."""
+"""Mode of a Unix socket. Connecting needs write permission, which the owner and the group have."""
 
 
 def raise_descriptor_limit() -> None:
-    """Raise the descriptor limit of this process and its children to the hard limit."""
+    """Raise the limit of file descriptors of this process and its children to the hard limit."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with contextlib.suppress(ValueError, OSError):  # some kernels refuse an unlimited one
+    with contextlib.suppress(ValueError, OSError):  # some kernels refuse to set an unlimited number
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def descriptor_limit() -> int:
-    """Return the descriptor limit of this process."""
+    """Return the limit of file descriptors of this process."""
     return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
 
 
 def descriptors_used() -> int:
-    """Return the number of descriptors that this process has open."""
-    counted = Path("/proc/self/fd").stat().st_size  # Linux 6.2 and later; 0 before
-    return counted or len(os.listdir("/proc/self/fd")) - 1  # the listing itself uses one
+    """Return the number of file descriptors that this process has open."""
+    counted = Path("/proc/self/fd").stat().st_size  # the number since Linux 6.2; 0 in earlier versions
+    return counted or len(os.listdir("/proc/self/fd")) - 1  # listing the folder uses one descriptor itself
 
 
 def connections(ports: Container[int]) -> list[tuple[str, int]]:
     """Return the peers of TCP connections to local ports, including connections that the peer has closed."""
-    # proc(5), /proc/net/tcp: addresses are words in host byte order, states those of the kernel's tcp_states.h.
+    # proc(5), /proc/net/tcp: addresses are words in host byte order, and states are those of the kernel's tcp_states.h.
     peers = []
     for table in ("tcp", "tcp6"):
-        with contextlib.suppress(OSError):  # a machine without IPv6
+        with contextlib.suppress(OSError):  # the machine may have no IPv6
             for line in Path(f"/proc/self/net/{table}").read_text(encoding="ascii").splitlines()[1:]:
                 _, here, there, state, *_ = line.split()
                 if state in _CONNECTED and int(here.rpartition(":")[2], 16) in ports:
@@ -51,7 +51,7 @@ def connections(ports: Container[int]) -> list[tuple[str, int]]:
 
 
 _CONNECTED = ("01", "08")
-"""ESTABLISHED and CLOSE_WAIT."""
+"""States of a connection in /proc/net/tcp: ESTABLISHED and CLOSE_WAIT."""
 
 
 def _address(written: str) -> tuple[str, int]:
@@ -62,9 +62,9 @@ def _address(written: str) -> tuple[str, int]:
 
 
 def disconnect(peers: Container[tuple[str, int]]) -> None:
-    """Shut down every connection of this process to these hosts and ports, also those of libraries."""
+    """Shut down every connection of this process to these hosts and ports, including connections of libraries."""
     for number in map(int, os.listdir("/proc/self/fd")):
-        with contextlib.suppress(OSError):  # closed meanwhile, or not connected
+        with contextlib.suppress(OSError):  # the descriptor has been closed meanwhile, or is not connected
             if not stat.S_ISSOCK(os.fstat(number).st_mode):
                 continue
             with socket.socket(fileno=os.dup(number)) as connection:
@@ -73,7 +73,7 @@ def disconnect(peers: Container[tuple[str, int]]) -> None:
 
 
 class Reserve:
-    """Reserve of file descriptors, which nothing else in this process can use up."""
+    """Reserve of file descriptors, which cannot be used for anything else in this process."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -85,16 +85,16 @@ class Reserve:
         return len(self._kept)
 
     def release(self) -> None:
-        """Close one descriptor, so that another can be opened. Raises IndexError if none is left."""
+        """Close one reserved descriptor, so that a connection can be opened. Raises IndexError if none is left."""
         os.close(self._kept.pop())
 
     def close(self, descriptor: int) -> None:
-        """Close a descriptor opened from the reserve, and return it to the reserve in the same step."""
+        """Close a connection's descriptor and reserve it again, in one step."""
         os.dup2(self._null, descriptor, inheritable=False)
         self._kept.append(descriptor)
 
     def refill(self, opened: int = 0) -> None:
-        """Reserve the full number less `opened`, the number in use; fewer if the system refuses."""
+        """Fill the reserve up to its full number minus `opened`, the number in use, as far as the system allows."""
         with contextlib.suppress(OSError):
             while len(self._kept) < self._count - opened:
                 self._kept.append(os.dup(self._null))
@@ -107,9 +107,9 @@ class Reserve:
 
 
 def listen(address: StopAddress) -> list[socket.socket]:
-    """Listen at a Unix socket, or at every address of a host name. Raises OSError on failure."""
+    """Listen on a Unix socket, or on every address of a host name. Raises OSError on failure."""
     if isinstance(address.where, str):
-        # Left behind by a gateway that was killed; Zenoh's lock file shows that no other one is running.
+        # A gateway that was killed may have left the socket. Zenoh's lock file shows that no other gateway is running.
         Path(address.where).unlink(missing_ok=True)
         places: list[tuple[socket.AddressFamily, Any]] = [(socket.AF_UNIX, address.where)]
     else:
@@ -135,7 +135,7 @@ def listen(address: StopAddress) -> list[socket.socket]:
 
 
 def source(connected: socket.socket, address: object) -> str:
-    """Return the source of a connection: the peer's address, or its process id for a Unix socket."""
+    """Return the source of a connection: the address of the peer or, for a Unix socket, the process id of the peer."""
     if connected.family == socket.AF_UNIX:
         credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
         return str(struct.unpack("3i", credentials)[0])

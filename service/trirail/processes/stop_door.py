@@ -1,10 +1,12 @@
-"""Stop port: a server beside Zenoh's endpoints that accepts only stops, in a thread with an event loop.
+"""Stop port, a server that accepts only stops, in addition to Zenoh's endpoints.
 
-Each connection has its own task. TLS uses the sockets directly, since asyncio's streams would give each connection a
-buffer of 256 KB, which a flood multiplies, and would close its descriptor later than the reserve needs it.
+The server runs in a thread with an event loop, and each connection has its own task. TLS is used directly on the
+sockets instead of with asyncio's streams. A stream would need a buffer of 256 KB per connection, which is too much in a
+flood of connections, and would close the descriptor later than the reserve of descriptors needs it.
 
-Each source may use a share of the connections. The source is an address until the user is known, and then the user.
-When a source exceeds its share, its oldest connection is closed, so that a flood from one source does not block others.
+Each source may use only a share of the connections. A source is an address until the user is known, and afterwards the
+user. When a source exceeds its share, its oldest connection is closed. A flood from one source therefore does not block
+other sources.
 """
 
 from __future__ import annotations
@@ -29,19 +31,25 @@ from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopRequest, answe
 from trirail.wire.text import quoted
 
 MAX_CALLERS: Final = 4096
-"""Maximum number of connections, at most a quarter of the process's descriptors; their descriptors are reserved."""
+"""Maximum number of connections, whose descriptors are reserved.
+
+The number is also limited to a quarter of the process's descriptors.
+"""
 REQUEST_TIMEOUT_S: Final = 10.0
-"""Time-out of a connection's request [s]; a shorter one would make idle floods more expensive."""
+"""Maximum time to wait for the request of a connection [s].
+
+With a shorter time, a flood of idle connections would cost more processor time.
+"""
 ANSWER_TIMEOUT_S: Final = 20.0
-"""Time-out of the answer [s]; it normally arrives within 15 s."""
+"""Maximum time to wait for the answer to a request [s]. Normally, the answer arrives within 15 s."""
 ACCEPTED_PER_TURN: Final = 64
-"""Maximum number of connections accepted before the existing ones are served."""
+"""Maximum number of connections that are accepted before existing connections are served."""
 
 T = TypeVar("T")
 Answer = Callable[[CommandReply | ErrorReply], None]
-"""Receiver of the answer to a request, from any thread."""
+"""Function that sends the answer to a request. It may be called from any thread."""
 RequestHandler = Callable[[str, StopRequest, Answer], None]
-"""Receiver of a request, with the name in the sender's certificate; "" without certificates."""
+"""Function that handles a request, given the name in the sender's certificate; "" if certificates are not used."""
 
 
 class _Stage(Enum):
@@ -52,12 +60,15 @@ class _Stage(Enum):
 
 
 _SHARES: Final = {_Stage.SILENT: 1 / 2, _Stage.TALKING: 1 / 8, _Stage.KNOWN: 1 / 8, _Stage.WAITING: 1 / 64}
-"""Share of all connections per source: of one address while silent and in a handshake, of one user before the request
-and after it."""
+"""Share of all connections that one source may use, by the stage of the connection.
+
+The source is an address while the connection is silent and during the handshake. It is a user before and after the
+request.
+"""
 
 
 class _Caller:
-    """Connection of a client, with the task that serves it and the share to which it counts."""
+    """Connection of a client, with the task that serves the connection and the share in which it is counted."""
 
     def __init__(self, connection: socket.socket, source: str) -> None:
         self.connection = connection
@@ -68,13 +79,13 @@ class _Caller:
 
 
 class StopDoor:
-    """Server of the stop port; `start` begins to serve requests, and `close` ends the server."""
+    """Server of the stop port. `start` begins to serve requests, and `close` ends the server."""
 
     def __init__(self, secured: ssl.SSLContext | None, handle_request: RequestHandler) -> None:
         self._secured = secured
         self._handle_request = handle_request
-        self._callers: dict[_Caller, None] = {}  # the oldest first
-        self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # those first that are longest in it
+        self._callers: dict[_Caller, None] = {}  # from the oldest to the newest connection
+        self._shares: dict[tuple[_Stage, str], dict[_Caller, None]] = {}  # connections in the order of joining
         self._listening: list[socket.socket] = []
         self._max_callers = min(MAX_CALLERS, descriptor_limit() // 4)
         self._reserve = Reserve(self._max_callers)
@@ -83,15 +94,15 @@ class StopDoor:
         self._thread = threading.Thread(target=self._run, name="stop door", daemon=True)
 
     def listen(self, address: StopAddress) -> None:
-        """Listen at an address, before the start. Raises OSError if that is impossible."""
+        """Listen on an address. Call this method before `start`. Raises OSError if that is impossible."""
         self._listening += listen(address)
 
     def start(self) -> None:
-        """Begin to take requests."""
+        """Begin to accept and serve requests."""
         self._thread.start()
 
     def close(self) -> None:
-        """Close the server; requests without an answer get no answer from it."""
+        """Close the server. Requests that have not been answered receive no answer on the stop port."""
         self._loop.call_soon_threadsafe(self._closing.set)
         self._thread.join()
         self._reserve.end()
@@ -124,7 +135,7 @@ class StopDoor:
                 connected, address = listening.accept()
             except BlockingIOError:
                 break
-            except OSError:  # no descriptor is left, or the caller has disconnected
+            except OSError:  # no descriptor is left, or the client has disconnected
                 continue
             connected.setblocking(False)
             caller = _Caller(connected, source(connected, address))
@@ -135,7 +146,7 @@ class StopDoor:
         self._reserve.refill(len(self._callers))
 
     def _enter(self, caller: _Caller, stage: _Stage, share: str) -> None:
-        """Count a connection in the share of another stage or source."""
+        """Move a connection to another stage, in which it is counted for the source `share`."""
         self._discount(caller)
         caller.stage, caller.share = stage, share
         self._count(caller)
@@ -167,7 +178,7 @@ class StopDoor:
     # ------------------------------------------------------------------ one connection
 
     async def _attend(self, caller: _Caller) -> None:
-        """Serve a connection to its end."""
+        """Serve a connection until it is closed."""
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S) as timeout:
                 line, user = await self._request(caller)
@@ -175,15 +186,18 @@ class StopDoor:
                 answer = await self._answer(caller, user, line)
             self._check_open(caller)
             caller.connection.send(answer_with(answer))  # no line is longer than the socket's buffer
-        except (OSError, ValueError):  # disconnected, invalid request, or no valid certificate
+        except (OSError, ValueError):  # the client has disconnected, or sent an invalid request or certificate
             pass
         finally:
             caller.task = None
             self._drop(caller)
 
     async def _request(self, caller: _Caller) -> tuple[bytes, str]:
-        """Return the line of a connection, and the name in its certificate. Raises OSError or ValueError."""
-        await caller.readable.wait()  # a silent connection does not cost a handshake
+        """Receive the line with the request, and return it with the name in the client's certificate.
+
+        Raises OSError or ValueError if that fails.
+        """
+        await caller.readable.wait()  # do not begin a handshake on a silent connection
         user = ""
         self._enter(caller, _Stage.TALKING, caller.share)
         if self._secured is not None:
@@ -201,14 +215,14 @@ class StopDoor:
         return heard.partition(b"\n")[0], user
 
     async def _receive(self, caller: _Caller) -> bytes:
-        """Return the next data of a connection. Raises ConnectionError if it has gone."""
+        """Return the next data from a connection. Raises ConnectionError if the client has disconnected."""
         data = await self._when_readable(caller, lambda: caller.connection.recv(MAX_LINE))
         if not data:
             raise ConnectionError
         return data
 
     async def _when_readable(self, caller: _Caller, act: Callable[[], T]) -> T:
-        """Return the result of an action that is retried each time the connection becomes readable."""
+        """Try an action each time the connection becomes readable, until it succeeds; return the result."""
         while True:
             self._check_open(caller)
             caller.readable.clear()
@@ -220,13 +234,17 @@ class StopDoor:
     def _check_open(self, caller: _Caller) -> None:
         """Raise ConnectionError if a connection has been closed.
 
-        OpenSSL keeps the number of the connection's descriptor, which by now may belong to a newer connection.
+        OpenSSL would continue to use the number of the connection's descriptor, which may now be that of a newer
+        connection.
         """
         if caller not in self._callers:
             raise ConnectionError
 
     async def _answer(self, caller: _Caller, user: str, line: bytes) -> CommandReply | ErrorReply:
-        """Forward a request; return its answer. Raises ConnectionError if the caller disconnects or sends more."""
+        """Forward a request and return the answer.
+
+        Raises ConnectionError if the client disconnects or sends further data before the answer.
+        """
         try:
             request = decoded(line, StopRequest)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""Supervisor (`trirail run`): starts the other processes, monitors and restarts them, and ends them in order."""
+"""Supervisor (`trirail run`), which starts, monitors and restarts the other processes, and ends them in order."""
 
 from __future__ import annotations
 
@@ -28,39 +28,53 @@ from trirail.wire.credentials import Admission
 from trirail.wire.messages import Event, Level
 
 CHILDREN = ("gateway", "recorder", "loop", "planner")
-"""Processes in the order of their start: the first two need no compiled code, and start while it is being imported."""
+"""Processes in the order of their start.
+
+The first two need no compiled code, and therefore start while compiled code is being imported.
+"""
 CHILDREN_WITH_DRIVES = ("gateway", "recorder", "loop", "drives", "planner")
-"""The same list with simulated drives; the loop rehearses while the drives start, and then waits for them."""
+"""Processes in the order of their start, if the drives are simulated.
+
+The loop runs its rehearsal while the drives start, and then waits for the drives.
+"""
 PORTS = ("gateway", "recorder", "planner")
 """Processes that connect to the loop, in the order of trirail.processes.ports.Ports."""
 WATCHED_BY_SYSTEMD = ("loop", "gateway")
-"""Essential processes; the service survives the loss of the others."""
+"""Essential processes, without whose heartbeats systemd ends the service. It survives the loss of other processes."""
 CONSEQUENCES = {
     "gateway": "the loop stops the robot and holds",
     "planner": "the motion under way continues, new goals are refused",
     "recorder": "the robot is not affected",
     "drives": "the robot is in fault; restart the service to restart them",
 }
-"""Consequence of a process's death for the robot."""
+"""Consequence for the robot if a process dies."""
 START_WITHIN = 300.0
-"""Longest time for the processes to come up, and for compiling each function at the first start [s]."""
+"""Maximum time for the processes to start, and for compiling each function at the first start [s]."""
 FORKS_WITHIN = 5.0
-"""Longest time for the fork server to fork a child once the service is up [s]."""
+"""Maximum time for the fork server to fork a child when the service has started [s]."""
 END_WITHIN = 6.0
-"""Longest time for processes to end before they are killed [s]."""
+"""Maximum time for processes to end before they are killed [s]."""
 RESTART_DURING_START = 1.0
-"""Pause before restarting a process that has ended before the service was up [s]: long enough to notice that the loop
-has ended."""
+"""Pause before the restart of a process that has ended during the start of the service [s].
+
+It is long enough to notice that the loop has ended, in which case the process is not restarted.
+"""
 RESTARTS = 5
-"""Number of restarts of one process within a minute that happen without a pause."""
+"""Maximum number of restarts of one process within a minute without a pause."""
 CHECK_PERIOD_S = 0.1
 """Interval between two checks of the other processes [s]."""
 MAX_SILENCE_S = 0.7
-"""Longest time without a heartbeat [s], after which a process is killed as hung; see heartbeats.HangWatch."""
+"""Maximum time without a heartbeat [s]. After that time, a process is killed as hung; see heartbeats.HangWatch."""
 MAX_RECORDER_SILENCE_S = 5.0
-"""Longest time without a heartbeat of the recorder [s]; it may wait for a disk, and no motion depends on it."""
+"""Maximum time without a heartbeat of the recorder [s].
+
+It is longer, because the recorder may wait for a disk, and no motion depends on the recorder.
+"""
 RETRY_PAUSE_S = 10.0
-"""Pause before any further restart of recorder or planner [s]; a further end of the gateway ends the service."""
+"""Pause before the recorder or the planner is restarted again after RESTARTS restarts [s].
+
+If the gateway ends again after RESTARTS restarts, the service ends.
+"""
 
 
 class Supervisor:
@@ -69,11 +83,11 @@ class Supervisor:
     Parameters
     ----------
     record
-        Recording file; None for a file named by the time.
+        Recording file; None for a file that is named after the robot and the time.
     report
-        Function that is called with each message about the processes and the message's level.
+        Function called with each message about the processes and with the level of the message.
     on_event
-        Function that is called with each event of the service.
+        Function called with each event of the service.
 
     """
 
@@ -116,9 +130,9 @@ class Supervisor:
         self._up = False
 
     def run(self, up: Callable[[dict[str, dict[str, Any]]], None]) -> int:
-        """Run until a signal or the end of an essential process; return the exit code.
+        """Run the service until a signal arrives or the service must end; return the exit code.
 
-        `up` is called once, with the ready message of each process.
+        `up` is called once when all processes are ready, with the ready message of each process.
         """
         raise_descriptor_limit()
         with _runtime_folder() as folder, Signals() as signals:
@@ -128,7 +142,7 @@ class Supervisor:
             self._parent = ForkServerLink(self._order, folder, self._heartbeats, sockets)
             self._selector.register(self._parent, selectors.EVENT_READ)
             try:
-                with _metrics_server(self._order.config, self._health):  # after the fork: the server has a thread
+                with _metrics_server(self._order.config, self._health):  # after the fork, because it starts a thread
                     self._run_children(up, signals)
             finally:
                 self._parent.close()
@@ -160,7 +174,7 @@ class Supervisor:
             keys = [key for key, _ in self._selector.select(CHECK_PERIOD_S)]
             self._receive_from_parent()
             senders: list[ChildProcess | None] = [key.data for key in keys if key.fileobj is not self._parent]
-            # The loop first: if it has ended, the others end because of it.
+            # Handle the loop first: if the loop has ended, the other processes end because of that.
             for child in sorted(senders, key=lambda child: child is not self._children.get("loop")):
                 if child is None:
                     ending = progress.interrupted if not self._up else "stopping the robot and disabling the drives"
@@ -193,7 +207,7 @@ class Supervisor:
                 raise ServiceError(f"not up within {START_WITHIN:g} s: {missing}")
 
     def _kill_hung(self) -> None:
-        """Kill hung processes, once per CHECK_PERIOD_S; `_on_end` then handles their end."""
+        """Check all processes once per CHECK_PERIOD_S, and kill hung processes. `_on_end` then handles their end."""
         now = time.monotonic()
         if now < self._next_turn:
             return
@@ -218,13 +232,13 @@ class Supervisor:
         return Running(child.pid, child.ready_message is not None, restarts)
 
     def _on_end(self, child: ChildProcess) -> None:
-        """Handle the end of a process: restart it, or end the service."""
+        """Handle the end of a process. Restart the process or end the service, depending on the process."""
         self._forget(child)
         child.wait(time.monotonic() + END_WITHIN)
         if child.name != "loop" and self._loop_is_ending():
-            return  # the others end normally after the loop
+            return  # the other processes end normally after the loop
         if not self._up and child.name != "loop" and child.returncode == 0:
-            # Most likely the loop could not start, has reported that, and so closed its connection to this process.
+            # Most likely, the loop could not start, has reported that, and has closed its connection to this process.
             self._due[child.name] = time.monotonic() + RESTART_DURING_START
             return
         said_why = child.returncode == os.EX_CONFIG
@@ -243,7 +257,7 @@ class Supervisor:
             self._fail("" if said_why else f"the {name} could not start ({child.end_description})")
             return
         if name == "drives":
-            if child.returncode:  # otherwise the loop has disconnected from them, and its end is reported
+            if child.returncode:  # otherwise, the loop has disconnected from the drives, and its end is reported
                 self._report(f"the simulated drives have died ({child.end_description}): {CONSEQUENCES[name]}", "error")
             return
         now = time.monotonic()
@@ -261,7 +275,10 @@ class Supervisor:
         self._due[name] = now + wait
 
     def _loop_is_ending(self) -> bool:
-        """Return whether the loop has run and has stopped its heartbeat; only the loop's own end is then reported."""
+        """Return True if the loop has run and has stopped its heartbeat, or is gone.
+
+        In that case only the end of the loop is reported, and not that of other processes.
+        """
         loop = self._children.get("loop")
         return loop is None or (loop.ready_message is not None and not self._heartbeats.heart("loop").count)
 
@@ -276,7 +293,7 @@ class Supervisor:
             self._report(reason, "error")
 
     def _receive_from_parent(self) -> None:
-        """Process messages of the fork server; end the service if the fork server has died."""
+        """Process a message from the fork server. End the service if the fork server has died."""
         self._parent.receive()
         if self._parent.gone and not self._ending:
             loop = self._children.get("loop")
@@ -301,7 +318,7 @@ class Supervisor:
         del self._children[child.name]
 
     def _end(self) -> None:
-        """End the loop first, so that gateway and recorder can report its end, then the other processes."""
+        """End the loop first, so that the gateway and the recorder can report its end. Then end the other processes."""
         notify("STOPPING=1")
         self._health.end({name: self._running(name) for name in self._names})
         for child in self._children.values():
@@ -312,12 +329,12 @@ class Supervisor:
             if not loop.wait(time.monotonic() + END_WITHIN):
                 self._kill_unresponsive(loop)
             self._loop_has_run = self._loop_has_run or loop.ready_message is not None
-        for name in ("planner", "drives"):  # killed: they have no state, and may be frozen or still starting
+        for name in ("planner", "drives"):  # killed, because they have no state and may be frozen or still starting
             if left := self._children.get(name):
                 self._kill(left)
                 self._forget(left)
-        # Gateway and recorder end by themselves once the loop's messages are published and on disk; a loop that has
-        # never run has sent none.
+        # Gateway and recorder end by themselves when the loop's messages have been published and written to disk. A
+        # loop that has never run has sent no messages.
         by_itself = time.monotonic() + (END_WITHIN if self._loop_has_run else 0.0)
         asked = by_itself + END_WITHIN
         for child in list(self._children.values()):
@@ -327,7 +344,7 @@ class Supervisor:
             if not child.wait(asked):
                 self._kill_unresponsive(child)
                 self._failed = True
-            # During the start SIGTERM may arrive before a process has installed its handler.
+            # During the start, SIGTERM may arrive before a process has installed its signal handler.
             up = self._loop_has_run and child.ready_message is not None
             self._failed = self._failed or (up and child.returncode != 0)
             self._forget(child)
@@ -342,14 +359,17 @@ class Supervisor:
 
 
 def _admission(config: Config) -> Admission | None:
-    """Read the credentials of [zenoh.tls] once, for all starts of the gateway. Raises ServiceError if invalid."""
+    """Read the credentials of [zenoh.tls], if it is set. They are read once for all starts of the gateway.
+
+    Raises ServiceError if the credentials are invalid.
+    """
     zenoh = config.zenoh
     return Admission.read(Path(zenoh.tls.directory), zenoh.users) if zenoh.tls is not None else None
 
 
 @contextmanager
 def _runtime_folder() -> Iterator[Path]:
-    """Create a temporary folder for sockets. Raises ServiceError on failure."""
+    """Create a temporary folder for sockets, which exists within the context. Raises ServiceError on failure."""
     parent = os.environ.get("XDG_RUNTIME_DIR")
     with ExitStack() as stack:
         try:
@@ -364,7 +384,7 @@ def _runtime_folder() -> Iterator[Path]:
 
 
 def _metrics_server(config: Config, health: Health) -> AbstractContextManager[object]:
-    """Return the context in which metrics are served, if [telemetry] metrics_port is set."""
+    """Return a context within which metrics are served, if [telemetry] metrics_port is set."""
     if not config.telemetry.metrics_port:
         return nullcontext()
     from trirail.processes.metrics import MetricsServer

@@ -1,4 +1,4 @@
-"""Assembly of trajectories that arrive in several messages."""
+"""Assembly of trajectories whose parts arrive in several messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from trirail.wire.sizes import MAX_POINTS
 from trirail.wire.text import quoted
 
 PARTS_WITHIN = 5.0
-"""Longest time between two parts, after which the goal is refused [s]."""
+"""Maximum time between two parts of a trajectory [s]. After that time, the goal is refused."""
 
 
 class _Received(NamedTuple):
@@ -23,7 +23,7 @@ class _Received(NamedTuple):
 
 
 class _Incomplete:
-    """Trajectory with missing parts."""
+    """Trajectory of which some parts have not arrived yet."""
 
     def __init__(self, of: int) -> None:
         self.of = of
@@ -32,7 +32,7 @@ class _Incomplete:
 
     @property
     def message(self) -> Incoming:
-        """All parts as one message, with the number of the first part; its answer goes to all parts."""
+        """All received parts as one message with the number of the first part. An answer is sent for all parts."""
         first, *others = sorted((part.incoming for part in self.received.values()), key=lambda each: each.number)
         newest = others[-1] if others else first
         size = first.size + sum(each.size for each in others)
@@ -40,21 +40,23 @@ class _Incomplete:
 
     @property
     def missing(self) -> str:
-        """Missing parts, for people."""
+        """Text for people that lists the missing parts."""
         numbers = [number for number in range(1, self.of + 1) if number not in self.received]
         listed = ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")
         return f"part{'s' if len(numbers) > 1 else ''} {listed} of {self.of}"
 
 
 class TrajectoryParts:
-    """Assembly of trajectories; the memory of parts counts as their user's until they are answered.
+    """Assembler of trajectories from their parts.
+
+    The memory of a part is counted for its user until the part is answered.
 
     Parameters
     ----------
     refuse
         Function that refuses all parts of a goal.
     clock
-        Monotonic clock [s].
+        Function that returns the monotonic time [s].
 
     """
 
@@ -70,9 +72,9 @@ class TrajectoryParts:
         return (goal.message for goal in self._incomplete.values())
 
     def add(self, incoming: Incoming, user: str, goal: TrajectoryGoal) -> tuple[Incoming, PackedTrajectory] | None:
-        """Add a part; return the whole goal with its messages once all parts have arrived, else None.
+        """Add a part. If all parts have arrived, return the whole goal and its parts as one message, else None.
 
-        Raises RefusedError for a part that does not match the previous ones.
+        Raises RefusedError if the part does not match the previous parts.
         """
         if goal.part is None or goal.id is None:
             return incoming, packed(goal)
@@ -105,7 +107,7 @@ class TrajectoryParts:
 
 
 def _check(incomplete: _Incomplete, goal: TrajectoryGoal, number: int, of: int) -> None:
-    """Raise RefusedError for a part that does not match the previous ones."""
+    """Raise RefusedError if a part does not match the previous parts."""
     problem = ""
     points = sum(len(part.goal.rows) // ROW for part in incomplete.received.values()) + len(goal.points)
     first = next(iter(incomplete.received.values()), None)

@@ -1,8 +1,8 @@
-"""Monitoring of the gateway's Zenoh links: those of clients, which are limited, and those to routers.
+"""Monitoring of the gateway's Zenoh links to clients, whose number is limited, and to routers.
 
-Zenoh limits the number of sessions in total, but not per certificate. The gateway therefore checks the links. If few
-sessions are left, it ends the newest sessions of the user who has the most, starting with users without a role. Zenoh
-itself connects to the routers of [zenoh] connect; this module reports these links.
+Zenoh limits the total number of sessions, but not the number per certificate. The gateway therefore checks the links.
+If few sessions are left, it ends the newest sessions of the user with the most sessions, beginning with users without a
+role. Zenoh itself connects to the routers in [zenoh] connect. This module reports whether these links exist.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from trirail.wire.messages import Notice
 from trirail.wire.text import quoted
 
 CHECK_PERIOD_S: Final = 1.0
-"""Interval between two checks [s]."""
+"""Interval between two checks of the links [s]."""
 WARNING_SHARE: Final = 0.8
-"""Fraction of a resource above which a warning starts; the warning ends below nine tenths of it."""
+"""Fraction of a limited resource at which a warning begins. The warning ends below nine tenths of this fraction."""
 FREE_SHARE: Final = 0.1
-"""Share of the sessions kept free for users with few sessions."""
+"""Fraction of all sessions that is kept free for users with few sessions."""
 PROTECTED_SESSIONS: Final = 8
-"""Number of sessions per user that are never ended."""
+"""Number of sessions of each user with a role that are never ended."""
 
 
 class ResourceUse(NamedTuple):
-    """Sessions and file descriptors in use, and their limits."""
+    """Number of sessions and file descriptors in use, and their limits."""
 
     sessions: int
     sessions_most: int
@@ -41,16 +41,17 @@ class ResourceUse(NamedTuple):
 
 
 def surplus(links: Mapping[str, str], users: Container[str], most: int) -> set[str]:
-    """Return the addresses whose sessions must end so that FREE_SHARE of the sessions is free.
+    """Return the addresses whose sessions must be ended, so that the fraction FREE_SHARE of all sessions is free.
 
     Parameters
     ----------
     links
-        Name in the certificate of each address, the oldest first; links without a certificate are left out.
+        Name in the certificate of each link, by address, from the oldest to the newest link. Links without a
+        certificate are not included.
     users
         Users with a role.
     most
-        Limit of sessions.
+        Maximum number of sessions.
 
     """
     of: dict[str, list[str]] = {}
@@ -68,26 +69,28 @@ def surplus(links: Mapping[str, str], users: Container[str], most: int) -> set[s
 
 
 FAILED_A_SECOND: Final = 10.0
-"""Number of failed handshakes that Zenoh handles per second; after each it accepts no connection for 0.1 s."""
+"""Number of failed handshakes that Zenoh handles per second. After each, Zenoh accepts no connection for 0.1 s."""
 UNOPENED: Final = 20
-"""Number of connections without a session above which a warning starts."""
+"""Number of connections without a session at which a warning begins."""
 
 
 class LinkMonitor:
-    """Monitor of clients' links, checked once a second; it ends surplus sessions, and warns before limits are reached.
+    """Monitor of the links to clients, which checks them once per second.
+
+    It ends surplus sessions, and warns before limits are reached.
 
     Parameters
     ----------
     links
-        Function that returns the name in the certificate of each link, by address.
+        Function that returns the name in the certificate of each link, by address; None without a certificate.
     end
         Function that ends the sessions of a set of addresses.
     users
         Users with a role.
     most
-        Limit of sessions.
+        Maximum number of sessions.
     unopened
-        Function that returns the number of connections without a session by host, given the addresses of all links.
+        Function that returns the number of connections without a session, by host, given the addresses of all links.
 
     """
 
@@ -111,7 +114,7 @@ class LinkMonitor:
         """Resources in use at the last check."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about resources nearly used up, one line each."""
+        """Return warnings about resources that are nearly used up, with one line per warning."""
         return tuple(self._warnings.values())
 
     def poll(self) -> None:
@@ -140,7 +143,7 @@ class LinkMonitor:
         self._warn(count >= UNOPENED * self._hysteresis(text.code), text)
 
     def _check_use(self, what: str, used: int, most: int, by: str) -> None:
-        """Warn if a resource is nearly used up."""
+        """Set or clear the warning that a resource is nearly used up."""
         code = EventCode.SESSIONS_FULL if what == "sessions" else EventCode.DESCRIPTORS_FULL
         words = (
             f"{used} of {most} {what} of the gateway are in use{by}: beyond that, new clients can only stop the robot"
@@ -148,11 +151,11 @@ class LinkMonitor:
         self._warn(used >= most * WARNING_SHARE * self._hysteresis(code), coded(words, code, used=used, most=most))
 
     def _hysteresis(self, code: EventCode) -> float:
-        """Return the factor on the threshold of a warning: less than 1 while the warning is active."""
+        """Return the factor for the threshold of a warning, which is below 1 while the warning is active."""
         return 0.9 if code in self._warnings else 1.0
 
     def _warn(self, too_much: bool, text: EventText) -> None:
-        """Set or clear a warning, and announce a new one."""
+        """Set a warning if `too_much`, otherwise clear it. Announce the warning if it is new."""
         if not too_much:
             self._warnings.pop(text.code, None)
             return
@@ -162,34 +165,35 @@ class LinkMonitor:
 
 
 ROUTER_GRACE_S = 5.0
-"""Time after the start without warnings about unreachable routers [s]."""
+"""Time after the start in which there are no warnings about unreachable routers [s]."""
 DIAGNOSIS_PERIOD_S = 15.0
-"""Interval between two diagnoses of a missing link [s]."""
+"""Interval at which the reason for a missing link is diagnosed again [s]."""
 
 
 @dataclass
 class _Router:
     endpoint: str
     ask_at: float
-    """Time of the next diagnosis of a missing link."""
+    """Time of the next diagnosis, if the link is missing [s]."""
     linked: bool | None = None
-    """State announced last; None before the first."""
+    """Whether the link existed when it was last announced; None before the first announcement."""
     asked: Future[str] | None = None
     warning: str = ""
-    """Warning about a missing link; empty while linked."""
+    """Warning that the link is missing; empty while the link exists."""
 
 
 class RouterLinks:
-    """Monitor of router links, which announces each new, lost or missing link once.
+    """Monitor of the links to routers, which announces each new, lost or missing link once.
 
     Parameters
     ----------
     endpoints
         Endpoints of the routers.
     linked
-        Function that returns the endpoints with a link, without blocking.
+        Function that returns the endpoints with a link. It must not block.
     why_not
-        Function that returns the reason why an endpoint has no link; called in a thread, since it may take seconds.
+        Function that returns the reason why an endpoint has no link. It is called in a thread, because it may take
+        seconds.
 
     """
 
@@ -207,7 +211,7 @@ class RouterLinks:
         self._asking = ThreadPoolExecutor(1, "router")
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about routers without a link, one line each."""
+        """Return warnings about routers without a link, with one line per warning."""
         return tuple(router.warning for router in self._routers if router.warning)
 
     def poll(self) -> None:
@@ -240,7 +244,7 @@ class RouterLinks:
             router.ask_at = now + DIAGNOSIS_PERIOD_S
         if router.asked is None or not router.asked.done():
             return
-        error = router.asked.exception()  # an exception caused by an unknown peer must not end the service
+        error = router.asked.exception()  # not raised, because an error with an unknown peer must not end the service
         why = quoted(f"{error!r}") if error is not None else router.asked.result()
         router.asked = None
         why = why or "it answers, but opens no session: is it a router that takes this robot?"

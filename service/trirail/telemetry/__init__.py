@@ -1,1 +1,1 @@
-"""Recording and drawing: Rerun streams, files, black boxes, and functions that read them."""
+"""Recording and drawing of a robot with Rerun: live streams, recording files, black boxes, and reading the files."""

@@ -1,8 +1,8 @@
-"""Black box that keeps the last minute in memory, and writes it to its own file on a fault.
+"""Black box, which stores the last minute of data in memory and writes it to a separate file after a fault.
 
-The file is `fault-<time>.rrd` in the recording's folder, with the same content as the recording: every record, the
-control inputs, the log, the drawing, the configuration and the software. It also contains the seconds after the fault,
-including the stop.
+The file is `fault-<time>.rrd` in the folder of the recording. It has the same content as a recording: every record, the
+control inputs, the log, the drawing, the configuration and the software versions. It also contains the seconds after
+the fault, in which the robot stops.
 """
 
 from __future__ import annotations
@@ -29,12 +29,15 @@ BEFORE_S = 60.0
 AFTER_S = 2.0
 """Time kept after the fault [s]."""
 MARGIN_S = 1.0
-"""Extra time kept, since batches may begin or end in between [s]."""
+"""Extra time kept, because the start or the end of the saved time may fall within a batch [s]."""
 
 MAX_MESSAGES_MB = 12.0
-"""Limit of the kept messages including their overhead in memory [1e6 bytes]; a flood would send more in a minute."""
+"""Maximum memory for stored messages, including MESSAGE_OVERHEAD for each [1e6 bytes].
+
+A flood of messages can exceed it within a minute; the oldest messages are then dropped.
+"""
 MESSAGE_OVERHEAD = 600
-"""Memory that a message needs in addition to its packed bytes: closure, tuple and place in the queue [bytes]."""
+"""Memory that a message needs in addition to its packed bytes, for closure, tuple and queue entry [bytes]."""
 
 Fill = Callable[[Recorder], None]
 Begin = Callable[[str, str], Recorder]
@@ -42,29 +45,29 @@ Begin = Callable[[str, str], Recorder]
 
 
 class StoredInput(NamedTuple):
-    """Input that can be repeated to the recorder of a black box."""
+    """Stored call that passes an input to the recorder of a black box."""
 
     order: int
     t: float
-    """Time of its arrival [s]."""
+    """Time at which the input arrived, since the start of the loop [s]."""
     fill: Fill
     lasting: str = ""
-    """Name of a state that is valid until its next update; empty for an event."""
+    """Name of the state that the input sets until the next update of that state; empty for an event."""
     size: int = 0
-    """Size that counts towards SAID_MB [bytes]."""
+    """Memory that counts towards MAX_MESSAGES_MB [bytes]."""
 
 
 class BlackBox:
-    """Memory of everything that the recorder receives.
+    """Memory of the last minute of everything that the recorder receives.
 
     Parameters
     ----------
     rate_hz
         Rate of the control loop.
     begin
-        Function that returns the recorder of a black box, given its name and reason.
+        Function that returns a new recorder for a black box, given the black box's name and reason.
     warn
-        Function that receives a report of each problem with a file.
+        Function that receives a warning if a black box is incomplete or cannot be saved.
     """
 
     def __init__(self, rate_hz: int, begin: Begin, warn: Callable[[EventText], None]) -> None:
@@ -82,7 +85,7 @@ class BlackBox:
         self._writing: list[threading.Thread] = []
 
     def records(self, batch: bytes) -> None:
-        """Store packed records; write the file once the records after a fault have arrived."""
+        """Store packed records; after a fault, write the file as soon as AFTER_S seconds of records have arrived."""
         self._t = last_cycle(batch) / self._rate_hz
         self._records.append(StoredInput(next(self._order), self._t, methodcaller("records", batch)))
         oldest = self._t - BEFORE_S - AFTER_S - MARGIN_S
@@ -94,28 +97,28 @@ class BlackBox:
             self._write(self._faults.popleft())
 
     def event(self, event: Event) -> None:
-        """Store an event; if it is a fault, prepare its file."""
+        """Store an event; if it is a fault, schedule the writing of a file."""
         self._keep_packed(EventReport(event))
         if event.kind == "fault":
             self._faults.append(event)
 
     def control_input(self, item: ControlInput) -> None:
-        """Store an input of the control loop."""
+        """Store an input to the control loop."""
         self._keep_packed(item)
 
     def latch(self, name: str, *values: object) -> None:
-        """Store a state that is valid until its next update, by the name of the recorder's method."""
+        """Store a state that is valid until its next update, as a call of the recorder's method `name`."""
         self._keep(methodcaller(name, *values), lasting=name)
 
     def close(self) -> None:
-        """Write the files of recent faults, and wait until they are complete."""
+        """Write the files that are still due, and wait until all files are complete."""
         while self._faults:
             self._write(self._faults.popleft())
         for thread in self._writing:
             thread.join()
 
     def _keep_packed(self, message: EventReport | ControlInput) -> None:
-        """Keep a message in packed form, which is many times smaller."""
+        """Store a message in packed form, which is many times smaller than the decoded message."""
         packed = encode(message)
         self._keep(lambda recorder: _replay_message(recorder, packed), size=len(packed) + MESSAGE_OVERHEAD)
 
@@ -127,7 +130,7 @@ class BlackBox:
             self._forget()
 
     def _forget(self) -> None:
-        """Drop the oldest message, unless it is a state that is still valid."""
+        """Remove the oldest message from the queue. If it sets a state, save the state as one that is still valid."""
         old = self._messages.popleft()
         self._message_bytes -= old.size
         if old.lasting:
@@ -135,14 +138,14 @@ class BlackBox:
 
     def _write(self, fault: Event) -> None:
         if self._dropped_at >= self._t - BEFORE_S - AFTER_S - MARGIN_S:
-            # A flood of messages fills the memory before a minute has passed.
+            # A flood of messages has filled the memory in less than a minute.
             words = (
                 f"black box: messages exceed {MAX_MESSAGES_MB:g} MB; "
                 f"those before t = {self._dropped_at:.1f} s are missing"
             )
             self._warn(coded(words, EventCode.BLACK_BOX_SHORT, until=self._dropped_at))
         fills = [*self._latched.values(), *(kept.fill for kept in heapq.merge(self._records, self._messages))]
-        # Runs in a thread, since it takes a second or two during which the recording must continue.
+        # Writing takes a second or two. It runs in a thread, because the recording must continue meanwhile.
         thread = threading.Thread(target=self._fill, args=(fault, fills), name="black box")
         self._writing = [writing for writing in self._writing if writing.is_alive()] + [thread]
         thread.start()
@@ -164,7 +167,7 @@ class BlackBox:
 
 
 def _replay_message(recorder: Recorder, packed: bytes) -> None:
-    """Pass a message of the loop to a recorder."""
+    """Decode a stored message and pass it to a recorder."""
     match decode_answer(packed):
         case EventReport(event):
             recorder.event(event)

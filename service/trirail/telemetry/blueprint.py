@@ -1,4 +1,7 @@
-"""Layout of the viewer: the robot with mode and events below it, and the curves beside it; or several robots."""
+"""Layout of the viewer: the robot on the left, with its mode and events below, and the curves on the right.
+
+Several robots are shown next to each other, with one column per robot.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,13 @@ MARGIN = 0.09
 
 
 class RobotView(NamedTuple):
-    """Robot in a view."""
+    """Robot to be shown by the viewer."""
 
     robot: DrawnRobot
     bounds: Points
     """Bounds of the robot's parts, (2, 2): lowest and highest x and y [m]."""
     root: str = ""
-    """Entity above all entities of the robot; empty for the root of the recording."""
+    """Path of the entity that contains all entities of the robot; empty for the root of the recording."""
 
 
 def layout(shown: RobotView) -> rrb.Blueprint:
@@ -53,9 +56,9 @@ def layout(shown: RobotView) -> rrb.Blueprint:
 
 
 def side_by_side(several: Sequence[RobotView]) -> rrb.Blueprint:
-    """Return the layout for several robots, with one column each.
+    """Return the layout for several robots, with one column per robot.
 
-    The plots use the wall clock, because each loop has its own `t`.
+    The plots use wall-clock time, because each robot's time `t` begins with its own control loop.
     """
     window = rrb.TimeAxis(view_range=_last(WINDOW))
     columns = [
@@ -81,7 +84,7 @@ def _blueprint(views: rrb.Horizontal, timeline: str) -> rrb.Blueprint:
 
 
 def _situation(shown: RobotView, window: rrb.TimeAxis, timeline: str) -> list[rrb.View | rrb.Tabs]:
-    """Return the views of the robot, its numbers, its mode and its events."""
+    """Return the views that show the robot's drawing, its current values, its mode and its events."""
     events = rrb.TextLogView(
         name="Events",
         origin=f"{shown.root}{journal.EVENTS}",
@@ -100,7 +103,7 @@ def _situation(shown: RobotView, window: rrb.TimeAxis, timeline: str) -> list[rr
 
 
 def _states(shown: RobotView, window: rrb.TimeAxis) -> rrb.StateTimelineView:
-    """Return the view of the mode and, if the robot has any, of its outputs and inputs."""
+    """Return the view of the mode. It also shows the digital outputs and inputs, if the robot has any."""
     if not shown.robot.digital:
         return rrb.StateTimelineView(name="Mode", origin=f"{shown.root}/mode", time_view=window)
     return rrb.StateTimelineView(

@@ -16,29 +16,29 @@ from trirail.wire.event_codes import EventCode, EventText, coded
 
 
 class CandumpLog:
-    """Log of the frames on one bus.
+    """Log file of the frames on one bus.
 
-    The log leaves RESERVE bytes of the disk free, and continues when there is space again. It recreates a deleted file,
-    and reports that to `warn`.
+    Nothing is written while fewer than RESERVE bytes of the disk are free. If the file is deleted, it is created again,
+    and `warn` receives a report.
     """
 
     def __init__(self, path: Path, channel: str, warn: Callable[[EventText], None] = lambda _: None) -> None:
         self.lost = 0
-        """Number of batches that are not in the file."""
+        """Number of batches that could not be written."""
         self.trouble = ""
-        """Reason why the last batch is not in the file; empty if it is."""
+        """Reason why the last batch could not be written; empty if it was written."""
         self._path = path
         self._channel = channel
         self._warn = warn
         self._begin("wb")
 
     def write(self, batch: bytes) -> None:
-        """Append a batch of captured frames, or count it as lost."""
+        """Append a batch of captured frames; if that fails, count the batch as lost."""
         self.trouble = self._append(batch)
         self.lost += bool(self.trouble)
 
     def _append(self, batch: bytes) -> str:
-        """Append a batch completely or not at all; return the reason for a failure, or ""."""
+        """Append a batch completely or not at all; return the reason for a failure, or "" on success."""
         if identity(self._path) != self._identity:
             try:
                 self._recreate()
@@ -81,8 +81,9 @@ class CandumpLog:
 
 
 def _format_frame(frame: bytes) -> str:
-    """Format a `struct can_frame` as candump does: 3 digits for an 11-bit identifier, 8 for others and for error
-    frames.
+    """Format a `struct can_frame` as candump does.
+
+    An 11-bit identifier has 3 digits; a longer identifier and that of an error frame have 8 digits.
     """
     identifier, length, data = CAN_FRAME.unpack(frame)
     if identifier & ERROR:

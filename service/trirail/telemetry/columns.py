@@ -1,4 +1,4 @@
-"""Conversion of arrays to Rerun columns, with many entities per call, which costs far less than a call per entity."""
+"""Conversion of arrays to Rerun columns, for many entities per call, which is much faster than one call per entity."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rerun.chunk import Chunk
 
 SECOND = 1_000_000_000  # [ns]
 RECORD, FIELDS = "/record", rr.ComponentDescriptor("fields")
-"""Entity path and component of the complete record of each cycle in a recording."""
+"""Entity path and component that store the complete record of each cycle in a recording."""
 
 
 class Column(NamedTuple):
-    """Values of one component of one entity; there is a list for each time."""
+    """Values of one component of one entity, with one list of values per time."""
 
     path: str
     kind: rr.ComponentDescriptor
@@ -25,20 +25,23 @@ class Column(NamedTuple):
 
 
 class Timelines:
-    """Timelines of all data: `t`, the nominal time since the start of the loop, and `wall`, the wall clock."""
+    """Timelines that all data have: `t`, the nominal time since the start of the loop, and `wall`, the wall clock."""
 
     def __init__(self, rate_hz: int, wall_offset_ns: int) -> None:
         self._rate_hz = rate_hz
         self._wall_offset_ns = wall_offset_ns
 
     def for_records(self, records: NDArray[np.void]) -> dict[str, pa.Array]:
-        """Return the times of records. The steps of `t` are exact if the period is a whole number of nanoseconds."""
+        """Return the times of records on both timelines.
+
+        The steps of `t` are exact if the period of the loop is a whole number of nanoseconds.
+        """
         t = records["cycle"] * SECOND // self._rate_hz
         return times(t, records["deadline_ns"] + self._wall_offset_ns)
 
 
 def times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> dict[str, pa.Array]:
-    """Return both times [ns] by the names of their timelines."""
+    """Return times in nanoseconds as Arrow arrays, by the name of their timeline."""
     return {
         "t": pa.array(t.astype("timedelta64[ns]")),
         "wall": pa.array(wall.astype("datetime64[ns]")),
@@ -46,7 +49,7 @@ def times(t: NDArray[np.int64], wall: NDArray[np.int64]) -> dict[str, pa.Array]:
 
 
 def chunks(times: dict[str, pa.Array], columns: Iterable[Column]) -> list[Chunk]:
-    """Return columns that share their times as chunks, one for each entity."""
+    """Return columns that have the same times as Rerun chunks, with one chunk per entity."""
     arrays = list(times.values())
     fields = [pa.field(name, array.type) for name, array in times.items()]
     for path, kind, values in columns:
@@ -76,7 +79,10 @@ def strips(values: NDArray[np.float64]) -> pa.ListArray:
 
 
 def ragged(rows: Sequence[Sequence[NDArray[np.float64]]]) -> pa.ListArray:
-    """Convert rows with any number of lines, each through any number of points (k, 2), to single precision."""
+    """Convert rows of lines to single precision.
+
+    Each row contains any number of lines, and each line any number k of points, (k, 2).
+    """
     lines = [line for row in rows for line in row]
     points = _vectors(np.concatenate([np.empty((0, 2)), *lines]))
     ends = np.cumsum([0, *map(len, rows)], dtype=np.int32)
@@ -94,7 +100,7 @@ def layout(kind: np.dtype[Any]) -> pa.StructType:
 
 
 def structs(records: NDArray[np.void]) -> pa.ListArray:
-    """Return records as rows that each contain one struct with the same fields."""
+    """Convert records to rows, each with one struct that has the fields of the record."""
     names = records.dtype.names or ()
     fields = []
     for values in (records[name] for name in names):

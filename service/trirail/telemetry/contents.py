@@ -1,6 +1,7 @@
-"""Contents of a recording: robot, time, users, goals and faults, counted by the recorder or read from the recording.
+"""Contents of a recording: robot, time span, users, goals and faults.
 
-They are stored as JSON in a file next to the recording, so that sessions can be found without reading recordings.
+The recorder collects the contents while it records. They can also be read from a recording. They are stored as JSON in
+a file next to the recording, called its sidecar, so that a search for sessions does not need to read the recordings.
 """
 
 from __future__ import annotations
@@ -22,9 +23,7 @@ from trirail.wire.packets import Announcement, CheckRequest, CommandRequest, Con
 
 _PART = re.compile(r"-part\d+(-\d+)?$")
 STAMP = "%Y%m%d-%H%M%S"
-"""Format of the local time in the names of recordings, which is the start time or, for a black box, the time of its
-fault.
-"""
+"""Format of the local time in a recording's name: its start time or, for a black box, the time of the fault."""
 
 
 class FaultEntry(msgspec.Struct):
@@ -42,43 +41,43 @@ class FaultEntry(msgspec.Struct):
 
 
 class Contents(msgspec.Struct):
-    """Contents of one file."""
+    """Contents of one recording file."""
 
     name: str
     """Name of the file."""
     robot: str
     began: float | None = None
-    """Time of the first record [s since 1970]; None if there is none."""
+    """Time of the first record [s since 1970]; None if the file contains no records."""
     ended: float | None = None
-    """Time of the last record [s since 1970]."""
+    """Time of the last record [s since 1970]; None if the file contains no records."""
     cycles: int = 0
     users: set[str] = msgspec.field(default_factory=set)
     """Users who sent goals or commands."""
     goals: dict[str, dict[str, int]] = msgspec.field(default_factory=dict)
-    """Number of goals by user and outcome."""
+    """Number of finished goals, by user and then by outcome."""
     faults: list[FaultEntry] = msgspec.field(default_factory=list)
     reason: str | None = None
-    """Fault for which a black box was saved."""
+    """Message of the fault for which the black box was saved; None if the file is not a black box."""
     trouble: str | None = None
-    """Reason why the file could not be read."""
+    """Reason why the file could not be read; None if it was read."""
     running: bool = False
-    """Whether the file is still being written, so that these contents are not final."""
+    """True while the file is still being written. The contents are then not final."""
     version: Literal[1] = 1
-    """Version of this format; other versions are not read."""
+    """Version of the format of the sidecar; sidecars of other versions are ignored."""
 
     @property
     def session(self) -> str:
-        """Name of the session, which is the name of its first file without suffix."""
+        """Name of the session to which the file belongs: the name of the session's first file, without suffix."""
         return _PART.sub("", self.name.removesuffix(".rrd"))
 
     def add_cycles(self, began: float, ended: float, count: int) -> None:
-        """Count cycles, given the times of the first and last of them [s since 1970]."""
+        """Add `count` cycles, of which the first was at `began` and the last at `ended` [s since 1970]."""
         self.began = began if self.began is None else self.began
         self.ended = ended
         self.cycles += count
 
     def event(self, event: Event) -> None:
-        """Count the goal or fault in an event."""
+        """Add the finished goal or the fault that an event reports."""
         if event.outcome is not None:
             ended = self.goals.setdefault(event.user or "", {})
             ended[event.outcome] = ended.get(event.outcome, 0) + 1
@@ -86,7 +85,7 @@ class Contents(msgspec.Struct):
             self.faults.append(FaultEntry(event.time, event.fault or FaultDetail(""), event.message))
 
     def control_input(self, item: ControlInput) -> None:
-        """Add the user who sent an input of the control loop."""
+        """Add the user who sent an input to the control loop."""
         match item.given:
             case GoalRequest(user=user) | CheckRequest(user=user) | CommandRequest(user=user) if user:
                 self.users.add(user)
@@ -98,24 +97,24 @@ prepare(Contents)
 
 
 def save(recording: Path, contents: Contents) -> None:
-    """Save the contents of a recording next to it, with the recording's permissions. Raises OSError."""
+    """Save contents in the sidecar of a recording, with the same permissions as the recording. Raises OSError."""
     mode = stat.S_IMODE(recording.stat().st_mode)
     files.replace(sidecar(recording), msgspec.json.encode(contents), mode)
 
 
 def load(recording: Path) -> Contents | None:
-    """Return the contents saved next to a recording; None if they are missing, damaged or of another version."""
+    """Return the contents saved next to a recording; None if the sidecar is missing, damaged or of another version."""
     try:
         contents = decoded(sidecar(recording).read_bytes(), Contents)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError):
         return None
-    contents.name = recording.name  # both may have been renamed
+    contents.name = recording.name  # the recording and its sidecar may have been renamed
     return contents
 
 
 def read_contents(path: Path) -> Contents:
-    """Read the contents of a recording; if it is unreadable, `trouble` contains the reason."""
-    from trirail.telemetry import provenance  # this imports Rerun, which takes most of the start-up time
+    """Read the contents of a recording. If the recording cannot be read, `trouble` contains the reason."""
+    from trirail.telemetry import provenance  # imported late, because importing Rerun takes most of the start-up time
     from trirail.telemetry.reading import read
 
     contents = Contents(path.name, "")
@@ -141,12 +140,12 @@ def read_contents(path: Path) -> Contents:
 
 
 def _reason(contents: Contents) -> str | None:
-    """Return the message of the fault whose time is in the name of a black box; otherwise of the last fault."""
+    """Return the message of the fault whose time is in the name of a black box, or else of the last fault."""
     for entry in (entry for entry in contents.faults if box_name(entry.time) in contents.name):
         return entry.message
     return contents.faults[-1].message if contents.faults else None
 
 
 def box_name(fault_time: float) -> str:
-    """Return the name, without suffix, of the black box for a fault at a time [s since 1970]."""
+    """Return the name, without suffix, of the black box for a fault at `fault_time` [s since 1970]."""
     return f"{BLACK_BOX}{datetime.fromtimestamp(fault_time).astimezone():{STAMP}}"

@@ -1,4 +1,4 @@
-"""Plotted curves, in millimetres, degrees and microseconds, and the limits drawn with them."""
+"""Curves of the live view's plots, in millimetres, degrees and microseconds, and the limits drawn in the same plots."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CENTRE, PHI, SINGULARITY = "/pose/centre", "/pose/phi", "/pose/singularity"
 TIMING = "/loop/timing"
 
 DRAWN_FROM = 0.7
-"""Fraction of a limit that a curve must reach for the limit to be drawn: a distant limit would flatten the curves."""
+"""Fraction of a limit that a curve must reach before the limit is drawn. A distant limit would flatten the curves."""
 
 
 class Curve(NamedTuple):
@@ -31,7 +31,7 @@ class Curve(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """Line at a constant value."""
+    """Horizontal line at a constant value, such as a limit."""
 
     name: str
     value: float
@@ -39,16 +39,16 @@ class Limit(NamedTuple):
 
 
 class Lines(NamedTuple):
-    """Lines of one plot."""
+    """Curves and limits of one plot."""
 
     moving: tuple[Curve, ...]
     still: tuple[Limit, ...] = ()
     drawn_from: float = 0.0
-    """Fraction of a limit that a curve must reach for the limit to be drawn; 0 to draw it always."""
+    """Fraction of a limit that a curve must reach before the limit is drawn; 0 if limits are always drawn."""
 
 
 def plots(robot: DrawnRobot) -> dict[str, Lines]:
-    """Return the lines of each plot, by entity, in the units of the curves."""
+    """Return the lines of each plot, by the entity path of the plot. Limits are in the units of the curves."""
     slider, platform, names = robot.limits.slider, robot.limits.platform, robot.geometry.labels
     error = slider.following_error * 1e6
     margin = float(np.degrees(robot.limits.singularity_margin))
@@ -65,7 +65,10 @@ def plots(robot: DrawnRobot) -> dict[str, Lines]:
 
 
 def timing(rate_hz: int, bus_load: float) -> Lines:
-    """Return the lines of the loop's timing. `bus_load` (1 is a full bus) is shown as the time that its frames take."""
+    """Return the lines of the plot of the loop's timing.
+
+    `bus_load`, which is 1 for a full bus, is shown as the time per cycle in which the bus is busy.
+    """
     period = 1e6 / rate_hz
     return Lines(
         (Curve("cycle", palette.CYCLE), Curve("lateness", palette.LATENESS)),
@@ -79,9 +82,9 @@ def values(
     starts: NDArray[np.intp],
     distance: NDArray[np.float64],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the values of the moving lines, (N, lines), for N groups of records that begin at `starts`.
+    """Return the values of the curves of each plot, (N, curves), for N groups of records that begin at `starts`.
 
-    `newest` contains the last record of each group, `distance` the distance of that record to a singularity [rad].
+    `newest` contains the last record of each group, and `distance` the distance of its pose to a singularity [rad].
     """
     error = records["following_error"]
     highest, lowest = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
@@ -99,7 +102,7 @@ def values(
 
 
 def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64]:
-    """Return the values of a plot, (N, k), followed by columns with its limits."""
+    """Return the values of a plot's curves, (N, k), with one more column per limit; NaN hides a limit."""
     rows, count = moving.shape
     limits = np.array([limit.value for limit in lines.still])
     table = np.empty((rows, count + len(limits)))
@@ -110,7 +113,7 @@ def with_limits(moving: NDArray[np.float64], lines: Lines) -> NDArray[np.float64
 
 
 def _window(x: Range, y: Range) -> tuple[Limit, ...]:
-    """Return the limits of the platform's centre, only once if they are the same for x and y."""
+    """Return the limits of the platform's centre. If x and y have the same limits, return them only once."""
     if x == y:
         return Limit("min", x[0] * 1e3), Limit("max", x[1] * 1e3)
     ends = zip(("x min", "x max", "y min", "y max"), (*x, *y), strict=True)
@@ -122,7 +125,7 @@ def _either_way(limits: Sequence[float], scale: float) -> NDArray[np.float64]:
 
 
 def _sliders(names: Labels, ends: NDArray[np.float64]) -> Lines:
-    """Return the lines of the sliders with their limits, (3, 2), only once if all sliders have the same limits."""
+    """Return the curves of the sliders and their limits `ends`, (3, 2). Limits that all sliders share appear once."""
     lines = tuple(Curve(leg, colour) for leg, colour in zip(names, palette.SLIDERS, strict=True))
     alike = bool((ends == ends[0]).all())
     named = [("", ends[0])] if alike else [(f"{leg} ", own) for leg, own in zip(names, ends, strict=True)]

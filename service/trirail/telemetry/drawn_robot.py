@@ -1,4 +1,4 @@
-"""Data needed to draw a robot, from its configuration or from its service."""
+"""Data needed to draw a robot, taken from a configuration or from a running service."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from trirail.wire.state import Info
 prepare(GeometryTable)
 
 DIGITAL = "/signals"
-"""Parent entity of outputs and inputs: views sort lanes by name, and the mode must come first."""
+"""Parent entity of outputs and inputs. Views sort their lanes by name; this name puts the lane of the mode first."""
 
 
 class DigitalSignal(NamedTuple):
-    """Digital output or input, and its place in the record of a cycle."""
+    """Digital output or input, and the position of its bit in the record of a cycle."""
 
     kind: Literal["output", "input"]
     name: str
     axis: int
     mask: int
-    """Bit of the signal in the word of its drive."""
+    """Bit mask of the signal in the output or input word of its drive."""
 
     @property
     def path(self) -> str:
@@ -56,7 +56,7 @@ class DrawnRobot:
 
     @classmethod
     def from_config(cls, settings: Config) -> DrawnRobot:
-        """Return the robot of a configuration."""
+        """Return the data of the robot that a configuration describes."""
         outputs = [_signal("output", name, each.drive, each.bit) for name, each in settings.outputs.items()]
         inputs = [_signal("input", name, each.drive, each.bit) for name, each in settings.inputs.items()]
         return cls(
@@ -70,9 +70,9 @@ class DrawnRobot:
 
     @classmethod
     def from_info(cls, info: Info) -> DrawnRobot:
-        """Return the robot of a service.
+        """Return the data of a service's robot, given the description that the service sends.
 
-        Raises msgspec.ValidationError or ConfigError if the service has another version.
+        Raises msgspec.ValidationError or ConfigError if the service runs an incompatible version.
         """
         each = [_leg(leg) for leg in info.geometry]
         legs = converted({"kind": info.mechanism, "leg": each, "labels": info.labels}, GeometryTable)

@@ -1,6 +1,6 @@
-"""Logs in a recording, in addition to the records: the control inputs, and the events of the service.
+"""Logs in a recording: the control inputs and the events of the service, stored in addition to the records.
 
-Each line has a text for people, and the message itself as JSON for programs.
+Each line contains a text for people and the message itself as JSON for programs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from trirail.wire.plan_packets import NotPlanned, PathExtension, PreemptingMotio
 EVENTS, REQUESTS = "/events", "/requests"
 TEXT, LEVEL = rr.TextLog.descriptor_text(), rr.TextLog.descriptor_level()
 JSON, WORDS = rr.ComponentDescriptor("json"), rr.ComponentDescriptor("words")
-"""Components next to the line that a viewer shows: the message itself, and the line without its time."""
+"""Components in addition to the text that a viewer shows: the message as JSON, and the text without its time."""
 LEVELS: dict[Level, str] = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 
@@ -67,18 +67,18 @@ class Line(NamedTuple):
 
 
 def event_entry(event: Event) -> Entry:
-    """Return the entry of an event of the service."""
+    """Return the log entry of an event of the service."""
     return Entry(EVENTS, event.t, event.time, event.message, event.level, event)
 
 
 def input_entry(item: ControlInput, rate_hz: int, wall_offset_ns: int) -> Entry:
-    """Return the entry of a control input, at the nominal time of its cycle."""
+    """Return the log entry of a control input, at the nominal time of the cycle that handled the input."""
     wall = (item.now_ns + wall_offset_ns) / SECOND
     return Entry(REQUESTS, item.cycle / rate_hz, wall, _input_text(item), message=item)
 
 
 def chunks(entries: Sequence[Entry]) -> list[Chunk]:
-    """Return entries as Rerun's chunks, one for each log."""
+    """Return log entries as Rerun chunks, with one chunk per log."""
     logs = dict.fromkeys(entry.log for entry in entries)
     return [_chunk(log, [entry for entry in entries if entry.log == log]) for log in logs]
 

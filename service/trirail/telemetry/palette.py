@@ -5,7 +5,7 @@ from __future__ import annotations
 from trirail.wire.vocabulary import Mode
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
-"""Red, green, blue and, if translucent, opacity; each is 0 to 255."""
+"""Red, green, blue and, for a translucent colour, opacity; each from 0 to 255."""
 
 SLIDERS: tuple[Colour, Colour, Colour] = ((242, 108, 79), (52, 190, 145), (82, 148, 255))
 """Colours of the sliders A, B and C."""
@@ -45,7 +45,7 @@ MODES: dict[Mode, Colour] = {
     Mode.STOPPING: (196, 104, 44),
     Mode.FAULT: (200, 56, 56),
 }
-"""Colour of each mode: used unchanged in the live view, paler on paper, and as a rich style in terminals."""
+"""Colour of each mode: unchanged in the live view, paler in printed reports, and as a style of Rich in terminals."""
 
 
 OUTCOMES: dict[str, Colour] = {
@@ -62,7 +62,7 @@ OUTCOMES: dict[str, Colour] = {
 
 
 def pale(colour: Colour) -> Colour:
-    """Return the colour for filled areas on white: halfway to white."""
+    """Return a paler colour for filled areas on a white background, halfway between the colour and white."""
     red, green, blue = colour[:3]
     return (red + 255) // 2, (green + 255) // 2, (blue + 255) // 2
 
@@ -74,6 +74,6 @@ def code(colour: Colour) -> str:
 
 
 def dark(colour: Colour) -> Colour:
-    """Return the colour for the background: half as bright."""
+    """Return the colour at half its brightness, for use as a background."""
     red, green, blue = colour[:3]
     return red // 2, green // 2, blue // 2

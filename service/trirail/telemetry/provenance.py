@@ -1,4 +1,4 @@
-"""Provenance of a recording: the configuration, as a file that can be used again, and the software."""
+"""Provenance of a recording: the versions of the software, and the configuration as a file that can be used again."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from trirail.naming import Labels
 from trirail.wire.decoding import decoded, prepare
 
 CONFIGURATION, SOFTWARE = "/configuration", "/software"
-"""Entity paths of a recording's provenance, as text documents."""
+"""Entity paths of the text documents that store a recording's provenance."""
 LIBRARIES = ("eclipse-zenoh", "ruckig", "rerun-sdk", "python-can", "canopen", "numpy", "numba")
 Tables = dict[str, Any]
 _PACKAGES = (Path(__file__).parents[1], Path(trirail_drivers.__path__[0]))
@@ -32,7 +32,7 @@ class Software(msgspec.Struct, frozen=True):
 
     trirail: str
     source: str
-    """Fingerprint of the packages' source files; it distinguishes versions that have no number."""
+    """Hash of the source files of both packages. It distinguishes development versions with the same version number."""
     machine: str
     versions: dict[str, str]
 
@@ -55,19 +55,19 @@ def versions() -> dict[str, str]:
 
 
 def text_documents(config: Config) -> dict[str, str]:
-    """Return the text documents of a recording, by entity path."""
+    """Return the text documents to store in a recording, by entity path."""
     described = msgspec.json.format(msgspec.json.encode(software()), indent=2)
     return {CONFIGURATION: toml(config), SOFTWARE: described.decode()}
 
 
 def configuration(documents: Mapping[str, str]) -> Config | None:
-    """Return the configuration in a recording's texts; None if there is none. Raises ConfigError."""
+    """Return the configuration stored in a recording; None if it has none. Raises ConfigError if it is invalid."""
     text = documents.get(CONFIGURATION)
     return parse(text) if text is not None else None
 
 
 def labels(documents: Mapping[str, str]) -> Labels:
-    """Return the labels of the sliders in a recording's texts, or the letters of the sliders if there are none."""
+    """Return the sliders' labels from a recorded configuration, or the letters A, B, C if it cannot be read."""
     try:
         config = configuration(documents)
     except ConfigError:
@@ -76,7 +76,7 @@ def labels(documents: Mapping[str, str]) -> Labels:
 
 
 def recorded_by(documents: Mapping[str, str]) -> Software | None:
-    """Return the software in a recording's texts; None if it is missing or cannot be decoded."""
+    """Return the software versions stored in a recording; None if they are missing or cannot be decoded."""
     try:
         return decoded(documents.get(SOFTWARE, ""), Software)
     except msgspec.DecodeError:
@@ -84,13 +84,16 @@ def recorded_by(documents: Mapping[str, str]) -> Software | None:
 
 
 def toml(config: Config) -> str:
-    """Format a complete configuration as TOML, including defaults, so that parse(toml(config)) == config."""
+    """Format a configuration as TOML, including default values, so that parse(toml(config)) == config."""
     tables = msgspec.to_builtins(config)
     return "\n".join(toml_lines(tables, tables, "")).lstrip() + "\n"
 
 
 def toml_lines(tables: Tables, other: Tables, base: str, path: str = "") -> Iterator[str]:
-    """Yield tables as lines of TOML. Comments mark values that differ from `other`, whose name is `base`."""
+    """Yield tables as lines of TOML.
+
+    For each value that differs from `other`, a comment shows the value in `other`, which `base` names.
+    """
     inner = {key: value for key, value in tables.items() if _is_tables(value)}
     plain = {key: value for key, value in tables.items() if key not in inner}
     if path and (plain or not inner):
@@ -119,7 +122,7 @@ def _is_tables(value: object) -> bool:
 
 
 def _literal(value: object) -> str:
-    """Format a value as TOML, which writes strings, numbers, booleans and arrays as JSON does."""
+    """Format a value as TOML, in which strings, numbers, booleans and arrays look the same as in JSON."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -1,9 +1,9 @@
-"""Reading of recordings into numpy: each cycle's record bit for bit, the log of events, and the texts beside them.
+"""Reading of recordings into numpy: the exact record of each cycle, the log of events, and the text documents.
 
 from trirail import read
 recording = read("recordings/demo-20260101-120000.rrd")
 error = recording.records["following_error"]      # (N, 3) [m]; the fields are those of trirail.wire.records
-session = join([read(path) for path in parts])    # of a session whose recording was rotated, in any order
+session = join([read(path) for path in parts])    # all files of a rotated recording, in any order
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from trirail.wire.records import DTYPE
 # Structure of an RRD file: Rerun's crate re_log_encoding, src/rrd/frames.rs.
 _MAGIC = b"RRF2"
 _FILE_HEADER = 12
-"""Size of magic number, version and options [bytes]."""
+"""Size of the file header, which contains magic number, version and options [bytes]."""
 _MESSAGE_HEADER = struct.Struct("<QQ")
-"""Kind of a message, and the number of bytes that follow it."""
+"""Header of each message: the kind of the message, and the number of bytes that follow the header."""
 _END = 0
-"""Kind of the last message of a closed file; only a table of contents follows it."""
+"""Kind of the last message of a properly closed file. Only a table of contents follows this message."""
 
 _LEVEL = rr.TextLog.descriptor_level().component
 _DOCUMENT = rr.TextDocument.descriptor_text().component
@@ -55,18 +55,18 @@ prepare(Event)
 BY_CYCLE = "cycle"
 """Field by which records are sorted."""
 _LAYOUT = layout(DTYPE)
-"""Fields of the records, as Arrow types in a file."""
+"""Arrow types of the fields of a record in a file."""
 
 
 class OlderRecordingWarning(UserWarning):
-    """Warning that a recording is older than some fields of the records."""
+    """Warning that a recording lacks fields that were added to the records later."""
 
 
 def read(path: str | os.PathLike[str]) -> Recording:
     """Read a recording (.rrd), without changing the file.
 
     Fields, units and frames of the records are those of trirail.wire.records.FIELDS: SI units and radians, sliders in
-    the order A, B, C, poses in the base frame. From a file that was cut off, or is still being written, all complete
+    the order A, B, C, poses in the base frame. If the file was cut off or is still being written, all of its complete
     messages are read.
 
     Raises
@@ -79,7 +79,7 @@ def read(path: str | os.PathLike[str]) -> Recording:
     Warns
     -----
     OlderRecordingWarning
-        The recording is older than some fields: they are NaN, or 0 where they are not floats.
+        The recording lacks fields that were added later. Those fields are NaN, or 0 if they are not floats.
     """
     path = Path(path)
     size = path.stat().st_size if path.is_file() else 0
@@ -89,7 +89,7 @@ def read(path: str | os.PathLike[str]) -> Recording:
     except ServiceError:
         if not path.is_file() or path.stat().st_size == size:
             raise
-        with _without_partial_message(path, growing=True) as whole:  # it was being written while Rerun read it
+        with _without_partial_message(path, growing=True) as whole:  # the file was being written while Rerun read it
             chunks = _chunks(whole, path)
     texts = _static(chunks, _DOCUMENT)
     kept = [chunk for chunk in chunks if chunk.entity_path == RECORD]
@@ -108,7 +108,10 @@ def read(path: str | os.PathLike[str]) -> Recording:
 
 
 def join(parts: Sequence[Recording]) -> Recording:
-    """Join the parts of a session, given in any order. Raises ServiceError if they belong to different sessions."""
+    """Join the recordings of a session's files, given in any order.
+
+    Raises ServiceError if the recordings belong to different sessions.
+    """
     first, *others = sorted(parts, key=lambda part: int(part.records["cycle"][0]))
     for other in others:
         if (other.name, other.texts) != (first.name, first.texts):
@@ -132,7 +135,7 @@ def join(parts: Sequence[Recording]) -> Recording:
 def _without_partial_message(path: Path, *, growing: bool = False) -> Iterator[Path]:
     """Yield the file itself or, if its last message was cut off, a copy without that message.
 
-    Rerun cannot read a file that contains a partial message. For a `growing` file, a copy is always yielded.
+    Rerun cannot read a file that contains a partial message. If the file is still `growing`, always yield a copy.
     """
     try:
         size, length = path.stat().st_size, _complete_length(path)
@@ -170,7 +173,7 @@ def _complete_length(path: Path) -> int:
 
 
 def _chunks(whole: Path, path: Path) -> list[Chunk]:
-    """Return the chunks of the records and of the logs, and the static chunks."""
+    """Return the chunks of records, the chunks of logs, and the static chunks."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)  # the file was cut off
@@ -185,9 +188,9 @@ def _chunks(whole: Path, path: Path) -> list[Chunk]:
 def _cycles(
     batches: Sequence[pa.RecordBatch], path: Path
 ) -> tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.datetime64]]:
-    """Return records in order of cycle, with their times from `_times`.
+    """Return the records in the order of their cycles, and their times as returned by `_times`.
 
-    Raises ServiceError, and warns of missing fields, as documented for `read`.
+    Errors and warnings are the same as for `read`.
     """
     if not any(batch.num_rows for batch in batches):
         raise ServiceError(f"{path}: holds no records of cycles (entity {RECORD}): was it made by trirail?")
@@ -206,9 +209,9 @@ def _cycles(
 
 
 def _check_layout(kind: pa.StructType, path: Path) -> None:
-    """Warn of fields that records of this kind lack.
+    """Warn about fields that are missing from records of type `kind`.
 
-    Raises ServiceError for unknown fields, or without a cycle number.
+    Raises ServiceError if the records have unknown fields, or have no cycle number.
     """
     if odd := set(kind) - set(_LAYOUT):
         names = ", ".join(sorted({field.name for field in odd}))
@@ -226,7 +229,7 @@ def _check_layout(kind: pa.StructType, path: Path) -> None:
 
 
 def _place(part: pa.StructArray, records: NDArray[np.void]) -> None:
-    """Copy the fields that were read into zeroed records; missing floats become NaN."""
+    """Copy the fields that were read into `records`, which must be zero. Set missing floats to NaN."""
     there = {field.name: values for field, values in zip(part.type, part.flatten(), strict=True)}
     for name in DTYPE.names or ():
         values = there.get(name)
@@ -239,7 +242,7 @@ def _place(part: pa.StructArray, records: NDArray[np.void]) -> None:
 
 
 def _times(batches: Sequence[pa.RecordBatch]) -> tuple[NDArray[np.float64], NDArray[np.datetime64]]:
-    """Return the times of rows: nominal time since the start of the loop [s], and wall clock in UTC [ns]."""
+    """Return two times for each row: nominal time since the start of the loop [s], and wall-clock time in UTC [ns]."""
     t, wall = (
         np.concatenate([np.from_dlpack(batch.column(timeline).view(pa.int64())) for batch in batches])
         for timeline in ("t", "wall")
@@ -283,7 +286,7 @@ def _decoded(row: str, decode: Callable[[str], T], path: Path, what: str) -> T:
 
 
 def _static(chunks: list[Chunk], component: str) -> dict[str, str]:
-    """Return the texts of a component that are valid for the whole session, by entity path."""
+    """Return the static texts of a component, which are valid for the whole session, by entity path."""
     return {
         chunk.entity_path: batch.column(component).flatten()[0].as_py()
         for chunk in chunks

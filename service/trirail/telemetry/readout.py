@@ -1,4 +1,4 @@
-"""Readout beside the drawing, with mode, fault, pose, goal, override and sliders as text."""
+"""Text shown next to the robot's drawing, with mode, fault, pose, goal, override and slider values."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from trirail.wire.vocabulary import MODES, Mode
 
 PATH = "/readout"
 _ESCAPES = str.maketrans({letter: f"\\{letter}" for letter in "\\`*_{}[]<>()#+-.!|~$&:"})
-"""Escapes of Markdown's special characters, which are plain text after a backslash (CommonMark 2.4)."""
+"""Escape sequences for Markdown's special characters. After a backslash, they are plain text (CommonMark 2.4)."""
 
 _TABLE_HEAD = "| | x [mm] | y [mm] | φ [°] | | {} | {} | {} |"
 _TABLE_RULE = f"|---|{'--:|' * 3}---|{'--:|' * 3}"
 
 
 class ReadoutState(NamedTuple):
-    """State in the readout that is not in the records; it is valid until its next update."""
+    """State that the readout shows in addition to the record. It is valid until it is updated."""
 
     goal: str | None = None
     """Id of the current goal."""
     target: Sequence[float] | None = None
-    """Pose to which the goal leads: x, y [m], phi [rad]; None if there is no goal or it is a jog."""
+    """Target pose of the goal: x, y [m], phi [rad]; None if there is no goal, or if the goal is a jog."""
     override: float = 1.0
-    """Speed override, 0 to 2."""
+    """Speed override, from 0 to 2; 1 is the planned speed."""
     fault: str | None = None
-    """Reason for the robot's fault."""
+    """Reason for the robot's current fault; None if there is no fault."""
 
 
 def markdown(record: np.void, state: ReadoutState, names: Labels = NAMES) -> str:
-    """Return the readout for a record of wire.records.DTYPE as Markdown, in millimetres, degrees and micrometres."""
+    """Return the readout for one record of wire.records.DTYPE as Markdown, in millimetres, degrees and micrometres."""
     head = f"**{MODES[record['mode']].upper()}**   override {state.override:.0%}"
     if state.goal is not None:
         share, left = float(record["progress"]), float(record["remaining"])

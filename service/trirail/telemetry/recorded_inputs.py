@@ -1,8 +1,9 @@
-"""Format of the control inputs in recordings: JSON with unchanged names and order of fields.
+"""Format of the control inputs in recordings: JSON in which the names and the order of fields never change.
 
-Between the processes, an announcement is one record with a notice, and an answer from the planner contains the reply to
-the goal. The format of recordings is older: it has one record for each kind of notice, and stores the fields of the
-reply among those of the answer. It is kept so that files of any age can be read, and older programs can read new files.
+The messages between the processes have changed since: a single type of announcement contains any kind of notice, and
+the planner's answer contains the reply to the goal as a separate object. In a recording, each kind of notice has a
+type of its own, and the fields of the reply are stored among the fields of the answer. Recordings retain this format,
+because all versions must be able to read both old and new files.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ class _RecordedNotice(NamedTuple):
 
     kind: str
     fields: dict[str, str]
-    """Recorded name of each field, keyed by its name in the notice."""
+    """Name of each field in a recording, by its name in the notice."""
     constants: dict[str, str]
-    """Values of fields that are not recorded because the kind determines them."""
+    """Values of fields that are not recorded, because the kind of notice determines them."""
 
 
 _CODED = {"message": "message", "event_code": "event_code", "params": "params"}
@@ -47,24 +48,24 @@ _PLANS = {
     "Planned": ("number", "version", "first", "run", "duration", "slowed", "stops_first", "stop", "bound", "lag"),
     "Extended": ("number", "version", "s", "path", "slowed"),
 }
-"""Recorded fields of the planner's answers, including the fields of their reply."""
+"""Recorded fields of each kind of planner's answer, including the fields of the reply to the goal."""
 _OLDEST = ("id", "duration", "slowed", "stops_first", "queued", "lag", "accepted")
 _LATER = tuple(name for name in GoalReply.__struct_fields__ if name not in _OLDEST)
-"""Fields that were added to a reply later; they are recorded only if they differ from the reply below."""
+"""Fields that were added to the reply later. A field is recorded only if its value differs from _PLAIN_REPLY."""
 _PLAIN_REPLY = GoalReply("", None)
 _Line = dict[str, Any]
 prepare(_Line, ControlInput, AlignmentLook)
 
 
 def encode_input(what: ControlInput) -> str:
-    """Return an input as JSON."""
+    """Encode a control input as JSON in the format of recordings."""
     if isinstance(what.given, Announcement):
         entry = _recorded_notice(what.given.notice)
     elif isinstance(what.given, PreemptingMotion | PathExtension):
         entry = _recorded_plan(what.given)
     elif isinstance(what.given, GoalRequest):
         entry = msgspec.to_builtins(what.given)
-        for name in ("marks", "stop_at"):  # fields of later goals: older programs refuse fields that they do not know
+        for name in ("marks", "stop_at"):  # these fields were added later, and older programs refuse unknown fields
             if not entry["goal"].get(name, True):
                 del entry["goal"][name]
     else:
@@ -73,7 +74,7 @@ def encode_input(what: ControlInput) -> str:
 
 
 def decode_input(text: str) -> ControlInput:
-    """Return an input, given as JSON. Raises msgspec.DecodeError."""
+    """Decode a control input from the JSON of a recording. Raises msgspec.DecodeError if it is invalid."""
     line = decoded(text, _Line)
     entry = line.get("given")
     if isinstance(entry, dict) and entry.get("type") in _NOTICES:
@@ -84,13 +85,13 @@ def decode_input(text: str) -> ControlInput:
 
 
 def _recorded_notice(notice: Notice) -> _Line:
-    """Return the recorded fields of an announcement."""
+    """Return the fields with which a notice is recorded."""
     name = _TYPES[notice.kind]
     return {"type": name} | {recorded: getattr(notice, field) for field, recorded in _NOTICES[name].fields.items()}
 
 
 def _recorded_plan(plan: PreemptingMotion | PathExtension) -> _Line:
-    """Return the recorded fields of an answer from the planner."""
+    """Return the fields with which an answer from the planner is recorded."""
     fields = msgspec.to_builtins(plan)
     fields |= fields.pop("reply")
     later = [name for name in _LATER if getattr(plan.reply, name) != getattr(_PLAIN_REPLY, name)]
@@ -100,7 +101,7 @@ def _recorded_plan(plan: PreemptingMotion | PathExtension) -> _Line:
 
 
 def _announcement(entry: _Line) -> _Line:
-    """Return the fields of the recorded announcement."""
+    """Return the fields of an announcement, given its recorded fields."""
     kind, fields, constants = _NOTICES[entry["type"]]
     notice: _Line = {"kind": kind} | constants
     notice |= {field: entry[recorded] for field, recorded in fields.items() if recorded in entry}
@@ -111,7 +112,7 @@ def _announcement(entry: _Line) -> _Line:
 
 
 def _plan(entry: _Line) -> _Line:
-    """Return the fields of the recorded answer from the planner."""
+    """Return the fields of an answer from the planner, given its recorded fields."""
     reply = {name: entry.pop(name) for name in GoalReply.__struct_fields__ if name in entry}
     unrecorded = {"id": "", "duration": None, "queued": entry["type"] == "Extended"}
     return entry | {"reply": unrecorded | reply}

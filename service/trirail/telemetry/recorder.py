@@ -1,4 +1,4 @@
-"""Recorder that writes records, events and frames to the file and to the live view."""
+"""Recorder, which writes records and events to a file and to the live view, and CAN frames to a log file."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ RECORDS_HZ = 5
 DRAWING_HZ = 1
 """Number of batches of drawings per second written to the file.
 
-A low rate saves space, and the records are sufficient to draw them again.
+A low rate saves space. Nothing is lost, because the drawings can be made again from the records.
 """
 CHECKS_HZ = 1
-"""Number of checks per second of files, folder, log and live view."""
+"""Number of times per second that the files, the folder, the log and the live view are checked."""
 TIDY_EVERY = 10.0
-"""Interval between checks of the folder, and between writes of the newest file's sidecar [s]."""
+"""Interval at which the folder is checked, and at which the sidecar of the newest file is written [s]."""
 MB = 1e6
 
 
 class Recorder:
-    """Writes one recording.
+    """Writer of one recording.
 
-    With telemetry.capture_can, it also writes all CAN frames to a .log file next to the first file.
+    If telemetry.capture_can is set, the recorder also writes all CAN frames to a .log file next to the first file.
 
     Parameters
     ----------
@@ -55,17 +55,17 @@ class Recorder:
     directory
         Folder of the files `<robot>-<date>-<time>.rrd`; rotated files also have `-part2` and so on in their names.
     path
-        File to write instead of one in `directory`.
+        File to write, instead of a new file in `directory`.
     name, reason
-        Name and reason of a black box, which has one file and may fill the disk.
+        Name of a black box, and the fault for which it is saved. A black box has only one file, and may fill the disk.
     sidecars
-        Whether to write the contents of each file next to it, for `trirail sessions`.
+        Whether to write a summary of each file next to that file, which `trirail sessions` reads.
     live
         Whether to serve the live view.
     warn
-        Function that receives reports of missing data; if it is None, they are only in the log.
+        Function that receives reports of missing data. If it is None, the reports are written only to the log.
     wall_ns, monotonic_ns
-        Clocks [ns].
+        Functions that return the wall-clock time and the monotonic time [ns].
 
     Raises
     ------
@@ -112,7 +112,7 @@ class Recorder:
         self._sidecars, self._reason, self._wall_offset_ns = sidecars, reason, started_ns - monotonic_ns()
         self._contents: Contents | None = None
         self._sidecar_error = ""
-        """Reason why the last sidecar is missing; empty if it was written."""
+        """Reason why the last sidecar could not be written; empty if it was written."""
         reserve = 0 if self._is_black_box else RESERVE
         self._first, self._own_files = first, first.parent
         self._files = RotatedFiles(first, self._open, streams.drop, reserve, lambda: monotonic_ns() * 1e-9, self._warn)
@@ -120,7 +120,7 @@ class Recorder:
         streams.attach(self._files, DRAWING_HZ)
         self._live: Relay | None = None
         self.live_url = ""
-        """Address for viewers; empty if there is no live view."""
+        """Address to which viewers connect; empty if there is no live view."""
         if server:
             self._live = live_relay(streams.open(server))
             streams.attach(self._live, LIVE_HZ)
@@ -134,9 +134,9 @@ class Recorder:
         self._next_entry = 0.0
         self._tidy_error = ""
         self._reported_trouble = ""
-        """Loss that was reported, as in `unrecorded`; empty if there is none."""
+        """Data reported as unrecorded, as returned by `unrecorded`; empty if no loss is being reported."""
         self._recovered_at = 0.0
-        """Time from which the end of the loss may be reported [s]."""
+        """Earliest time at which the end of a loss may be reported [s]."""
 
     @property
     def path(self) -> Path:
@@ -150,12 +150,12 @@ class Recorder:
 
     @property
     def cause(self) -> str:
-        """Reason why the most recently lost batch was lost; empty if none was lost."""
+        """Reason why the most recently lost batch was lost; empty if no batch was lost."""
         return self._files.cause or self._frames_cause
 
     @property
     def unrecorded(self) -> tuple[str, str]:
-        """Data that currently does not reach any file, and the reason; both are empty while everything is written."""
+        """Description of the data that currently does not reach a file, and the reason; both empty if all data does."""
         if self._files.trouble:
             return "nothing is recorded", self._files.trouble
         if self._frames and self._frames.trouble:
@@ -164,16 +164,16 @@ class Recorder:
 
     @property
     def skipped(self) -> int:
-        """Number of batches dropped because the live view was too slow."""
+        """Number of batches that were dropped because the live view was too slow."""
         return self._live.skipped if self._live else 0
 
     @property
     def missing(self) -> tuple[int, int, int]:
-        """Numbers of batches missing in the file and in the live view, and of cycles that this recorder missed."""
+        """Three counts: batches missing in the file, batches missing in the live view, and cycles not received."""
         return self.lost, self.skipped, self._missed_cycles
 
     def records(self, batch: bytes) -> None:
-        """Write packed records."""
+        """Write packed records, and run the periodic checks when they are due."""
         last = last_cycle(batch)
         if self._last is not None:
             self._missed_cycles += last - self._last - len(batch) // SIZE
@@ -189,7 +189,7 @@ class Recorder:
             self._contents.add_cycles(began, ended, len(rows))
 
     def save(self) -> None:
-        """Write all records and log lines that have arrived; they then survive the end of this process."""
+        """Write all records and log lines that have arrived, so that they survive the end of this process."""
         self._records.flush()
         self._streams.save()
 
@@ -200,7 +200,7 @@ class Recorder:
             self._contents.event(event)
 
     def control_input(self, item: ControlInput) -> None:
-        """Write an input of the control loop."""
+        """Write an input to the control loop."""
         self._streams.control_input(item)
         if self._contents is not None:
             self._contents.control_input(item)
@@ -210,11 +210,11 @@ class Recorder:
         self._streams.update_state(standing)
 
     def bus_load(self, share: float) -> None:
-        """Set the bus load; 1 is a full bus."""
+        """Set the displayed bus load; 1 means a full bus."""
         self._streams.bus_load(share)
 
     def frames(self, batch: bytes) -> None:
-        """Write captured CAN frames, packed as trirail_drivers.bus.capture.FRAME."""
+        """Write captured CAN frames, packed as trirail_drivers.bus.can_frame.CAPTURED."""
         if self._frames:
             self._frames.write(batch)
             self._frames_cause = self._frames.trouble or self._frames_cause
@@ -222,7 +222,7 @@ class Recorder:
     def close(self) -> None:
         """Write the remaining data and finish the file.
 
-        If the disk or a viewer is not responding, this waits for at most a few seconds.
+        If the disk or a viewer does not respond, this method waits for at most a few seconds.
         """
         self._flush()
         if words := self._missing_text():
@@ -236,7 +236,7 @@ class Recorder:
             self._live.close()
 
     def _open(self, path: Path) -> rr.RecordingStream:
-        """Begin a file that contains everything needed to view it on its own."""
+        """Begin a new file with all data that a viewer needs to show the file without earlier files."""
         self._write_sidecar()
         self._contents = Contents(path.name, self._config.robot.name, reason=self._reason)
         stream = self._streams.open(rr.FileSink(path))
@@ -246,7 +246,7 @@ class Recorder:
         return stream
 
     def _write_sidecar(self, *, running: bool = False) -> None:
-        """Write the contents of the newest file next to it; with `running`, they are not final."""
+        """Write the sidecar of the newest file, marked as not final if `running`."""
         if not self._sidecars or self._contents is None:
             return
         self._contents.running = running
@@ -269,11 +269,11 @@ class Recorder:
         self._streams.flush()
 
     def _run_checks(self) -> None:
-        """Rotate the file, tidy the folder and report missing data, each when it is due."""
+        """Rotate the file, delete old recordings, write the sidecar and report missing data, if any of these is due."""
         t = self._streams.t
         if not self._is_black_box:
             self._rotate()
-        if self._live:  # without a viewer, it shares the drawings of the file, which costs nothing
+        if self._live:  # while no viewer is connected, reuse the drawings made for the file, which costs nothing
             self._streams.attach(self._live, LIVE_HZ if is_watched(self._config.telemetry.live_port) else DRAWING_HZ)
         if self._own_folder is not None and t >= self._next_tidy:
             self._next_tidy = t + TIDY_EVERY
@@ -288,10 +288,10 @@ class Recorder:
             self._warn(coded(words, EventCode.RECORDING_INCOMPLETE, lost=lost, skipped=skipped, absent=absent))
 
     def _report_trouble(self, t: float) -> bool:
-        """Report the beginning and the end of a loss once each; return whether a loss is being reported.
+        """Report a loss once when it begins and once when it ends. Return True from the first report to the second.
 
-        The end is reported after REPORT_EVERY seconds without a loss, because a full disk may have space
-        intermittently.
+        The end is reported only after REPORT_EVERY seconds without a loss, because space may become free on a full disk
+        for short moments.
         """
         problem, why = self.unrecorded
         if problem:
@@ -306,7 +306,7 @@ class Recorder:
         return bool(self._reported_trouble)
 
     def _rotate(self) -> None:
-        """Continue in another file if it is due, unless the disk is full and has no space for another file."""
+        """Continue in another file if the newest file is too old or too large, unless writing currently fails."""
         telemetry, volumes = self._config.telemetry, self._files
         full = volumes.age >= telemetry.rotate_minutes * 60.0 or volumes.size >= telemetry.rotate_mb * MB
         if full and not volumes.trouble:
@@ -327,7 +327,7 @@ class Recorder:
                 self._warn(coded(words, EventCode.RECORDINGS_KEPT, error=str(error)))
 
     def _missing_text(self) -> str:
-        """Return a message about missing data if there is more than last reported, otherwise ""."""
+        """Return a message about missing data if any count has changed since the last message; otherwise return ""."""
         if self.missing == self._reported:
             return ""
         self._reported = self.missing
@@ -339,16 +339,16 @@ class Recorder:
 
 
 def _remedy(error: OSError) -> str:
-    """Return what to do after a file could not be created."""
+    """Return advice for the user if a file could not be created."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "free some space on that disk; telemetry.keep_mb limits the size of all recordings"
     return "set telemetry.directory to a folder that can be written"
 
 
 def _overwrite(path: Path) -> Path:
-    """Create an empty file, or empty an existing one.
+    """Create an empty file, or truncate an existing file.
 
-    Raises FileError if the file is not regular, since a FIFO would wait for a reader.
+    Raises FileError if the file is not a regular file. Opening a FIFO would wait for a reader.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):

@@ -1,4 +1,4 @@
-"""Recording in numpy, and selections of it: a time span, a goal, fewer rows, some columns, and tables of these."""
+"""Recording as numpy arrays, with methods to select a time span, a goal or fewer rows, and to return tables."""
 
 from __future__ import annotations
 
@@ -25,39 +25,45 @@ if TYPE_CHECKING:
 
 FIELD_NAMES = DTYPE.names or ()
 TIMES = ("t", "wall")
-"""Columns in addition to the fields: nominal time since the start of the loop [s], and wall clock (UTC)."""
+"""Columns in addition to the record's fields: nominal time since the start of the loop [s], and wall clock (UTC)."""
 _COORDINATES = ("x", "y", "phi")
 _SLIDERS = tuple(name.lower() for name in NAMES)
 _ROUNDING = 1e-6
-"""Tolerance for the time between two rows, so that 10 ms are ten cycles of one millisecond."""
+"""Tolerance against rounding errors, as a fraction of the interval of rows.
+
+With the tolerance, an interval of 10 ms is exactly ten cycles of one millisecond.
+"""
 
 
 class RecordedAlignment(NamedTuple):
-    """Looks of one alignment, calibration or check, as reported by its client."""
+    """Looks of one alignment, calibration or check, as reported by the client that ran it."""
 
     id: str
-    """Prefix of the ids of its goals."""
+    """Prefix of the ids of the alignment's goals."""
     user: str
     purpose: str
     """One of alignment, calibration and check."""
     t: tuple[float, ...]
     """Nominal times at which the looks were reported, since the start of the loop [s]."""
     looks: tuple[AlignmentLook, ...]
-    """Looks in order. The last has the end; if an error or a calibration ended it, it is not one of the cameras."""
+    """Looks in order. The last entry has the reason for the end.
+
+    If an error or a calibration ended the sequence, the last entry only reports the end, and is not a picture.
+    """
 
     @property
     def end(self) -> str:
-        """Reason why it ended; unknown if no end was reported."""
+        """Reason why the alignment ended; "unknown" if no end was reported."""
         return self.looks[-1].end or "unknown"
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """Names of the marks that were found: the rows of `residuals`."""
+        """Sorted names of the marks that were found, one for each row of `residuals`."""
         return tuple(sorted({mark.name for look in self.looks for mark in look.marks}))
 
     @property
     def residuals(self) -> NDArray[np.float64]:
-        """Distance of each mark from its target at each look, (marks, looks) [m]; NaN where unknown."""
+        """Distance of each mark from its target in each look, (marks, looks) [m]; NaN if the distance is unknown."""
         ways = [
             {mark.name: math.hypot(*mark.to_go) for mark in look.marks if mark.to_go is not None} for look in self.looks
         ]
@@ -69,24 +75,22 @@ class Recording(NamedTuple):
     """Content of a recording."""
 
     name: str
-    """Name of the robot and start time; empty if the file contains none."""
+    """Name of the recording, with the robot's name and the start time; empty if the file has no name."""
     records: NDArray[np.void]
-    """Records of all cycles, (N,), of wire.records.DTYPE, in order of `cycle`, without those that did not reach the
-    file.
-    """
+    """Records that reached the file, (N,), in order of `cycle`; their type is wire.records.DTYPE."""
     t: NDArray[np.float64]
     """Nominal times of the records since the start of the loop, (N,) [s]."""
     wall: NDArray[np.datetime64]
     """Wall-clock times of the records, (N,), UTC [ns]."""
     events: list[Line]
-    """Lines of the log, in order."""
+    """Lines of the log of events, in order of time."""
     texts: dict[str, str]
-    """Text documents that are valid for the whole session, by entity path: /configuration, /software."""
+    """Text documents that are valid for the whole session, by entity path: /configuration and /software."""
     requests: tuple[ControlInput, ...] = ()
-    """Control inputs in order: goals and commands, each with the cycle that handled it, and disturbances."""
+    """Inputs to the control in order, such as goals, commands and disturbances, with the cycle that handled each."""
 
     def __repr__(self) -> str:
-        """Return the name, the duration, and the numbers of cycles and events in one line."""
+        """Return one line with the name, the duration, the number of cycles and the number of events."""
         duration = float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
         name = self.name or "unnamed"
         return f"<Recording {name}: {duration:.1f} s, {len(self.records)} cycles, {len(self.events)} events>"
@@ -106,14 +110,14 @@ class Recording(NamedTuple):
         begin, end
             First and last time `t` [s].
         goal
-            Id of a goal; only its cycles are returned.
+            Id of a goal. If it is given, only the cycles from the goal's acceptance to its end are returned.
         every
-            Interval of the rows [s]. The first row of each interval is returned, not a mean.
+            Interval of the rows [s]. Of each interval, the first row is returned, not a mean.
 
         Returns
         -------
         Recording
-            The part, with all requests, which are needed to look up goals.
+            The part. It retains all requests of the recording, which are needed to look up goals.
 
         Raises
         ------
@@ -149,7 +153,7 @@ class Recording(NamedTuple):
 
     @property
     def alignments(self) -> list[RecordedAlignment]:
-        """Alignments, camera calibrations and checks that clients reported, in order, with every look."""
+        """Alignments, camera calibrations and checks that clients reported, in order, with all of their looks."""
         return _alignments(self.events)
 
     def table(self, every: float | str | None = None, columns: Sequence[str] = ()) -> pd.DataFrame:
@@ -160,8 +164,8 @@ class Recording(NamedTuple):
         every
             Interval of the rows, in seconds or as text such as "10ms"; None for all rows.
         columns
-            Names of fields, or words in names, such as pose or error; all fields if empty. Columns of poses end in
-            _x, _y, _phi, those of sliders in _a, _b, _c.
+            Names of fields, or words that occur in names, such as pose or error; all fields if empty. Columns of poses
+            end in _x, _y, _phi, and columns of sliders end in _a, _b, _c.
 
         Raises
         ------
@@ -185,11 +189,12 @@ class Recording(NamedTuple):
 
 
 def table(recording: Recording, columns: Sequence[str] = ()) -> pa.Table:
-    """Return the records as a table: t [s], wall (UTC), the name of the mode, then the fields of wire.records.FIELDS.
+    """Return the records as a table with SI units and radians.
 
-    The table uses SI units and radians. Columns of sliders end in _a, _b, _c, those of poses in _x, _y, _phi, and those
-    of the parts of a cycle in their names. `columns` selects the fields after t, each by its name or by a word in
-    several names, such as error or commanded. Raises ServiceError for an unknown column.
+    The columns are t [s], wall (UTC), the name of the mode, and the other fields of wire.records.FIELDS. Columns of
+    sliders end in _a, _b, _c, columns of poses in _x, _y, _phi, and columns of the parts of a cycle in the name of the
+    part. If `columns` is given, the table contains only t and the selected fields. A field is selected by its name or
+    by a word in its name, such as error or commanded. Raises ServiceError for an unknown column.
     """
     fields = chosen(columns)
     table_columns: dict[str, pa.Array] = {"t": pa.array(recording.t)}
@@ -202,9 +207,9 @@ def table(recording: Recording, columns: Sequence[str] = ()) -> pa.Table:
 
 
 def chosen(columns: Sequence[str]) -> tuple[str, ...]:
-    """Return the requested fields without duplicates, or all fields if none are requested.
+    """Return the names of the requested fields without duplicates, or of all fields if `columns` is empty.
 
-    Raises ServiceError for an unknown word.
+    Raises ServiceError if no field has a requested name or word.
     """
     everything = ("wall", "mode", *(name for name in FIELD_NAMES if name != "mode"))
     fields: list[str] = []
@@ -221,7 +226,7 @@ def chosen(columns: Sequence[str]) -> tuple[str, ...]:
 
 
 def _columns(name: str, values: NDArray[np.void]) -> Iterator[tuple[str, pa.Array]]:
-    """Yield the columns of a field with their names."""
+    """Yield the name and the values of each column into which a field is split."""
     if name == "mode":
         yield name, pa.DictionaryArray.from_arrays(pa.array(values), pa.array([str(mode) for mode in MODES]))
     elif values.ndim == 1:
@@ -233,7 +238,7 @@ def _columns(name: str, values: NDArray[np.void]) -> Iterator[tuple[str, pa.Arra
 
 
 def _goal(recording: Recording, goal: str) -> tuple[int, float]:
-    """Return the cycle that accepted a goal, and its end time [s], which is infinite if it is not recorded."""
+    """Return the cycle that accepted a goal, and the time at which the goal ended [s], or infinity if unrecorded."""
     taken_at = {
         item.given.id: item.cycle for item in reversed(recording.requests) if isinstance(item.given, GoalRequest)
     }
@@ -245,7 +250,7 @@ def _goal(recording: Recording, goal: str) -> tuple[int, float]:
 
 
 def _alignments(events: Iterable[Line]) -> list[RecordedAlignment]:
-    """Return the alignments in a log, in the order of their first looks."""
+    """Return the alignments reported in a log, in the order of their first looks."""
     looks_of: dict[tuple[str, str, str], list[tuple[float, AlignmentLook]]] = {}
     for line in events:
         if line.event is not None and (look := line.event.alignment) is not None:

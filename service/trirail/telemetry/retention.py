@@ -1,7 +1,8 @@
-"""Retention of recordings: the oldest are deleted when all recordings together take too much space.
+"""Retention of recordings: the oldest recordings are deleted when all recordings together need too much space.
 
-File times are not used, because a machine without a battery-backed clock dates files years off until it has the network
-time. A file that is being written is locked, and the dates and numbers in the names determine the order of the files.
+The age of a recording follows from the dates and numbers in its name, not from file times. On a machine without a
+battery-backed clock, file times can be wrong by years until the machine has received the network time. A file that is
+being written is locked, so that other processes do not delete the file.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from typing import NamedTuple
 BLACK_BOX = "fault-"
 """Prefix of the names of black boxes."""
 _NAME = re.compile(r"(?P<name>[A-Za-z0-9_-]+)-(?P<date>\d{8}-\d{6})(-part(?P<part>\d+))?(-(?P<again>\d+))?\.rrd")
-"""Pattern of names given by the recorder. Files with other names belong to users, and are never deleted."""
+"""Pattern of the file names that the recorder chooses. Files with other names belong to users and are never deleted."""
 
 
 def sidecar(recording: Path) -> Path:
-    """Return the path of the file with a recording's contents, such as demo-20260131-120000.rrd.json."""
+    """Return the path of a recording's sidecar, which contains a summary, such as demo-20260131-120000.rrd.json."""
     return recording.with_name(f"{recording.name}.json")
 
 
@@ -29,19 +30,23 @@ class _StoredRecording(NamedTuple):
     path: Path
     size: int
     order: tuple[bool, bool, str, str, int, int]
-    """Sort key that puts older recordings first, by date, part and number in the name, and the running session last."""
+    """Sort key in the order of deletion.
+
+    Recordings are sorted by date, part and number in their names, the running session after all others, and black boxes
+    last.
+    """
 
     @property
     def files(self) -> list[Path]:
-        """The recording and the files that belong to it: the log of CAN frames, and the sidecar."""
+        """Recording file and, if they exist, the log of CAN frames and the sidecar that belong to the recording."""
         beside = (self.path, self.path.with_suffix(".log"), sidecar(self.path))
         return [path for path in beside if path.exists()]
 
 
 def lock(path: Path) -> int:
-    """Lock a file that is being written.
+    """Lock a file while it is being written.
 
-    Return the descriptor that holds the lock, or -1 if the file cannot be opened.
+    Return a file descriptor, which must be passed to `unlock` later, or -1 if the file cannot be opened.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY)
@@ -53,13 +58,13 @@ def lock(path: Path) -> int:
 
 
 def unlock(descriptor: int) -> None:
-    """Release the descriptor that `lock` returned."""
+    """Close a descriptor that `lock` returned, which releases the lock."""
     if descriptor >= 0:
         os.close(descriptor)
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder in this or another process has locked the file. Raises FileNotFoundError."""
+    """Return True if a recorder in this or another process has locked the file. Raises FileNotFoundError."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:
@@ -74,10 +79,10 @@ def is_being_written(path: Path) -> bool:
 
 
 def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
-    """Delete the oldest recordings until all together take no more than `at_most` bytes; return the deleted files.
+    """Delete the oldest recordings until the others need at most `at_most` bytes; return the deleted recordings.
 
-    Recordings of the running `session` are deleted after all others, regardless of dates, and black boxes last. Files
-    that are being written are kept. Raises OSError if a file cannot be deleted.
+    Recordings of the running `session` are deleted after those of other sessions, regardless of their dates. Black
+    boxes are deleted last. A file that is being written is not deleted. Raises OSError if a file cannot be deleted.
     """
     recordings = sorted(_recordings(directory, session), key=lambda kept: kept.order)
     total = sum(kept.size for kept in recordings)
@@ -90,7 +95,7 @@ def tidy(directory: Path, at_most: float, session: str = "") -> list[Path]:
                 continue
             for path in kept.files:
                 path.unlink()
-        except FileNotFoundError:  # another process has just deleted it
+        except FileNotFoundError:  # another process has just deleted the recording
             pass
         else:
             deleted.append(kept.path)

@@ -1,4 +1,4 @@
-"""Rotated files of a session's recording; each file is complete in itself."""
+"""Files of a session whose recording is rotated. Each file can be viewed without the others."""
 
 from __future__ import annotations
 
@@ -15,18 +15,22 @@ from trirail.telemetry.sinks import Archive
 from trirail.wire.event_codes import EventCode, EventText, coded
 
 SOON, RETRY = 1.0, 10.0
-"""Delay from the failure of a file to the first attempt with another one, and interval between further attempts [s]."""
+"""Delay from a file's failure to the first attempt to begin another file, and interval between further attempts [s]."""
 TRIAL = 1 << 19
-"""Size of the test data written to a new file [bytes]. It exceeds the initial content, whose writing is not checked."""
+"""Size of the test data written to a new file [bytes].
+
+The test data is larger than the initial content of a recording, because the writing of that content is not checked.
+"""
 
 Open = Callable[[Path], rr.RecordingStream]
 Close = Callable[[rr.RecordingStream], None]
 
 
 class RotatedFiles:
-    """Writes batches to the newest of several files.
+    """Writer of batches to the newest of several files.
 
-    A new file begins on `turn`, or when the newest file fails or is deleted; `warn` receives a report of a deletion.
+    A new file begins when `turn` is called, or when the newest file cannot be written or has been deleted. If the file
+    was deleted, `warn` receives a report.
     """
 
     def __init__(
@@ -41,7 +45,7 @@ class RotatedFiles:
         self.path = path
         """Newest file."""
         self.cause = ""
-        """Reason why the most recently lost batch was lost."""
+        """Reason why the most recently lost batch was lost; empty if no batch was lost."""
         self._first = path
         self._begin = begin
         self._end = end
@@ -50,20 +54,20 @@ class RotatedFiles:
         self._warn = warn
         self._number = 1
         self._lost_before = 0
-        self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # destroying them would wait for the disk
+        self._failed: list[tuple[rr.RecordingStream, Archive]] = []  # never destroyed, which would wait for the disk
         self._retry: float | None = None
         self._lock = -1
-        """Descriptor of the lock that shows other processes that the newest file is being written."""
+        """Descriptor of the lock by which other processes recognise that the newest file is being written."""
         self._open()
 
     @property
     def lost(self) -> int:
-        """Number of batches that did not reach any file."""
+        """Number of batches that were not written to any file."""
         return self._lost_before + self._archive.lost
 
     @property
     def trouble(self) -> str:
-        """Reason why the last batch did not reach any file; empty if it did."""
+        """Reason why the last batch could not be written; empty if it was written."""
         return self._archive.trouble
 
     @property
@@ -80,7 +84,7 @@ class RotatedFiles:
             return 0
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Write a batch, or count it as lost, without waiting long for the disk."""
+        """Write a batch without waiting long for the disk; if writing fails, count the batch as lost."""
         now = self._clock()
         if self._archive.gone and (self._retry is None or now >= self._retry):
             self._retry, deleted = now + RETRY, self.path
@@ -100,7 +104,10 @@ class RotatedFiles:
             self.turn()
 
     def turn(self) -> bool:
-        """Continue in another file; if it cannot be written, stay in this file and return False."""
+        """Continue in another file and return True.
+
+        If no other file can be written, continue in the present file and return False.
+        """
         number = self._number + 1
         try:
             path = claim(self._first.parent, f"{self._first.stem}-part{number}")
@@ -118,7 +125,7 @@ class RotatedFiles:
         return True
 
     def close(self) -> None:
-        """Finish the newest file, unless the disk is not responding."""
+        """Finish the newest file, unless the disk does not respond."""
         self._archive.close()
         retention.unlock(self._lock)
         self._lock = -1
@@ -131,7 +138,10 @@ class RotatedFiles:
 
 
 def claim(directory: Path, name: str) -> Path:
-    """Create an empty file with an unused name. Raises OSError if it cannot be written."""
+    """Create an empty recording file whose name begins with `name` and is unused; return the path of the file.
+
+    Raises OSError if data cannot be written to the file.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     path, number = directory / f"{name}.rrd", 1
     while True:
@@ -152,7 +162,7 @@ def claim(directory: Path, name: str) -> Path:
 
 
 def _try(descriptor: int) -> None:
-    """Check that data reaches the disk, since an empty file can be created even on a full disk. Raises OSError."""
+    """Raise OSError if data does not reach the disk. Even on a full disk, an empty file can be created."""
     if os.write(descriptor, bytes(TRIAL)) < TRIAL:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     os.fsync(descriptor)

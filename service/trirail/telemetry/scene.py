@@ -1,8 +1,9 @@
-"""Drawing of the robot in Rerun: static parts once, then columns made from records.
+"""Drawing of the robot in Rerun. Static parts are sent once, and moving parts as columns made from records.
 
-`/record` contains every field of every record unchanged, in SI units. Everything else is drawn from it for people, in
-millimetres, degrees and microseconds, thinned to the resolution of a screen. Thinned curves show the worst value of
-following error, lateness and cycle time, and the newest value of everything else.
+The entity `/record` contains every field of every record unchanged, in SI units. All other entities are drawn from the
+records for people, in millimetres, degrees and microseconds, with as many samples as a screen can show. Each sample of
+following error, lateness and cycle time is the worst value of several cycles. Each sample of other values is the newest
+value.
 """
 
 from __future__ import annotations
@@ -55,17 +56,17 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
     yield "/robot/platform/stops", _lines(parts.edge_stops, [palette.LIMIT], 1.2, order=23)
     yield "/robot/workspace", _strips([palette.WORKSPACE], 0.8, order=15)
     yield "/robot/goal", _strips([palette.GOAL], 1.0, order=24)
-    # Sleeves in which the platform's edges slide, or the carriages' cross slides.
+    # These are the sleeves in which the platform's edges slide, or the cross slides on the carriages.
     yield "/robot/passive", _strips([palette.dark(c) for c in palette.SLIDERS], 5.5, order=25)
     yield "/robot/trace", _strips([palette.CENTRE], 1.2, order=30)
     yield (
         "/robot/platform/centre",
         rr.Points2D([[0.0, 0.0]], radii=rr.Radius.ui_points(4.0), colors=[palette.CENTRE], draw_order=31),
     )
-    yield (  # each slider, and the pivot about which the platform turns
+    yield (  # the three sliders, and the pivot of each leg, about which the platform turns
         "/robot/sliders",
         rr.Points2D.from_fields(
-            radii=[-8.5] * 3 + [-3.0] * 3,  # negative values are screen points, not metres
+            radii=[-8.5] * 3 + [-3.0] * 3,  # negative values mean screen points instead of metres
             colors=[*palette.SLIDERS, *[palette.PIN] * 3],
             draw_order=32,
         ),
@@ -73,7 +74,10 @@ def still(parts: RobotParts, frames: FramesTable, names: Labels) -> Iterator[tup
 
 
 def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], records: NDArray[np.void]) -> list[Column]:
-    """Return the moving parts in `records`, (N,), and the trace of the centre from `before` up to them."""
+    """Return the columns of the moving parts at `records`, (N,).
+
+    The trace of the platform's centre connects each record of `before`, (N,), with that of `records`.
+    """
     sliders = part_positions.slider_points(geometry, records["position"])
     crossing = part_positions.cross_slide_lines(geometry, parts, sliders, records["pose"][:, 2])
     pivots = part_positions.pivot_points(geometry, sliders, records["pose"])
@@ -88,7 +92,7 @@ def moving(geometry: Geometry, parts: RobotParts, before: NDArray[np.void], reco
 
 
 def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
-    """Return the platform at the goal's pose, with a cross at its centre; the column is empty without a goal."""
+    """Return the outline of the platform at the goal's pose, with a cross at the centre; empty if `pose` is None."""
     if pose is None:
         return Column("/robot/goal", STRIPS, columns.ragged([[]]))
     cross = [axis * ORIGIN * np.ptp(parts.bounds) for axis in _ORIGIN_CROSS]
@@ -97,7 +101,7 @@ def goal(parts: RobotParts, pose: Sequence[float] | None) -> Column:
 
 
 def _named(frames: FramesTable, size: float) -> Iterator[tuple[str, rr.AsComponents]]:
-    """Yield the tools on the platform and the axes of the work frames, each with its name."""
+    """Yield the tools on the platform and the axes of the work frames, labelled with their names."""
     if frames.tool:
         tools = np.array(list(frames.tool.values()))
         yield "/robot/platform/tools", _labelled(tools, list(frames.tool), [palette.CENTRE], 3.0, order=31)
@@ -122,7 +126,7 @@ def _lines(lines: list[Points], colours: Sequence[Colour], radius: float, *, ord
 
 
 def _strips(colours: Sequence[Colour], radius: float, *, order: float) -> rr.LineStrips2D:
-    """Return the style of lines that are drawn later."""
+    """Return the style of lines whose points are sent later."""
     return rr.LineStrips2D.from_fields(colors=colours, radii=rr.Radius.ui_points(radius), draw_order=order)
 
 
@@ -134,7 +138,7 @@ def _labelled(
 
 
 def _placed(path: str, pose: Points) -> list[Column]:
-    """Return the transforms from the platform's frame to the base frame for poses (N, 3)."""
+    """Return the transforms from the platform's frame to the base frame for N poses, (N, 3)."""
     translation, quaternion = np.zeros((len(pose), 1, 3)), np.zeros((len(pose), 1, 4))
     translation[:, 0, :2] = pose[:, :2]
     quaternion[:, 0, 2], quaternion[:, 0, 3] = np.sin(pose[:, 2] / 2.0), np.cos(pose[:, 2] / 2.0)
@@ -145,9 +149,9 @@ def _placed(path: str, pose: Points) -> list[Column]:
 
 
 DRAWN_HZ = 100
-"""Number of samples of the drawing per second."""
+"""Maximum number of drawn samples per second of the robot and its curves."""
 OUTLINES_HZ = 10
-"""Maximum number of workspace outlines per second."""
+"""Number of times per second that the outline of the workspace is updated, if φ has changed."""
 
 MARKDOWN = rr.components.MediaType.MARKDOWN
 TEXT = rr.TextDocument.descriptor_text()
@@ -158,7 +162,7 @@ LEVELS = ("off", "on")
 
 
 class Scene:
-    """Robot drawn in Rerun. `wall_offset_ns` is the wall clock minus the monotonic clock."""
+    """Conversion of records to drawings in Rerun. `wall_offset_ns` is the wall clock minus the monotonic clock [ns]."""
 
     def __init__(self, robot: DrawnRobot, wall_offset_ns: int) -> None:
         self._rate_hz = robot.rate_hz
@@ -191,16 +195,16 @@ class Scene:
             yield signal.path, rr.StateConfiguration(values=list(LEVELS), labels=list(LEVELS), colors=colours)
 
     def bus_load(self, share: float) -> Iterator[tuple[str, rr.AsComponents]]:
-        """Set the bus load (1 is a full bus), and yield the static parts that change with it."""
+        """Set the bus load, which is 1 for a full bus, and yield the static parts that show it."""
         self._plots[curves.TIMING] = lines = curves.timing(self._rate_hz, share)
         yield curves.TIMING, _series(lines)
 
     def complete(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return complete records, unchanged."""
+        """Return complete, unchanged records as chunks for a recording file."""
         return columns.chunks(self._timelines.for_records(records), [Column(RECORD, FIELDS, columns.structs(records))])
 
     def drawn(self, records: NDArray[np.void], standing: ReadoutState) -> list[Chunk]:
-        """Return the drawing of one or more records, in order. `standing` is the state at the last record."""
+        """Return the drawing of one or more records, which are in order. `standing` is the state at the last record."""
         starts, ends = _groups(records["cycle"], self._rate_hz // DRAWN_HZ)
         newest = records[ends]
         parts = moving(self._geometry, self._parts, records[starts], newest)
@@ -212,7 +216,7 @@ class Scene:
         return chunks + self._status(records) + self._switched(records) + self._readout(records[-1], standing)
 
     def goal(self, record: np.void, pose: Sequence[float] | None) -> list[Chunk]:
-        """Return the drawing of the goal's pose from the time of `record` on; `pose` is None if there is no goal."""
+        """Return the drawing of a goal's pose, shown from the time of `record` on; None erases the previous drawing."""
         return columns.chunks(self._timelines.for_records(record.reshape(1)), [goal(self._parts, pose)])
 
     def _readout(self, record: np.void, standing: ReadoutState) -> list[Chunk]:
@@ -220,7 +224,7 @@ class Scene:
         return columns.chunks(self._timelines.for_records(record.reshape(1)), [Column(readout.PATH, TEXT, text)])
 
     def _status(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return the mode and the workspace outline at the first record, and at changes of the mode and of φ."""
+        """Return the mode and the outline of the workspace at the first record and whenever the mode or φ changes."""
         changed = np.diff(records["mode"], prepend=len(MODES)) != 0
         some = np.arange(0, len(records), max(1, self._rate_hz // OUTLINES_HZ))
         steps = self._reach.outline_indices(records["pose"][some, 2])
@@ -233,7 +237,7 @@ class Scene:
         return columns.chunks(self._timelines.for_records(at), parts)
 
     def _switched(self, records: NDArray[np.void]) -> list[Chunk]:
-        """Return the outputs and inputs at the first record, and in the cycles in which they changed."""
+        """Return the state of each output and input at the first record and in each cycle in which it changed."""
         drawn: list[Chunk] = []
         for signal in self._digital:
             on = signal.values(records).astype(int)
@@ -245,7 +249,7 @@ class Scene:
 
 
 def _groups(cycles: NDArray[np.int64], size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first and last row of each run of rows whose cycles are in the same group of `size`."""
+    """Return the first and the last row of each group. A group contains the rows of up to `size` consecutive cycles."""
     changes = np.flatnonzero(np.diff(cycles // max(1, size))) + 1
     return np.concatenate([[0], changes]), np.concatenate([changes, [len(cycles)]]) - 1
 

@@ -1,4 +1,4 @@
-"""Search for sessions in a folder of recordings, using the sidecars of the recordings."""
+"""Search for sessions in a folder of recordings. A summary next to each recording, its sidecar, is read if possible."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trirail.telemetry.retention import is_being_written
 
 
 class SessionFilter(NamedTuple):
-    """Filter for sessions; None matches any value."""
+    """Conditions that a session must meet; None matches any value."""
 
     robot: str | None = None
     since: float | None = None
@@ -24,14 +24,14 @@ class SessionFilter(NamedTuple):
     until: float | None = None
     """Latest start of a session [s since 1970]."""
     fault: str | None = None
-    """Part of the cause, the code (such as 0x8700) or the message of a fault; case is ignored."""
+    """Text that the cause, the code (such as 0x8700) or the message of a fault must contain; case is ignored."""
     user: str | None = None
-    """User who sent a goal or command; with `outcome`, user of a goal with that outcome."""
+    """User who sent a goal or command. If `outcome` is given too, that user must have sent a goal with that outcome."""
     outcome: str | None = None
 
 
 class RecordedSession(Struct):
-    """Recorded session, in one file or, if its recording was rotated, in several."""
+    """Recorded session, which has several files if its recording was rotated."""
 
     session: str
     robot: str
@@ -41,30 +41,30 @@ class RecordedSession(Struct):
     cycles: int
     files: list[str]
     reason: str | None
-    """Fault for which a black box was saved."""
+    """Message of the fault for which the black box was saved; None if the session is not a black box."""
     trouble: str | None
-    """Reason why a file of the session could not be read."""
+    """Reason why a file of the session could not be read; None if all files were read."""
     users: list[str]
     goals: dict[str, int]
     """Number of finished goals by outcome."""
     faults: list[str]
     """Messages of the session's faults, in order."""
     running: bool = False
-    """Whether the session is still being recorded, in which case these values are some seconds old."""
+    """True while the session is still being recorded. The values are then some seconds old."""
 
 
 def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], None] | None = None) -> list[Contents]:
-    """Return the contents of each recording in a folder, in the order of their names.
+    """Return the contents of each recording in a folder, sorted by the name of the recording.
 
-    A recording that is being written is omitted until its recorder has written its sidecar.
+    A recording that is still being written is omitted until the recorder has written a sidecar for it.
 
     Parameters
     ----------
     folder
         Folder of the recordings.
     reread
-        Whether to read all recordings and write their sidecars again; otherwise, only recordings without a usable
-        sidecar are read.
+        True to read all recordings again and to rewrite their sidecars; False to read only recordings without a usable
+        sidecar.
     on_read
         Function called with each recording before it is read.
     """
@@ -80,7 +80,7 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
                 if on_read is not None:
                     on_read(path)
                 known = contents.read_contents(path)
-                with contextlib.suppress(OSError):  # the folder belongs to another user: read it again the next time
+                with contextlib.suppress(OSError):  # the folder belongs to another user: read the file again next time
                     contents.save(path, known)
         if known is not None:
             listed.append(known)
@@ -88,7 +88,7 @@ def recorded(folder: Path, *, reread: bool = False, on_read: Callable[[Path], No
 
 
 def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> list[RecordedSession]:  # noqa: B008 - a value, and never changed
-    """Return the sessions in files that match a filter, in the order of their start."""
+    """Return the sessions that match a filter, in the order of their start, given the contents of all files."""
     parts_of: dict[str, list[Contents]] = {}
     for file in sorted(files, key=lambda file: (file.began or 0.0, file.name)):
         parts_of.setdefault(file.session, []).append(file)
@@ -96,7 +96,7 @@ def find(files: Iterable[Contents], wanted: SessionFilter = SessionFilter()) -> 
 
 
 def fault_codes(files: Iterable[Contents]) -> list[str]:
-    """Return the cause and code of each fault in files, without duplicates."""
+    """Return the sorted causes and codes of the faults in files, such as "emcy 0x8700", without duplicates."""
     return sorted({entry.code for file in files for entry in file.faults})
 
 

@@ -1,4 +1,4 @@
-"""Drawing of an alignment in Rerun: curves of the marks' residuals, and a table of the last alignment."""
+"""Drawing of an alignment in Rerun: curves of the marks' distances from their targets, and a table of the looks."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from trirail.wire.messages import Event
 
 RESIDUALS, TABLE = "/alignment/residual", "/alignment/table"
 MOST_LOOKS = 8
-"""Number of newest looks in the table, with one column for each."""
+"""Maximum number of looks in the table, which has one column per look. Older looks are omitted."""
 _TEXT = rr.TextDocument.descriptor_text()
 _SCALARS = rr.Scalars.descriptor_scalars()
 
 
 class ShownAlignment:
-    """Drawing of the current or the last alignment."""
+    """Drawing of the current alignment or, after its end, of the last one."""
 
     def __init__(self) -> None:
         self._looks: list[AlignmentLook] = []
 
     def drawing_of(self, event: Event, look: AlignmentLook) -> list[Chunk]:
-        """Add a look and return its drawing."""
+        """Add a look, which `event` reports, and return the updated drawing."""
         if self._looks and (self._looks[0].id, self._looks[0].purpose) != (look.id, look.purpose):
             self._looks.clear()
         self._looks = [*self._looks, look][-MOST_LOOKS:]
@@ -60,5 +60,5 @@ def _cell(look: AlignmentLook, name: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Escape Markdown's special characters in text from outside."""
+    """Escape Markdown's special characters in a text that a client sent."""
     return "".join(f"\\{character}" if character in r"\`*_{}[]()<>#+-!|~" else character for character in text)

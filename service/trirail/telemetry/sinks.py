@@ -1,7 +1,7 @@
-"""Sinks of a recording: a file for everything, and a live view that may be slow, frozen or absent.
+"""Sinks of a recording: a file that receives all data, and a live view that may be slow, frozen or absent.
 
-Rerun's sinks do not report their failures: they stop accepting data, and then block every sender forever. This module
-prevents that, and counts the data that does not reach a sink.
+Rerun's sinks do not report failures. After a failure, a sink accepts no more data and blocks every sender forever. This
+module never waits long for a sink, and counts the data that does not reach a sink.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from trirail.errors import ServiceError
 
 LOOPBACK = "127.0.0.1"
 BACKLOG = 20
-"""Maximum number of batches that wait for the live view, equal to 2 s."""
+"""Maximum number of batches that wait for the live view, which is the data of about 2 s."""
 RESERVE = 64 << 20
-"""Space that is left free on the disk [bytes], since a file sink never recovers from a full disk."""
+"""Space that is left free on the disk [bytes]. Rerun's file sink never recovers from a full disk."""
 DISK_TIMEOUT_S = 2.0
-"""Time-out for the disk, or for the end of a thread [s]."""
+"""Maximum time to wait for the disk, or for a thread to end [s]."""
 
 
 def disk_shortage(directory: Path, reserve: int) -> str:
-    """Return why no data can be written to a folder while `reserve` bytes stay free; return "" if it can."""
+    """Return "" if more than `reserve` bytes are free on a folder's disk; otherwise return an error message."""
     try:
         free = shutil.disk_usage(directory).free
     except OSError as error:
@@ -41,8 +41,9 @@ def disk_shortage(directory: Path, reserve: int) -> str:
 
 
 def identity(path: Path) -> tuple[int, int] | None:
-    """Return the device and inode, which distinguish a file from a later one with the same name; None if there is no
-    file.
+    """Return the device and inode of a file, which distinguish it from a later file with the same name.
+
+    Return None if there is no file.
     """
     try:
         status = path.stat()
@@ -52,13 +53,17 @@ def identity(path: Path) -> tuple[int, int] | None:
 
 
 class Archive:
-    """Recording file. Each batch reaches the operating system before the next one, and `reserve` bytes stay free."""
+    """Writer of a recording file.
+
+    Each batch is passed to the operating system before the next batch is written. Nothing is written while fewer than
+    `reserve` bytes are free on the disk.
+    """
 
     def __init__(self, stream: rr.RecordingStream, path: Path, reserve: int = RESERVE) -> None:
         self.lost = 0
-        """Number of batches that are not in the file."""
+        """Number of batches that could not be written."""
         self.trouble = ""
-        """Reason why the last batch is not in the file; empty if it is."""
+        """Reason why the last batch could not be written; empty if it was written."""
         self._stream = stream
         self._reserve = reserve
         self._path = path
@@ -67,27 +72,27 @@ class Archive:
         self._stuck = False
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Write a batch, or count it as lost, without waiting long for the disk."""
+        """Write a batch without waiting long for the disk; if writing fails, count the batch as lost."""
         self.trouble = self._write(chunks)
         self.lost += bool(self.trouble)
 
     @property
     def gone(self) -> bool:
-        """Whether the file has been deleted or moved, so that data written to it could not be found."""
+        """True if the file has been deleted or moved. Data written to the open file would then be lost."""
         return identity(self._path) != self._identity
 
     @property
     def stuck(self) -> bool:
-        """Whether the file accepts no more data, since Rerun's sink does not recover from a disk failure."""
+        """True if the file accepted no data in the last attempt. Rerun's sink does not recover from a disk failure."""
         return self._stuck
 
     def close(self) -> None:
-        """Finish the file, unless the disk is not responding."""
+        """Finish the file, unless the disk does not respond."""
         if self._flushed(DISK_TIMEOUT_S):
             self._stream.disconnect()
 
     def _write(self, chunks: list[Chunk]) -> str:
-        """Write a batch; return the reason for a failure, or ""."""
+        """Write a batch; return the reason for a failure, or "" on success."""
         if self.gone:
             return f"{self._path} has been deleted or moved, and no other file can be created there"
         if full := disk_shortage(self._directory, self._reserve):
@@ -100,7 +105,7 @@ class Archive:
     def _flushed(self, within: float) -> bool:
         try:
             self._stream.flush(timeout_sec=within)
-        except RuntimeError:  # the only sign of a failing disk is that data is not written in time
+        except RuntimeError:  # not written in time, which is the only sign of a failing disk
             self._stuck = True
         else:
             self._stuck = False
@@ -108,11 +113,14 @@ class Archive:
 
 
 class Relay:
-    """Relay of batches in its own thread. When the receiver falls behind, the relay skips to the newest batch."""
+    """Thread that passes batches to a receiver.
+
+    If BACKLOG batches are waiting when another batch arrives, the waiting batches are dropped.
+    """
 
     def __init__(self, deliver: Callable[[list[Chunk]], None], finish: Callable[[], None]) -> None:
         self.skipped = 0
-        """Number of batches that were not delivered."""
+        """Number of batches that were dropped because the receiver was too slow."""
         self._deliver = deliver
         self._finish = finish
         self._waiting: deque[list[Chunk]] = deque()
@@ -122,7 +130,7 @@ class Relay:
         self._thread.start()
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Enqueue a batch without blocking."""
+        """Add a batch to the queue without blocking."""
         with self._changed:
             if len(self._waiting) == BACKLOG:
                 self.skipped += BACKLOG
@@ -131,7 +139,7 @@ class Relay:
             self._changed.notify()
 
     def close(self) -> None:
-        """Deliver the waiting batches, unless the receiver is not responding."""
+        """Deliver the waiting batches and end the thread; give up after DISK_TIMEOUT_S."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -157,29 +165,29 @@ def free_port() -> int:
 
 
 def is_watched(port: int) -> bool:
-    """Whether any client is connected to a port on which this process listens."""
+    """Return True if any client is connected to a port on which this process listens."""
     return any(_serves(int(name), port) for name in os.listdir("/dev/fd"))
 
 
 def _serves(descriptor: int, port: int) -> bool:
-    """Whether a descriptor is a connection to a port of this process."""
+    """Return True if a file descriptor is a connection to a port of this process."""
     try:
         if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
             return False
         with socket.socket(fileno=os.dup(descriptor)) as connection:
             connection.getpeername()  # raises for the listening socket, which has no peer
             return connection.family == socket.AF_INET and connection.getsockname()[1] == port
-    except OSError:  # closed in the meantime
+    except OSError:  # the descriptor was closed in the meantime, or is the listening socket
         return False
 
 
 def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
-    """Return a server for viewers on this machine; it keeps `memory_mb` of past data for viewers that connect late.
+    """Return a server for viewers on this machine.
 
-    Viewers receive the newest data first, so that they show the present state immediately. Raises ServiceError if the
-    port is in use.
+    The server stores up to `memory_mb` megabytes of past data for viewers that connect later. A viewer receives the
+    newest data first, and therefore shows the present state immediately. Raises ServiceError if the port is in use.
     """
-    with socket.socket() as probe:  # if the port were taken, the sink would only log it, and discard all data
+    with socket.socket() as probe:  # if the port were in use, the sink would only log an error and discard all data
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((LOOPBACK, port))
@@ -192,10 +200,10 @@ def live_server(port: int, memory_mb: float) -> rr.GrpcServerSink:
 
 
 def live_relay(stream: rr.RecordingStream) -> Relay:
-    """Return a relay to the viewers of a stream."""
+    """Return a relay that sends batches to a stream, and therefore to the viewers of the stream."""
 
     def deliver(chunks: list[Chunk]) -> None:
         stream.send_chunks(chunks)
-        stream.flush()  # wait here for a slow viewer, before Rerun's own queues fill the memory
+        stream.flush()  # wait here for a slow viewer, because Rerun's own queues would fill the memory
 
     return Relay(deliver, stream.disconnect)

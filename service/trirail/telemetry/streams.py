@@ -1,4 +1,4 @@
-"""Conversion of the loop's messages for sinks: drawings in batches, the goal, and log lines."""
+"""Conversion of the loop's messages to drawings and log lines, sent in batches to the sinks of a recording."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ REPORT_EVERY = 10.0
 
 
 class Sink(Protocol):
-    """Receiver of batches, which counts those that it cannot accept."""
+    """Receiver of batches, which counts the batches that it cannot accept."""
 
     def write_chunks(self, chunks: list[Chunk]) -> None:
-        """Write a batch without a long wait, or count it as lost."""
+        """Write a batch without waiting long; if writing fails, count the batch as lost."""
 
 
 class Streams:
-    """Recording of one robot, with its drawing, its layout and its sinks.
+    """Rerun streams of one robot, with its drawing, its layout and its sinks.
 
-    All entities are below the entity `root`, so that other robots can be in the same recording.
+    All entity paths begin with `root`. With different roots, several robots can be in the same recording.
     """
 
     def __init__(self, robot: DrawnRobot, name: str, wall_offset_ns: int, root: str = "") -> None:
         self.scene = Scene(robot, wall_offset_ns)
         self.shown = RobotView(robot, self.scene.bounds, root)
-        """Data of the robot that a layout needs."""
+        """Data that a layout needs to show the robot."""
         self._name = name
         self._rate_hz = robot.rate_hz
         self._wall_offset_ns = wall_offset_ns
@@ -63,7 +63,7 @@ class Streams:
         self._alignment = ShownAlignment()
 
     def open(self, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
-        """Return a stream of this recording to a Rerun sink, including the static parts and the layout."""
+        """Return a new stream of this recording to a Rerun sink, and send the static parts and the layout to it."""
         stream = rr.RecordingStream(APPLICATION, recording_id=self._recording)
         stream.set_sinks(sink, default_blueprint=blueprint.layout(self.shown))
         stream.send_recording_name(self._name)
@@ -71,7 +71,7 @@ class Streams:
         return stream
 
     def join(self, stream: rr.RecordingStream) -> None:
-        """Send the static parts to a stream, now and whenever they change."""
+        """Send the static parts to a stream, and send them again whenever they change."""
         for path, archetype in self.scene.still():
             stream.log(f"{self.shown.root}{path}", archetype, static=True)
         self._streams.append(stream)
@@ -79,8 +79,8 @@ class Streams:
     def attach(self, sink: Sink, drawing_hz: int) -> None:
         """Forward all subsequent messages to a sink, with `drawing_hz` batches of drawings per second.
 
-        Call this again to change the rate. Sinks with the same rate share their drawings, since drawing is the most
-        expensive part.
+        Another call changes the rate. Sinks with the same rate share their drawings, because drawing is the most
+        expensive step.
         """
         if self._rates.get(sink) == drawing_hz:
             return
@@ -108,7 +108,7 @@ class Streams:
         self._state = state
 
     def bus_load(self, share: float) -> None:
-        """Set the bus load; 1 is a full bus."""
+        """Set the displayed bus load; 1 means a full bus."""
         for path, archetype in self.scene.bus_load(share):
             for stream in self._streams:
                 stream.log(f"{self.shown.root}{path}", archetype, static=True)
@@ -120,24 +120,24 @@ class Streams:
             self._waiting += self._alignment.drawing_of(event, event.alignment)
 
     def control_input(self, item: ControlInput) -> None:
-        """Add an input of the control loop to the log."""
+        """Add a line to the log for an input to the control loop."""
         self._entries.append(journal.input_entry(item, self._rate_hz, self._wall_offset_ns))
 
     def log(self, level: Level, message: str) -> None:
-        """Add a line to the log at the time of the newest record."""
+        """Add a line to the log, at the time of the newest record."""
         wall = (int(self._record["deadline_ns"]) + self._wall_offset_ns) / SECOND
         self._entries.append(Entry(EVENTS, self.t, wall, message, level))
 
     def resend_state(self) -> None:
-        """Send all data with the next records, including data sent only on change, because a sink began a new file."""
+        """Send unchanged data again with the next records. A sink that begins a new file needs that data."""
         self._goal_drawn = self._state.target is None
 
     def drop(self, stream: rr.RecordingStream) -> None:
-        """Remove a finished stream."""
+        """Remove a finished stream, which then receives no more changes of the static parts."""
         self._streams.remove(stream)
 
     def save(self) -> None:
-        """Send all pending messages in one batch, which costs about the same for one line as for ten."""
+        """Send all pending messages in one batch. A batch costs about the same for one line as for ten."""
         chunks = self._placed(self._waiting + journal.chunks(self._entries))
         self._waiting, self._entries = [], []
         if chunks:
@@ -145,7 +145,7 @@ class Streams:
                 sink.write_chunks(chunks)
 
     def flush(self) -> None:
-        """Send all messages and records."""
+        """Send all pending messages and records."""
         self.save()
         for batches in self._batches.values():
             batches.flush()
@@ -167,7 +167,7 @@ class Streams:
 
 
 def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.GrpcServerSink) -> rr.RecordingStream:
-    """Return a stream to a Rerun sink that shows several robots side by side, each below its root."""
+    """Return a new stream to a Rerun sink that shows several robots side by side."""
     stream = rr.RecordingStream(APPLICATION, recording_id=str(uuid.uuid4()))
     stream.set_sinks(sink, default_blueprint=blueprint.side_by_side([streams.shown for streams in several]))
     stream.send_recording_name(name)
@@ -177,7 +177,10 @@ def open_together(several: Sequence[Streams], name: str, sink: rr.FileSink | rr.
 
 
 class MissingDataReport:
-    """Reports missing data in the log when more is missing than before, at most every REPORT_EVERY seconds."""
+    """Report of missing data in the log, written when more data is missing, but at most every REPORT_EVERY seconds.
+
+    `counts` returns the numbers of missing items, which are inserted into `words`.
+    """
 
     def __init__(self, streams: Streams, words: str, counts: Callable[[], tuple[int, ...]]) -> None:
         self._streams = streams
@@ -187,7 +190,7 @@ class MissingDataReport:
         self._next = 0.0
 
     def check(self) -> None:
-        """Write the report if it is due."""
+        """Write a report if more data is missing and REPORT_EVERY has passed since the last report."""
         missing = self._counts()
         if missing != self._reported and self._streams.t >= self._next:
             self._reported, self._next = missing, self._streams.t + REPORT_EVERY
@@ -195,7 +198,7 @@ class MissingDataReport:
 
 
 class Batches:
-    """Collects records into batches."""
+    """Collector of records, which delivers them in batches of at least `size` records."""
 
     def __init__(self, size: int, deliver: Callable[[NDArray[np.void]], None]) -> None:
         self._batch_bytes = max(1, size) * DTYPE.itemsize
@@ -203,13 +206,13 @@ class Batches:
         self._pending = bytearray()
 
     def add(self, batch: bytes) -> None:
-        """Add packed records; deliver all records when there are enough for a batch."""
+        """Add packed records. If there are enough for a batch, deliver all collected records."""
         self._pending += batch
         if len(self._pending) >= self._batch_bytes:
             self.flush()
 
     def flush(self) -> None:
-        """Deliver the collected records."""
+        """Deliver the collected records, even if they are fewer than a full batch."""
         if self._pending:
             records = unpack(bytes(self._pending))
             self._pending.clear()
