@@ -1,4 +1,4 @@
-"""Goals as clients send them, of all kinds in trirail.wire.kinds, in SI units and radians."""
+"""Goals of all kinds that clients can send, from the modules in trirail.wire.kinds, in SI units and radians."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ import_all(kinds)
 KINDS: tuple[type[GoalKind], ...] = tuple(
     sorted(set(GoalKind.__subclasses__()) - {PackedTrajectory}, key=lambda kind: kind.__module__)
 )
-"""All kinds of goals; each has its own module in trirail.wire.kinds."""
+"""Classes of all goal kinds; each module in trirail.wire.kinds contains one class."""
 
 if TYPE_CHECKING:
     Goal = GoalKind
