@@ -92,9 +92,9 @@ class AsyncGoalHandle:
     async def cancel(self) -> None:
         """Stop this goal, running or queued; return when the robot is at rest or the goal has ended.
 
-        Other goals continue, except goals that wait for this goal. To cancel a task that waits for the goal does not
-        stop the goal. Raises RefusedError (`no_goal`) if the goal has already ended, and ServiceError if the service
-        does not answer.
+        Other goals continue, except goals that wait for this goal. If you cancel only a task that waits for the goal,
+        the goal continues. Raises RefusedError (`no_goal`) if the goal has already ended, and ServiceError if the
+        service does not answer.
         """
         await self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
 
