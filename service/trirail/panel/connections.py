@@ -1,5 +1,4 @@
-"""Connections to the panel's server, managed so that idle connections block neither new connections nor the shutdown.
-"""
+"""Connections to the panel's server, of which idle ones block neither new connections nor the shutdown."""
 
 from __future__ import annotations
 

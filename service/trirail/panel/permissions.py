@@ -1,5 +1,4 @@
-"""Permissions of a role on the page. The page offers only permitted actions, and the service checks each action again.
-"""
+"""Permissions of a role on the page. The page offers only permitted actions; the service checks each action again."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Requests from a tab to the service. Each request has a separate task, so that a stop never waits for other requests.
-"""
+"""Requests from a tab to the service. Each request has a separate task, so a stop never waits for other requests."""
 
 from __future__ import annotations
 
