@@ -181,7 +181,7 @@ class Mover:
         motion.finish(result)
 
     async def _send_goal(self, moves: list[AxisMove], before: _Motion | None) -> _Motion:
-        """Send the goal for new sets and for the sets in progress whose axes the new sets do not move."""
+        """Send a goal for new sets, and for the sets in progress with axes that the new sets do not move."""
         carried: list[AxisMove] = []
         pose = (await self._robot.state()).commanded.pose
         if before is not None and before.goal.result is None:

@@ -279,7 +279,7 @@ class MovableAxis(_Movable[float]):
         super().__init__(COORDINATES[index])
 
     async def check_value(self, value: float) -> None:
-        """Check the path to a value, with the other coordinates at their commanded values; see Stage.check."""
+        """Check the path to a value; see Stage.check. The other coordinates are at their setpoints, as in `locate`."""
         pose = list(_setpoint(await (await self._stage.link()).robot.state()))
         pose[self._index] = float(value)
         await self._stage.check(pose)

@@ -39,7 +39,7 @@ EMPTY_OBSERVATION = Observation({}, (0.0, 0.0, 0.0), 0.0)
 GOAL_WITHIN = 60.0
 """Time-out of one motion [s]."""
 ENDS_AT_TARGET = ("done", "unsettled")
-"""Outcomes after which the robot is at or near its target; the next look measures the remaining distance."""
+"""Outcomes of a goal that leave the robot at or near its target. The next look measures the remaining distance."""
 
 
 class MotionHandle(Protocol):
@@ -264,7 +264,7 @@ class LookReports:
             error=None if measured is None else _error(measured),
             pose=None if observation is None else observation.pose,
             correction=report.correction,
-            end=cast(LookEnd | None, report.end and str(report.end)),  # tests/wire/test_looks.py holds them together
+            end=cast(LookEnd | None, report.end and str(report.end)),  # tests/wire/test_looks.py compares the values
             words=quoted(report.words),
             noise=report.noise,
             seconds=max(0.0, _time(report) - self._began),

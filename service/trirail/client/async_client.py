@@ -506,7 +506,7 @@ class AsyncRobot:
         await self.command(Command.QUICK_STOP)
 
     async def reset(self) -> None:
-        """Clear a fault whose cause is gone; the robot stays disabled. Raises RefusedError if the cause persists."""
+        """Clear a fault; the robot stays disabled. Raises RefusedError if the cause of the fault persists."""
         await self.command(Command.RESET)
 
     async def home(self) -> None:

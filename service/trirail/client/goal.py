@@ -21,7 +21,7 @@ from trirail.wire.vocabulary import Command, Stop
 STANDS_WITHIN = 10.0
 """Longest time from the time-out of a jog to the robot's rest [s]."""
 BRAKE_RENEWAL_S = 0.05
-"""Time-out of a jog's last renewal, which requests zero velocity [s]."""
+"""Time-out of the last renewal of a jog, which sets the velocity to zero [s]."""
 
 Velocity = tuple[float, float, float]
 """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
@@ -140,7 +140,7 @@ class OpenGoals:
         return self._handles.setdefault(handle.id, handle)
 
     def accept(self, handle: AsyncGoalHandle, reply: GoalReply) -> None:
-        """Keep the handle of an accepted goal until the goal ends."""
+        """Store the reply to an accepted goal; the handle remains registered until the goal ends."""
         handle.reply = reply
         self._end_call(handle.id)
         if self._handles.get(handle.id) is handle:  # otherwise the goal has already ended

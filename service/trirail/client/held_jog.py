@@ -49,7 +49,7 @@ class HeldJog:
         self._tool: Tool | None = None
         self._over = False
         self.error: TrirailError | None = None
-        """Error that ended the last jog; None if the service ended it for another reason."""
+        """Error that ended the last jog; None if the service reported the end of the jog without an error."""
         self._thread = threading.Thread(target=self._run, name="held jog", daemon=True)
         self._thread.start()
 

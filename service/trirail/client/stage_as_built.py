@@ -20,7 +20,7 @@ from trirail.kinematics.robot import forward
 from trirail.wire.records import unpack
 
 HISTORY = 5000
-"""Number of cycles whose positions are stored."""
+"""Number of latest cycles for which positions are stored."""
 COMES_WITHIN = 2.0
 """Longest wait for the records of a given time [s]."""
 

@@ -32,7 +32,7 @@ def subtract(after: Reading, before: Reading) -> Reading:
 
 
 class Observer:
-    """Questions to a person about quantities that no encoder measures."""
+    """Asker of questions to a person about quantities that no encoder measures."""
 
     def __init__(
         self, operator: Operator, simulated: Carriages | None, idle: Callable[[], object], labels: Labels = NAMES

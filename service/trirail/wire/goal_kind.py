@@ -130,7 +130,7 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def blend(self) -> float | None:
-        """Distance from the end at which the next goal may start [m]; None if the next goal preempts this one."""
+        """Distance from the end of the path at which the next goal may start [m]; None if the next goal preempts it."""
         return None
 
     @property

@@ -48,8 +48,8 @@ else:
     Goal = Union[KINDS]  # noqa: UP007 - from a tuple of types
     PathGoal = Union[tuple(kind for kind in KINDS if not kind.renewed)]  # noqa: UP007 - as above
     LoopGoal = Union[(*KINDS, PackedTrajectory)]
-"""Unions of goals. `Goal` is any goal that a client can send. `PathGoal` is a goal whose whole path is known when it
-arrives. `LoopGoal` is any goal as the gateway, loop, planner and recordings represent it."""
+"""Unions of goals. `Goal` is any goal that a client can send. `PathGoal` is a goal with a path that is completely
+known when the goal arrives. `LoopGoal` is any goal in the form that the gateway, loop, planner and recordings use."""
 
 
 def kind_name(goal: GoalKind) -> str:

@@ -120,7 +120,7 @@ def _share(packet: bytes | bytearray | memoryview) -> int | None:
 
 
 def _read_shared(descriptor: bytes) -> bytes:
-    """Read the file whose descriptor was received, and close the file."""
+    """Return the content of the file that belongs to a received descriptor, and close the file."""
     (file,) = array("i", descriptor)
     try:
         return os.pread(file, os.fstat(file).st_size, 0)  # the exact size, since a larger buffer would be cleared first

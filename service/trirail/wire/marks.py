@@ -172,15 +172,15 @@ class Switch(Struct, frozen=True, omit_defaults=True):
     """Wall-clock time at which the cycle was due [s since 1970]. The drives switch at the next SYNC, one period
     later."""
     commanded: Triple
-    """Commanded pose in that cycle: x, y [m], phi [rad]."""
+    """Commanded pose in this cycle: x, y [m], phi [rad]."""
     measured: Triple
-    """Pose measured in that cycle: x, y [m], phi [rad]."""
+    """Measured pose in this cycle: x, y [m], phi [rad]."""
     closed: bool = False
     """True if the output switched back because the goal ended or stopped, False if it switched at a mark."""
 
 
 def switch_rows(switches: tuple[Switch, ...]) -> list[dict[str, Any]]:
-    """Return a table of switches with one number per column, for CSV, Parquet and data frames."""
+    """Return a table with one row for each switch and one value in each column, for CSV, Parquet and data frames."""
     rows = []
     for switch in switches:
         row: dict[str, Any] = {

@@ -9,7 +9,7 @@ from trirail.wire.marks import Marks, StopAtEdge
 
 
 class MoveGoal(GoalKind, frozen=True, tag="move", rename={"origin": "from"}):
-    """Move the platform relative to the pose of its tool."""
+    """Move the platform by a displacement of its tool and a rotation about the tool."""
 
     follows = True
 

@@ -57,7 +57,7 @@ class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TrajectoryPart(Struct, frozen=True, forbid_unknown_fields=True):
-    """Number of a message in a trajectory that is sent in parts."""
+    """Position of a message in the sequence of messages that together contain a trajectory."""
 
     number: Annotated[int, Meta(ge=1, le=MAX_POINTS // 2)]
     """Number of this part, from 1."""
