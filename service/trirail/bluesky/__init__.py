@@ -1,4 +1,7 @@
-"""Bluesky devices for a running service: movable axes, readings and fly scans. Needs trirail[bluesky]."""
+"""Bluesky devices that connect to a running service, with movable axes, readings and fly scans.
+
+Needs trirail[bluesky].
+"""
 
 from __future__ import annotations
 

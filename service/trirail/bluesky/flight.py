@@ -1,4 +1,4 @@
-"""A fly scan: a path that the robot follows without a stop, and the data collected on it."""
+"""Fly scan, which consists of a path that the robot follows without a stop and the data collected on the path."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ COLUMNS: dict[str, tuple[str, str]] = {
     **{f"{kind}_{axis}": ("number", unit) for kind in ("commanded", "measured")
        for axis, unit in (("x", "m"), ("y", "m"), ("phi", "rad"))},
 }  # fmt: skip
-"""Type and unit of each column of the table of switches."""
+"""Type and unit of each column in the table of output switches."""
 
 
 class Flight(Device, Flyable, EventCollectable, Pausable):
-    """A fly scan of a stage: `kickoff` starts the path, `complete` waits for its end, `collect` yields its data.
+    """Fly scan of a stage: `kickoff` starts the path, `complete` waits for its end, and `collect` yields the data.
 
-    `send` sends the goal of the path. `first` maps the index of a coordinate to the value to which the robot moves
-    first. A path ends no later than the plan that started it, because the RunEngine itself stops only devices that were
-    set.
+    `send` is a function that sends the goal of the path. `first` is the pose to which the robot moves before the path,
+    as a mapping from the index of each coordinate to its value. When the plan that started the path ends, the device
+    stops the path. The RunEngine would not do this, because it stops only devices that were set.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         self._goal: AsyncGoalHandle | None = None
         self._sampling: asyncio.Task[None] | None = None
         self._samples: list[tuple[str, dict[str, Reading[Any]]]] = []
-        """Readings, each with the id of the goal then in progress; states can arrive before the path is accepted."""
+        """Readings, each with the id of the goal in progress, since states can arrive before the path is accepted."""
         self._sending = asyncio.Lock()
         self._interrupted: AsyncGoalHandle | None = None
-        """Goal whose stop was requested and is therefore not a failure."""
+        """Goal that was stopped on request, which is not a failure."""
         self._stopped = False
         self._stopping: asyncio.Task[None] | None = None
         super().__init__(name)
@@ -71,13 +71,13 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         return cast("Stage", self.parent)
 
     async def connect(self, *_: object, **__: object) -> None:
-        """Connect the stage."""
+        """Connect the stage to the service."""
         await self._stage.link()
 
     def kickoff(self) -> AsyncStatus[None]:
-        """Move to the first point; done when the service has accepted the path.
+        """Move to the first point, then start the path. The status is done when the service has accepted the path.
 
-        If the calling task, which runs the plan, ends first, the path is stopped.
+        The calling task runs the plan. If this task ends before the path does, the path is stopped.
         """
         status = AsyncStatus(self._kickoff())
         if (plan := asyncio.current_task()) is not None:
@@ -88,11 +88,11 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         link = await self._stage.link()
         self._goal, self._samples = None, []
         self._stopped = False
-        self._sending = asyncio.Lock()  # of this event loop
+        self._sending = asyncio.Lock()  # a lock of this event loop
         if self._first is not None:
             await link.mover.start(self._first).end
         async with self._sending:
-            if self._stopped:  # mypy cannot know that stop() runs meanwhile
+            if self._stopped:  # stop() may have run during the await, which mypy cannot know
                 raise TrirailError("stopped before its goal was sent")
             if not self._has_marks:
                 self._sampling = asyncio.create_task(self._sample(link.robot))
@@ -105,7 +105,10 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
 
     @AsyncStatus.wrap
     async def complete(self) -> None:
-        """Wait until the robot is measured to be at the end; fail with the reason if the path ends otherwise."""
+        """Wait until the robot's measured position has settled at the end of the path.
+
+        Raises UnfinishedError with the reason if the path ends with an outcome other than done.
+        """
         goal = self._goal
         if goal is None:
             raise TrirailError(f"{self.name}: complete before kickoff")
@@ -121,7 +124,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         """Stop the path; return when the robot is at rest."""
         self._stopped = True
         await (await self._stage.link()).mover.stop(success)
-        async with self._sending:  # a goal that is being sent is first accepted
+        async with self._sending:  # wait until the service has accepted a goal that is being sent
             goal = self._goal
         if goal is not None and goal.result is None:
             self._interrupted = goal if success else None
@@ -129,21 +132,21 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
         self._end_sampling()
 
     async def pause(self) -> None:
-        """Stop the path; a plan that resumes from a checkpoint before `kickoff` repeats it from its start."""
+        """Stop the path. If the plan resumes from a checkpoint before `kickoff`, it repeats the path from its start."""
         await self.stop()
 
     async def resume(self) -> None:
-        """Do nothing: the plan repeats `kickoff`."""
+        """Do nothing, since the plan repeats `kickoff`."""
 
     async def describe_collect(self) -> dict[str, dict[str, DataKey]]:
-        """Return the columns of the collected data, in a stream of the flight's name."""
+        """Return the columns of the collected data. The name of the stream is the name of the flight."""
         if not self._has_marks:
             return {self.name: await self._stage.describe()}
         source = f"trirail://{(await self._stage.link()).shown.name}/event"
         return {self.name: {f"{self.name}-{name}": _key(source, *column) for name, column in COLUMNS.items()}}
 
     async def collect(self) -> AsyncIterator[PartialEvent]:
-        """Yield a row per switch on the path; without marks, one per state."""
+        """Yield a row for each switch of an output on the path; if there are no marks, yield a row for each state."""
         goal_id = self._goal.id if self._goal is not None else ""
         sampled = [readings for during, readings in self._samples if during == goal_id]
         rows = self._switches() if self._has_marks else sampled
@@ -153,7 +156,7 @@ class Flight(Device, Flyable, EventCollectable, Pausable):
             yield {"time": next(iter(stamps.values())), "data": values, "timestamps": stamps}
 
     def _end_with_plan(self, begun: AsyncStatus[None]) -> None:
-        """Stop the path if it is still in progress when its plan ends."""
+        """Stop the path if it is starting or in progress; called when the plan ends."""
         under_way = self._goal is not None and self._goal.result is None
         if under_way or not begun.done:
             self._stopping = asyncio.create_task(self._stop_late())

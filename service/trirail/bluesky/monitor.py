@@ -1,4 +1,4 @@
-"""Monitors: functions that receive the readings of every state, as with bps.monitor."""
+"""Subscriptions of functions to the readings of a device, for bps.monitor of Bluesky."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Monitor = Callable[[Readings], None]
 
 
 class Monitored(Device):
-    """A device whose readings can be monitored: Subscribable of bluesky.protocols."""
+    """Device with readings that can be monitored; implements bluesky.protocols.Subscribable."""
 
     def __init__(self, name: str = "") -> None:
         self._monitors: dict[Monitor, asyncio.Task[None]] = {}
         super().__init__(name)
 
     def subscribe_reading(self, function: Monitor) -> None:
-        """Call a function with the readings of every state, in the running event loop; a slow one gets only the newest.
+        """Call a function in the running event loop with the readings of every state.
 
-        Raises ValueError if the function is already subscribed.
+        If the function is slow, it gets only the newest readings. Raises ValueError if it is already subscribed.
         """
         if function in self._monitors:
             raise ValueError(f"{self.name}: {function!r} has been subscribed already; call clear_sub first")
@@ -38,7 +38,7 @@ class Monitored(Device):
     def clear_sub(self, function: Monitor) -> None:
         """End a subscription, from any thread. Raises KeyError if the function is not subscribed."""
         task = self._monitors.pop(function)
-        with contextlib.suppress(RuntimeError):  # its event loop is closed, and the task with it
+        with contextlib.suppress(RuntimeError):  # the event loop of the task is closed, so the task has ended
             task.get_loop().call_soon_threadsafe(task.cancel)
 
     async def _states(self) -> AsyncGenerator[State]:
@@ -60,7 +60,7 @@ class Monitored(Device):
             self.log.exception("the monitor of %s has ended", self.name)
 
     def _call(self, function: Monitor, readings: Readings) -> None:
-        """Call a monitor and log its error; an error does not end the subscription."""
+        """Call a subscribed function. An error in the function is logged, and does not end the subscription."""
         try:
             function(readings)
         except Exception:

@@ -1,4 +1,4 @@
-"""Goals of a stage: sets of several axes that arrive together become one goal."""
+"""Conversion of Bluesky's sets of single axes to goals. Sets of several axes that arrive together become one goal."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from trirail.errors import RefusalCode, RefusedError, ServiceError, TrirailError
 from trirail.wire.state import Pose
 
 GATHERING_S = 0.005
-"""Time after the first set in which others join its goal [s]; sets of one message group are within a millisecond."""
+"""Time after a set during which other sets join its goal [s]. Sets of a message group arrive within a millisecond."""
 SILENCE_S = 5.0
-"""Time without a state after which a goal in progress is given up [s]."""
+"""Time without a state after which the service counts as lost during a goal [s]."""
 PROGRESS_S = 0.1
-"""Interval of progress reports [s]."""
+"""Interval between progress reports [s]."""
 
 
 class UnfinishedError(TrirailError):
-    """Raised when a goal ends with an outcome other than done; `result` is its result."""
+    """Error raised if a goal ends with an outcome other than done; `result` is the result of the goal."""
 
     def __init__(self, result: Result) -> None:
         super().__init__(result.message)
@@ -30,25 +30,25 @@ class UnfinishedError(TrirailError):
 
 
 def check_done(result: Result) -> None:
-    """Raise UnfinishedError if a goal is not done."""
+    """Raise UnfinishedError if the outcome of a goal is not done."""
     if result.outcome != "done":
         raise UnfinishedError(result)
 
 
 @dataclass(eq=False, slots=True)
 class AxisMove:
-    """A set of some axes."""
+    """Set of one or more axes, a request of Bluesky to move them to target values."""
 
     targets: Mapping[int, float]
-    """Target of each axis, by its index: x, y [m] and phi [rad]."""
+    """Target of each axis by the index of the axis, 0 to 2 for x, y [m] and phi [rad]."""
     end: asyncio.Future[None]
 
     def shares_axis(self, other: AxisMove) -> bool:
-        """Return whether both sets move the same axis."""
+        """Return True if both sets move the same axis."""
         return not self.targets.keys().isdisjoint(other.targets)
 
     def finish(self, error: Exception | None = None) -> None:
-        """End the set, if it has not ended."""
+        """End the set, with or without an error, if it has not ended."""
         if self.end.done():
             return
         if error is None:
@@ -59,45 +59,47 @@ class AxisMove:
 
 @dataclass(eq=False, slots=True)
 class _Motion:
-    """A goal and the sets that it carries out."""
+    """Goal, and the sets that the goal carries out."""
 
     target: Pose
     goal: AsyncGoalHandle
     moves: list[AxisMove] = field(default_factory=list)
     interrupted: bool = False
-    """Whether the goal's stop was requested and is therefore not a failure."""
+    """Whether the goal was stopped on request, which is not a failure."""
 
     def finish(self, result: Result) -> None:
-        """Finish the sets of this goal with the goal's result."""
+        """End the sets of this goal, with an error if the goal has failed."""
         failed = result.outcome != "done" and not self.interrupted
         end_all(self.moves, UnfinishedError(result) if failed else None)
 
 
 class Mover:
-    """Sender of one goal for all sets that arrive together; the goal's end finishes them. Uses one event loop.
+    """Sender of goals for sets of axes, within one event loop.
 
-    A set of other axes during a goal replaces it by a new goal to all targets, so that each axis arrives as it would
-    with independent motors. A set of the same axis preempts the earlier set.
+    Sets that arrive together become one goal, and end with this goal. If a set of other axes arrives during a goal, a
+    new goal to all targets replaces the goal, so that each axis reaches its target as with independent motors. A set of
+    the same axis preempts the earlier set.
     """
 
     def __init__(self, robot: AsyncRobot) -> None:
         self._robot = robot
         self._gathered: list[AxisMove] = []
-        """Sets that later sets may still join; replacing the list ends that."""
+        """Sets that later sets may still join. A new list begins with the next goal."""
         self._unsent: list[AxisMove] = []
-        """The gathered sets, and sets that wait for their turn; a stop ends all of these before their goal is sent."""
+        """Sets for which no goal has been sent yet. A stop ends these sets without sending a goal."""
         self._motion: _Motion | None = None
         self._sending = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self.pose: Pose | None = None
-        """Measured pose in the newest state during a goal."""
+        """Measured pose in the newest state during a goal; None before the first state."""
 
     def start(self, targets: Mapping[int, float]) -> AxisMove:
-        """Start to move axes to their targets; sets that follow within GATHERING_S join the goal."""
+        """Start to move axes to their targets. Sets that follow within GATHERING_S join the same goal."""
         move = AxisMove(targets, asyncio.get_running_loop().create_future())
-        move.end.add_done_callback(lambda end: end.cancelled() or end.exception())  # a set need not be waited for
+        # Retrieve the error, so that asyncio does not complain if no task waits for the set.
+        move.end.add_done_callback(lambda end: end.cancelled() or end.exception())
         if any(move.shares_axis(other) for other in self._gathered):
-            self._start_task()  # a goal of the earlier sets goes first
+            self._start_task()  # send a goal for the earlier sets first
         self._gathered.append(move)
         self._unsent.append(move)
         if len(self._gathered) == 1:
@@ -105,9 +107,10 @@ class Mover:
         return move
 
     async def progress(self, move: AxisMove) -> AsyncIterator[Pose]:
-        """Yield measured poses until a set has ended. Raises the set's error.
+        """Yield measured poses until a set has ended. Raises the error with which the set ends.
 
-        Cancelling the iteration cancels a set whose goal has not been sent; a goal in progress continues.
+        If the iteration is cancelled before the goal of the set is sent, the set is cancelled. A goal in progress
+        continues.
         """
         try:
             while not move.end.done():
@@ -121,11 +124,12 @@ class Mover:
     async def stop(self, success: bool) -> None:
         """Stop the goal in progress; return when the robot is at rest. Goals of other clients continue.
 
-        With `success`, the sets end as if they had arrived: a plan that pauses repeats them.
+        With `success`, the sets end without an error, as if the axes had reached their targets. A plan that pauses
+        repeats these sets when it resumes.
         """
         unsent, self._unsent, self._gathered = self._unsent, [], []
         end_all(unsent, None if success else TrirailError("stopped before its goal was sent"))
-        async with self._sending:  # a goal that is being sent is first accepted
+        async with self._sending:  # wait until the service has accepted a goal that is being sent
             motion = self._motion
         if motion is None or motion.goal.result is not None:
             return
@@ -133,7 +137,7 @@ class Mover:
         await cancel(motion.goal)
 
     async def settle(self, goal: AsyncGoalHandle) -> Result:
-        """Wait for the end of a goal. Raises ServiceError if the service is lost or restarts during the wait."""
+        """Wait for the end of a goal. Raises ServiceError if the service is lost or restarts before the goal ends."""
         ended, lost = asyncio.create_task(goal.wait()), asyncio.create_task(self._watch())
         try:
             await asyncio.wait({ended, lost}, return_when=asyncio.FIRST_COMPLETED)
@@ -141,7 +145,7 @@ class Mover:
         finally:
             ended.cancel()
             lost.cancel()
-            await asyncio.gather(ended, lost, return_exceptions=True)  # neither task may outlive this call
+            await asyncio.gather(ended, lost, return_exceptions=True)  # both tasks must end before this call does
 
     def _start_task(self, delay: float = 0.0) -> None:
         task = asyncio.create_task(self._send_later(self._gathered, delay))
@@ -151,20 +155,20 @@ class Mover:
             self._gathered = []
 
     async def _send_later(self, moves: list[AxisMove], delay: float) -> None:
-        """Send a goal for sets that are gathered during a delay, and finish them when it ends."""
+        """Send a goal for all sets that have been gathered after a delay, and end the sets when the goal ends."""
         if delay:
             await asyncio.sleep(delay)
             if moves is not self._gathered:
-                return  # sent or stopped meanwhile
+                return  # the sets were sent or stopped during the delay
             self._gathered = []
         try:
             async with self._sending:
                 self._unsent = [move for move in self._unsent if move not in moves]
                 moves = [move for move in moves if not move.end.done()]
                 if not moves:
-                    return  # stopped or cancelled meanwhile
+                    return  # all sets were stopped or cancelled
                 motion = self._motion = await self._send_goal(moves, self._motion)
-        except Exception as error:  # noqa: BLE001 - whatever it is, those who wait for the sets get it
+        except Exception as error:  # noqa: BLE001 - the tasks that wait for the sets must get every error
             end_all(moves, error)
             return
         try:
@@ -177,11 +181,12 @@ class Mover:
         motion.finish(result)
 
     async def _send_goal(self, moves: list[AxisMove], before: _Motion | None) -> _Motion:
-        """Send the goal for new sets and for the sets in progress whose axes the new sets do not move."""
+        """Send a goal for new sets, and for the sets in progress with axes that the new sets do not move."""
         carried: list[AxisMove] = []
         pose = (await self._robot.state()).commanded.pose
         if before is not None and before.goal.result is None:
-            # Taken over before the goal is sent: its acceptance ends the goal before, and the sets left with that.
+            # Move the sets of other axes to the new goal before it is sent. When the service accepts the new goal, the
+            # earlier goal ends, and with it the sets that remain with it.
             carried = [old for old in before.moves if not any(old.shares_axis(new) for new in moves)]
             before.moves = [old for old in before.moves if old not in carried]
             pose = before.target
@@ -200,7 +205,7 @@ class Mover:
         return _Motion(Pose(*target), goal, [*carried, *moves])
 
     async def _watch(self) -> ServiceError:
-        """Store the measured pose of each state; return the error when the service is lost."""
+        """Store the measured pose of each state in `pose`; return the error when the service is lost or restarts."""
         cycle, self.pose = -1, None
         async with aclosing(self._robot.states(SILENCE_S)) as states:
             async for state in states:
@@ -211,19 +216,19 @@ class Mover:
 
 
 def end_all(moves: list[AxisMove], error: Exception | None) -> None:
-    """End the sets, with an error or without."""
+    """End sets with an error; without an error if `error` is None."""
     for move in moves:
         move.finish(error)
 
 
 async def cancel(goal: AsyncGoalHandle) -> None:
-    """Stop a goal, unless it has already ended."""
+    """Stop a goal, unless it has already ended; return when the robot is at rest."""
     try:
         await goal.cancel()
     except RefusedError as error:
         if error.code != RefusalCode.NO_GOAL:
             raise
-    with contextlib.suppress(TimeoutError):  # the end is reported when the robot is at rest
+    with contextlib.suppress(TimeoutError):  # the service reports the end of the goal when the robot is at rest
         await goal.wait(SILENCE_S)
 
 

@@ -1,4 +1,4 @@
-"""The stage: x, y, phi and pose as movable axes of Bluesky, and all values of a state as readings."""
+"""Stage as a Bluesky device, with x, y, phi and the pose as movable axes and the values of a state as readings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Keys = dict[str, DataKey]
 
 
 class StageLink(NamedTuple):
-    """Connection of a stage within one event loop."""
+    """Connection of a stage to its service for one event loop."""
 
     loop: asyncio.AbstractEventLoop
     robot: AsyncRobot
@@ -43,10 +43,10 @@ class StageLink(NamedTuple):
 
 
 class Stage(Monitored, AsyncReadable, HasHints):
-    """A robot as a device of Bluesky, with the movable axes `x`, `y`, `phi`, and `pose` for all three together.
+    """Robot as a Bluesky device, with the movable axes `x`, `y` and `phi`, and `pose` for all three together.
 
-    Lengths are in metres, angles in radians. Each reading is of one state, which the service published after every
-    event that this client has received; a reading after a move therefore shows where the move ended. The stage neither
+    Lengths are in metres, angles in radians. All values of a reading are from the same state, which is newer than every
+    event that this client has received. A reading after a move therefore shows the end of the move. The stage neither
     enables nor homes the robot.
     """
 
@@ -61,17 +61,20 @@ class Stage(Monitored, AsyncReadable, HasHints):
 
     @property
     def hints(self) -> Hints:
-        """Keys that a table or a plot shows by default."""
+        """Keys of the readings that a table or a plot shows by default."""
         return {"fields": [self.x.name, self.y.name, self.phi.name]}
 
     async def connect(self, *_: object, **__: object) -> None:
-        """Query geometry and limits in the running event loop. Raises ServiceError if the service does not answer."""
+        """Connect to the service in the running event loop, and query the robot's geometry and limits.
+
+        Raises ServiceError if the service does not answer.
+        """
         await self.link()
 
     async def link(self) -> StageLink:
         """Return the connection for the running event loop; the first call creates it."""
         if not self.name:
-            self.set_name(UNNAMED)  # documents need a name; init_devices would have given that of the variable
+            self.set_name(UNNAMED)  # Bluesky's documents need a name; init_devices would have used the variable's name
         loop = asyncio.get_running_loop()
         task = self._linking
         failed = task is not None and task.done() and (task.cancelled() or task.exception() is not None)
@@ -81,11 +84,11 @@ class Stage(Monitored, AsyncReadable, HasHints):
         return await asyncio.shield(task)
 
     async def describe(self) -> Keys:
-        """Return units, limits and precision of every reading, as the service has them now."""
+        """Return the units, limits and precision of every reading, from a query of the service."""
         return self._keys(DrawnRobot.from_info(await (await self.link()).robot.info()))
 
     def _keys(self, shown: DrawnRobot) -> Keys:
-        """Return units, limits and precision of every reading of a robot."""
+        """Return the units, limits and precision of every reading of a robot."""
         keys = [self._key(shown, axis) for axis in range(3)]
         source = keys[0]["source"]
         vector = DataKey(source=source, dtype="array", dtype_numpy="<f8", shape=[3], units="m")
@@ -98,15 +101,19 @@ class Stage(Monitored, AsyncReadable, HasHints):
         }
 
     async def read(self) -> Readings:
-        """Return measured pose, sliders [m] and following error [m] of the next state, and its nominal time [s]."""
+        """Return the readings of the next state.
+
+        The readings are the measured pose [m, m, rad], the slider positions and following errors [m], and the nominal
+        time [s].
+        """
         return self.readings(await (await self.link()).robot.state())
 
     async def stop(self, success: bool = True) -> None:
-        """Stop a goal of this stage's axes; return when the robot is at rest. Goals of other clients continue."""
+        """Stop the goal of this stage's axes; return when the robot is at rest. Goals of other clients continue."""
         await (await self.link()).mover.stop(success)
 
     async def check(self, pose: Sequence[float]) -> None:
-        """Let the service check the whole path to a pose against every limit; nothing moves.
+        """Let the service check the whole path to a pose against every limit, without moving.
 
         Raises RefusedError with the limit and the value if the service would refuse the pose.
         """
@@ -116,9 +123,10 @@ class Stage(Monitored, AsyncReadable, HasHints):
     def follow(
         self, points: Points, *, marks: Sequence[MarkLike] = (), stretch: bool = False, name: str = "flight"
     ) -> Flight:
-        """Return a fly scan along timed points, like Robot.follow; the robot first moves to the first point.
+        """Return a fly scan along timed points, as in Robot.follow. The robot first moves to the first point.
 
-        The scan collects the switches at its marks or, without marks, the readings of every state during the path.
+        The scan collects the switches of outputs at its marks. If there are no marks, it collects the readings of every
+        state during the path.
         """
         rows, places = points_of(points), marks_of(marks)
         first = dict(enumerate((rows[0].x, rows[0].y, rows[0].phi)))
@@ -127,12 +135,12 @@ class Stage(Monitored, AsyncReadable, HasHints):
     def fly_to(
         self, x: float, y: float, phi: float, *, marks: Sequence[MarkLike] = (), speed: float = 1, name: str = "flight"
     ) -> Flight:
-        """Return a fly scan straight to a pose, like Robot.move_to, with the same data as `follow`."""
+        """Return a fly scan to a pose on a straight path, as in Robot.move_to; the data are those of `follow`."""
         places = marks_of(marks)
         return Flight(self, lambda robot: robot.move_to(x, y, phi, speed=speed, marks=places), bool(places), name)
 
     def key(self, name: str) -> str:
-        """Return the key of a reading."""
+        """Return the key of the reading with this name."""
         return f"{self.name or UNNAMED}-{name}"
 
     def readings(self, state: State) -> Readings:
@@ -163,13 +171,16 @@ class Stage(Monitored, AsyncReadable, HasHints):
             "dtype_numpy": "<f8",
             "shape": [],
             "units": UNITS[axis],
-            # One digit finer than the window within which a goal is done.
+            # The precision is one digit finer than the in-position window.
             "precision": math.ceil(-math.log10(limits.in_position.pose[axis])) + 1,
             "limits": {"control": {"low": low, "high": high}},
         }
 
     async def _connect(self, loop: asyncio.AbstractEventLoop, before: StageLink | None) -> StageLink:
-        """Return a connection in the running event loop; close the earlier one, whose event loop is closed."""
+        """Return a connection for the running event loop.
+
+        `before` is an earlier connection with a closed event loop, which is closed first.
+        """
         if before is not None:
             await before.robot.close()
         robot = await self._robot._for_running_loop()
@@ -178,7 +189,7 @@ class Stage(Monitored, AsyncReadable, HasHints):
 
 
 class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]):
-    """Axes of a stage that one value sets."""
+    """Base class of the movable axes of a stage; one value of type T sets one axis or all axes."""
 
     def __init__(self, coordinate: str) -> None:
         self._coordinate = coordinate
@@ -186,26 +197,26 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
 
     @property
     def _stage(self) -> Stage:
-        return cast(Stage, self.parent)  # set by Device, where a stage gets its axes
+        return cast(Stage, self.parent)  # Device sets the parent when a stage gets its axes
 
     @property
     def name(self) -> str:
-        """Key of the axis' reading."""
+        """Name of the axis, which is also the key of its reading."""
         if self._name or self.parent is None:
             return self._name
         return self._stage.key(self._coordinate)
 
     @property
     def hints(self) -> Hints:
-        """Key that a table or a plot shows by default."""
+        """Key of the reading that a table or a plot shows by default."""
         return {"fields": [self.name]}
 
     async def connect(self, *_: object, **__: object) -> None:
-        """Connect the stage."""
+        """Connect the stage to the service."""
         await self._stage.link()
 
     async def describe(self) -> Keys:
-        """Return units, limits and precision."""
+        """Return the units, limits and precision of the reading."""
         return {self.name: (await self._stage.describe())[self.name]}
 
     async def read(self) -> Readings:
@@ -213,16 +224,19 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
         return self._own(await self._stage.read())
 
     async def locate(self) -> Location[T]:
-        """Return the target of the goal in progress, or the commanded value at rest, and the measured value."""
+        """Return the setpoint and the measured value.
+
+        The setpoint is the target of the goal in progress; if there is no goal, it is the commanded value.
+        """
         state = await (await self._stage.link()).robot.state()
         return Location(setpoint=self._value(_setpoint(state)), readback=self._value(state.pose))
 
     @WatchableAsyncStatus.wrap
     async def set(self, value: T) -> AsyncIterator[WatcherUpdate[T]]:
-        """Move to a value; done when the robot is measured to be there.
+        """Move to a value. The status is done when the measured position has settled at the value.
 
-        Fails with the reason if the goal is refused or ends with another outcome than done. Sets of several axes within
-        some milliseconds become one straight move.
+        The status fails with the reason if the goal is refused, or ends with an outcome other than done. Sets of
+        several axes within some milliseconds become one straight move.
         """
         targets = self._targets(value)
         link = await self._stage.link()
@@ -258,14 +272,14 @@ class _Movable(Monitored, AsyncLocatable[T], AsyncReadable, HasHints, Generic[T]
 
 
 class MovableAxis(_Movable[float]):
-    """One coordinate of the platform's centre: x, y [m] or phi [rad]."""
+    """Movable axis for one coordinate of the platform's centre: x, y [m] or phi [rad]."""
 
     def __init__(self, index: int) -> None:
         self._index = index
         super().__init__(COORDINATES[index])
 
     async def check_value(self, value: float) -> None:
-        """Check the path to a value, with the other coordinates at their commanded values; see Stage.check."""
+        """Check the path to a value; see Stage.check. The other coordinates are at their setpoints, as in `locate`."""
         pose = list(_setpoint(await (await self._stage.link()).robot.state()))
         pose[self._index] = float(value)
         await self._stage.check(pose)
@@ -278,7 +292,7 @@ class MovableAxis(_Movable[float]):
 
 
 class MovablePose(_Movable[NDArray[np.float64]]):
-    """The whole pose of the platform's centre: x, y [m] and phi [rad]."""
+    """Movable axis for the whole pose of the platform's centre: x, y [m] and phi [rad]."""
 
     def __init__(self) -> None:
         super().__init__("pose")
@@ -296,6 +310,6 @@ class MovablePose(_Movable[NDArray[np.float64]]):
 
 
 def _setpoint(state: State) -> Pose:
-    """Return the target of the goal in progress, or the commanded pose without one."""
+    """Return the target of the goal in progress; the commanded pose if there is no goal or the goal has no target."""
     target = state.goal.target if state.goal is not None else None
     return target or state.commanded.pose

@@ -1,1 +1,1 @@
-"""The Python client, trajectories from files, and private services for demos and tools."""
+"""Python client, reader of trajectory files, and launcher of private services for demos and tools."""

@@ -1,7 +1,7 @@
-"""Alignments: procedures carried out with the user's camera and a connection to the robot.
+"""Alignment procedures that use the user's camera and a connection to the robot.
 
-The client reports each look to the service, for recordings, reports and panels. A failed report causes a single warning
-and never ends an alignment.
+The client reports each look to the service, which adds the look to recordings, reports and panels. If reports fail, the
+client warns once and continues the alignment.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from trirail.wire.text import quoted
 
 T = TypeVar("T")
 Look = Callable[[], Marks | Awaitable[Marks]]
-"""Function that takes a picture, or one per camera, and returns the marks in it, {name: (u, v)} [pixel]; for AsyncRobot
-it may be a coroutine function."""
+"""Function that takes one picture with each camera and returns the pixels of the marks, {name: (u, v)} [pixel].
+
+A coroutine function is allowed with AsyncRobot only."""
 EMPTY_OBSERVATION = Observation({}, (0.0, 0.0, 0.0), 0.0)
 GOAL_WITHIN = 60.0
 """Time-out of one motion [s]."""
 ENDS_AT_TARGET = ("done", "unsettled")
-"""Outcomes after which the robot is at or near its target; the next look measures the remaining distance."""
+"""Outcomes of a goal that leave the robot at or near its target. The next look measures the remaining distance."""
 
 
 class MotionHandle(Protocol):
@@ -53,7 +54,7 @@ class MotionHandle(Protocol):
 
 
 class StageRobot(Protocol):
-    """Calls of Robot or AsyncRobot that an alignment needs."""
+    """Methods of Robot or AsyncRobot that an alignment calls."""
 
     def send(self, make: Goal, /) -> MotionHandle | Awaitable[MotionHandle]:
         """Send a goal."""
@@ -70,9 +71,9 @@ class StageRobot(Protocol):
 def drive(
     robot: StageRobot, look: Look, requests: Generator[AlignmentRequest, Observation, T], speed: float, wait: float
 ) -> T:
-    """Carry out the requests of a procedure with a Robot; return the procedure's result.
+    """Carry out the requests of a procedure with a blocking Robot; return the procedure's result.
 
-    Like `drive_async`, but without an event loop. Ctrl-C stops the motion.
+    The parameters and errors are those of `drive_async`, but no event loop is needed. Ctrl-C stops the motion.
     """
 
     def call_look() -> Marks:
@@ -85,7 +86,7 @@ def drive(
 
 
 def finish(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine that never suspends because all of its calls block; return its result."""
+    """Run a coroutine without an event loop; return its result. All calls of the coroutine must block, not suspend."""
     try:
         coroutine.send(None)
     except StopIteration as end:
@@ -102,7 +103,7 @@ async def drive_async(
     wait: float,
     sleep: Callable[[float], Awaitable[None] | None] = asyncio.sleep,
 ) -> T:
-    """Carry out the requests of a procedure, and return its result; cancellation stops the motion.
+    """Carry out the requests of a procedure; return the procedure's result. Cancelling the task stops the motion.
 
     Parameters
     ----------
@@ -111,16 +112,16 @@ async def drive_async(
     speed
         Fraction of full speed.
     wait
-        Time after a motion until a picture of the camera is current [s].
+        Waiting time after a motion, after which the camera's next picture shows the robot at rest [s].
     sleep
-        Function that waits, in the event loop or without one.
+        Function that waits for a number of seconds, either a coroutine function or a blocking one.
 
     Raises
     ------
     RefusedError
         If a motion is refused or does not reach its target.
     Exception
-        Any error of `look`.
+        If `look` raises it.
 
     """
     check_wait(wait)
@@ -151,7 +152,7 @@ async def drive_async(
 
 
 async def completed(called: Any) -> Any:
-    """Return the result of a call, awaiting it if needed."""
+    """Return a value; if the value is awaitable, await it and return its result."""
     return await called if inspect.isawaitable(called) else called
 
 
@@ -178,7 +179,7 @@ async def _move(robot: StageRobot, goal: Goal, goal_id: str) -> None:
 
 
 def goals(motion: StageMotion, speed: float) -> Iterator[Goal]:
-    """Yield the goals of a motion; with an approach, the first goal overshoots the end."""
+    """Yield the goals of a motion; with an approach, a first goal overshoots the target and a second returns to it."""
     by, tool, beyond = motion.by, motion.tool, motion.approach
     first = by if beyond is None else _sum(by, beyond)
     if tool is None:
@@ -204,11 +205,11 @@ def _negative(a: Triple) -> Triple:
 
 
 class UnrecordedAlignmentWarning(UserWarning):
-    """Warning that the service did not accept the report of an alignment, so that recordings lack it."""
+    """Warning that the service did not accept a report of an alignment, so recordings do not contain the alignment."""
 
 
 class LookReports:
-    """Builder of the messages of one alignment and of its goals' ids, which begin with the alignment's id."""
+    """Builder of the look messages and goal ids of one alignment; each goal id begins with the alignment's id."""
 
     def __init__(self) -> None:
         self.id = f"align-{uuid.uuid4().hex[:8]}"
@@ -223,7 +224,10 @@ class LookReports:
         return (f"{self.id}-{number}" for number in self._goals)
 
     def message(self, report: LookReport) -> bytes | None:
-        """Return the message of a look; None if it cannot be encoded or an earlier message was not accepted."""
+        """Return the message that reports a look.
+
+        Return None if the message cannot be encoded, or if an earlier message could not be encoded or was not accepted.
+        """
         if self._last is None or self._last.purpose != report.purpose:
             self._number, self._began = 0, _time(report)
         self._number = max(1, self._number + (report.observation is not None))
@@ -235,13 +239,16 @@ class LookReports:
             return None
 
     def failure(self, error: BaseException) -> bytes | None:
-        """Return the message that reports an error as the end; None before the first look or if an end was reported."""
+        """Return the message that reports that an error ended the alignment.
+
+        Return None if no look has been reported yet, or if the end has already been reported.
+        """
         if self._last is None or self._last.end is not None:
             return None
         return self.message(LookReport(self._last.purpose, end="failed", words=str(error) or type(error).__name__))
 
     def lost(self, error: Exception) -> None:
-        """Warn once that the service does not accept the report."""
+        """Warn that the service does not accept the reports; do nothing after the first call."""
         if not self._lost:
             self._lost = True
             words = f"this alignment is not in the service's recording: {error}"
@@ -257,7 +264,7 @@ class LookReports:
             error=None if measured is None else _error(measured),
             pose=None if observation is None else observation.pose,
             correction=report.correction,
-            end=cast(LookEnd | None, report.end and str(report.end)),  # tests/wire/test_looks.py holds them together
+            end=cast(LookEnd | None, report.end and str(report.end)),  # tests/wire/test_looks.py compares the values
             words=quoted(report.words),
             noise=report.noise,
             seconds=max(0.0, _time(report) - self._began),

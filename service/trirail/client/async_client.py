@@ -63,11 +63,11 @@ T = TypeVar("T")
 
 
 class AsyncRobot:
-    """A connection to one robot's service inside a context, for the tasks of one event loop.
+    """Asynchronous context manager for a connection to one robot's service, for the tasks of one event loop.
 
-    Arguments, names and errors are those of trirail.client.client.Robot, which wraps these calls for threads. If you
-    cancel a call that sends a goal, the goal is stopped if the service has received it. An accepted goal continues,
-    even if no task waits for it.
+    The arguments, method names and errors are those of trirail.client.client.Robot, which offers the same calls to
+    threads. If you cancel a call that sends a goal, the client stops the goal in case the service has received it. An
+    accepted goal continues even if no task waits for the goal.
     """
 
     def __init__(
@@ -103,23 +103,26 @@ class AsyncRobot:
         await self._opened.aclose()
 
     def _connected(self) -> Connection:
-        """Open a connection, which may block for a while. Raises ServiceError if the service cannot be reached."""
+        """Open a connection; this call blocks. Raises ServiceError if the locator cannot be reached."""
         return Connection(self.name, self._connect, self._credentials, self.user)
 
     async def _use(self, connection: Connection) -> None:
-        """Send and receive over a connection, in the running event loop."""
+        """Use a connection for all later calls, and subscribe to its events in the running event loop."""
         self._open = AsyncConnection(connection)
         self._opened.enter_context(self._open.subscribe_to_events(self._on_event, history=True))
 
     async def _shared(self, connection: Connection) -> AsyncRobot:
-        """Return a robot for the running event loop that has its own goals and shares the connection."""
+        """Return a robot for the running event loop that shares the connection but registers its goals separately."""
         shared = copy.copy(self)
         shared._opened, shared._goals = AsyncExitStack(), OpenGoals()
         await shared._use(connection)
         return shared
 
     async def _twin(self, connection: Connection) -> AsyncRobot:
-        """Return a robot for the running event loop that only sends commands and shares the connection."""
+        """Return a robot for the running event loop that shares the connection and receives no events.
+
+        The returned robot can send commands; the handles of its goals would never get a result.
+        """
         twin = copy.copy(self)
         twin._open = AsyncConnection(connection)
         return twin
@@ -151,18 +154,19 @@ class AsyncRobot:
 
         The platform moves on a straight line in pose space if its start allows this. `speed` is a fraction of full
         speed, (0, 1]: at 0.5 the motion takes twice as long on the same path. With `blend` [m], the next pose goal
-        waits for this one and begins when every point of the platform is within this distance of its target; without
-        it, the next goal preempts this one. `limits` may lower the platform's limits. A goal that has not begun within
-        `valid_for` [s] expires.
+        waits for this goal, and begins when every point of the platform is within this distance of its place at the
+        target. Without `blend`, the next goal preempts this goal. `limits` may lower the platform's limits. A goal that
+        has not begun within `valid_for` [s] expires.
 
         `tool` is a point (u, v) [m] in the platform's frame, or the name of a point in [frames.tool]. This point then
         moves to x, y on a straight line, within the platform's limits, while the platform turns. `frame` names the
         frame of [frames.work] in which x, y and phi are given.
 
-        Outputs switch at the `marks` on the path, each a trirail.Mark or a dict of its fields; the result has a row for
-        each switch. The goal ends with a controlled stop at the edge `stop_at` of an input, a trirail.StopAt or a dict
-        of its fields. The `id` must be new; without it, the client generates one. Raises RefusedError, for example if
-        the pose is out of reach or the robot is not enabled or is stopping.
+        `marks` switch outputs at places on the path. Each mark is a trirail.Mark, or a dict of the fields of a Mark.
+        The result of the goal lists every switch. `stop_at` names the edge of an input at which the goal ends with a
+        controlled stop. It is a trirail.StopAt, or a dict of the fields of a StopAt. The `id` must be new; by default,
+        the client generates an id. Raises RefusedError, for example if the pose is out of reach or the robot is not
+        enabled or is stopping.
         """
         return await self.send(
             lambda name: PoseGoal(
@@ -201,10 +205,11 @@ class AsyncRobot:
     ) -> AsyncGoalHandle:
         """Move the platform by x, y [m] and turn it by phi [rad]; return once the service accepts the goal.
 
-        The platform turns about its `tool`, or about its centre without one. x and y are along the axes of `frame`:
-        base, platform (as oriented at that time), or a frame of [frames.work]. `origin` is the start of the move.
-        "commanded" is the end of the preceding goals, so that moves add up whenever they are sent; "measured" is the
-        robot's measured pose. The other arguments are those of move_to.
+        The platform turns about the `tool`, or about the platform's centre if no tool is given. x and y are along the
+        axes of `frame`: base, platform (with the orientation that it has at the start of the move), or a frame of
+        [frames.work]. `origin` selects the start of the move. "commanded" is the end of the preceding goals, so moves
+        add up no matter when they are sent. "measured" is the robot's measured pose. The other arguments are those of
+        move_to.
         """
         return await self.send(
             lambda name: MoveGoal(
@@ -237,7 +242,7 @@ class AsyncRobot:
         stop_at: StopAtLike | None = None,
         id: str | None = None,  # noqa: A002 - the field's name on the wire
     ) -> AsyncGoalHandle:
-        """Move the platform to a named pose, one of `poses`; the other arguments are those of move_to.
+        """Move the platform to a named pose; `poses` returns the names. The other arguments are those of move_to.
 
         The service looks the name up when it receives the goal. Raises RefusedError `unknown_pose` for an unknown name.
         """
@@ -269,8 +274,8 @@ class AsyncRobot:
     ) -> AsyncGoalHandle:
         """Move the sliders A, B, C to positions lambda_10 [m]; return once the service accepts the goal.
 
-        The motion is a straight line in slider space if the start allows this. It can also leave a pose from which
-        move_to is refused. `speed`, `valid_for` and `id` are those of move_to.
+        The motion is a straight line in slider space if the start allows this. The motion can also begin at a pose from
+        which the service refuses move_to. The other arguments are those of move_to.
         """
         return await self.send(
             lambda name: SlidersGoal(
@@ -311,8 +316,8 @@ class AsyncRobot:
     ) -> AsyncJog:
         """Move the platform at a velocity [m/s, rad/s] until the context ends.
 
-        The client renews the jog before each `timeout` [s] passes. The velocity is that of the `tool`, about which the
-        platform turns, or that of the platform's centre without one.
+        The client renews the jog before each `timeout` [s] passes. The velocity is that of the `tool`, and the platform
+        turns about the tool. If no tool is given, the platform's centre replaces the tool.
 
         with robot.jog(x=0.01):  # of AsyncRobot: async with
             wait_for_the_key_to_be_released()
@@ -321,14 +326,15 @@ class AsyncRobot:
         return AsyncJog(self.send, (x, y, phi), timeout, tool)
 
     def track(self, *, timeout: float = 0.25, id: str | None = None) -> AsyncTrack:  # noqa: A002 - the field's name on the wire
-        """Follow a moving target that you update 10 to 200 times a second; brake when the context ends.
+        """Follow a moving target until the context ends; the program updates the target 10 to 200 times a second.
 
         with robot.track() as track:  # of AsyncRobot: async with, and await
             for pose, velocity, time in camera:
                 track.update(pose, velocity, time)
 
-        Between two updates the robot keeps the target's velocity, within every limit. It brakes on its path if no
-        update arrives for `timeout` seconds of real time. `id` is as for move_to.
+        Between two updates, the robot assumes that the target moves at the velocity of the latest update. The robot
+        respects every limit. It brakes on its path when the context ends, or if no update arrives for `timeout` seconds
+        of real time. `id` is that of move_to.
         """
 
         goal_id = id or uuid.uuid4().hex[:12]
@@ -339,7 +345,10 @@ class AsyncRobot:
         return AsyncTrack(self.send, post, goal_id, timeout)
 
     async def send(self, make: Goal | Callable[[str], Goal], id: str | None = None) -> AsyncGoalHandle:  # noqa: A002
-        """Send a trirail.wire.goals.Goal, or the goal that `make` returns for an id; return once it is accepted."""
+        """Send a trirail.wire.goals.Goal; return once the service accepts the goal.
+
+        `make` is the goal, or a function that returns the goal for an id.
+        """
         goal_id = id or id_of(make)
         *before, last = goal_messages(make, goal_id)
         goal = self._goals.open(AsyncGoalHandle(goal_id, self.command))
@@ -359,8 +368,9 @@ class AsyncRobot:
         """Plan a trirail.wire.goals.Goal without moving; return the reply that the service would give to the goal now.
 
         The service checks the whole path against every limit. The path begins at rest, at the end of the accepted goals
-        or at the commanded pose. Neither the mode nor the lease matters. Jogs and tracks have no path and cannot be
-        checked. A trajectory can be checked if it fits into one message. Raises RefusedError as for the goal itself.
+        or, if these have no fixed end or there are none, at the commanded pose. The check works in every mode, and for
+        users without the lease. Jogs and tracks have no path and cannot be checked. A trajectory can be checked if it
+        fits into one message. Raises RefusedError for the same reasons as the goal itself, apart from mode and lease.
         """
         return await self._connection.fetch(("check", self.user), GoalReply, check_message(goal))
 
@@ -379,15 +389,16 @@ class AsyncRobot:
     ) -> CameraCalibration:
         """Calibrate cameras from the marks of a part on the table; the stage makes test moves and returns to its start.
 
-        `look` takes a picture, or one with each camera, and returns {mark: (u, v)} in pixels without the marks that it
-        does not find. `moves` are x, y [m] and phi [rad] relative to the robot's pose, by default ±1 mm and ±1°; the
-        marks must stay in the picture in each of them. `views` gives the view that shows each mark; by default each
-        mark has a view of its own, as with two cameras, or with one camera that is moved to each mark. A perspective or
-        radial `lens` needs more moves, and a radial one also the `centre` of its picture [pixel]. At each pose the
-        client takes `looks` pictures, `wait` seconds after the robot is at rest. With an `approach` of x, y [m] and phi
-        [rad], the robot first overshoots by this amount and then returns, so that the backlash is always on the same
-        side. Ctrl-C stops the robot. Raises AlignmentError if the looks are not sufficient, and RefusedError if a move
-        is refused.
+        `look` is a function that takes one picture with each camera and returns the marks that it finds, {mark: (u, v)}
+        [pixel]. `moves` are x, y [m] and phi [rad] relative to the robot's pose, by default ±1 mm and ±1°; the marks
+        must stay in the picture during each move. `views` maps each mark to the view that shows it. By default, each
+        mark has a separate view, as with two cameras or with one camera that is moved from mark to mark. A perspective
+        or radial `lens` needs more moves, and a radial lens also the `centre` of its picture [pixel].
+
+        At each pose, the client waits until the robot is at rest and then for `wait` seconds more, and takes `looks`
+        pictures. With an `approach` of x, y [m] and phi [rad], the robot first overshoots by this amount and then
+        returns, so that the backlash is always on the same side. Ctrl-C stops the robot. Raises AlignmentError if the
+        looks are not sufficient, and RefusedError if a move is refused.
         """
         from trirail.alignment.procedure import DEFAULT_MOVES, calibrate_by_moves
 
@@ -413,10 +424,11 @@ class AsyncRobot:
 
         The procedure measures the marks, corrects the pose about the marks' centroid from the measured pose, and
         measures again. It ends when the best rigid motion places every mark within `tolerance` [m] and the part within
-        `angle` [rad], after `corrections` corrections, or when the error grows. With an unconfirmed calibration the
-        first correction is limited to twice the moves of the calibration. Without a `calibration`, the procedure first
-        makes one with moves of ±1 mm and ±1°. If the distance between marks is wrong by more than the fraction
-        `distance`, the marks are refused and nothing moves. The other arguments are those of calibrate_camera.
+        `angle` [rad], after `corrections` corrections, or when the error grows. If the calibration is unconfirmed, the
+        first correction is limited to twice the moves of the calibration. If no `calibration` is given, the procedure
+        first calibrates the cameras with moves of ±1 mm and ±1°. If the distance between marks is wrong by more than
+        the fraction `distance`, the procedure refuses the marks and nothing moves. The other arguments are those of
+        calibrate_camera.
         """
         from trirail.alignment.procedure import AlignmentTask, align, calibrate_and_align
 
@@ -441,16 +453,17 @@ class AsyncRobot:
     ) -> GeometryCalibration:
         """Identify the stage's geometry, encoder scales and cameras from the marks of a part; return the corrections.
 
-        `field` is the size of the pictures, (columns, rows) in pixels. The stage takes a look at its present pose,
-        after moves of 1 mm and 1°, and then at poses all over its travel at which the marks stay in the pictures. There
+        `field` is the size of the pictures, (columns, rows) in pixels. The procedure takes looks at the present pose,
+        after moves of 1 mm and 1°, and then at poses all over the travel at which the marks stay in the pictures. There
         are `poses` looks in total, at least 12; the information matrix determines the poses. The stage then returns to
         its start.
 
-        `.parameters` are corrections to the configuration by name [m, rad, or a fraction], and `.deviations` their
-        standard deviations. `.undetermined` names the parameters that the looks do not determine. `.residual` is the
-        prediction error for looks held out of the fit, before and after. This call writes nothing, and the service
-        keeps its geometry; `trirail align geometry` writes a configuration for its next start. The other arguments are
-        those of calibrate_camera. Needs trirail[analysis].
+        In the result, `.parameters` are corrections to the configuration by name [m, rad, or a fraction], and
+        `.deviations` are the standard deviations of these corrections. `.undetermined` names the parameters that the
+        looks do not determine. `.residual` is the prediction error, before and after the fit, for looks that the fit
+        did not use. This call writes no file, and the service continues to use its geometry. `trirail align geometry`
+        instead writes a configuration for the next start of the service. The other arguments are those of
+        calibrate_camera. Needs trirail[analysis].
         """
         from trirail.client.alignment import completed
         from trirail.client.stage_geometry import geometry_task
@@ -470,11 +483,11 @@ class AsyncRobot:
         return await drive_async(self, look, requests, speed, wait)
 
     async def _report_look(self, look: bytes) -> None:
-        """Report a look of an alignment to the service; `look` is a trirail.wire.looks.AlignmentLook as JSON."""
+        """Report a look of an alignment to the service; `look` is the JSON of a trirail.wire.looks.AlignmentLook."""
         await self._connection.fetch(("alignment", self.user), AlignmentLook, look, REPORT_WITHIN)
 
     async def enable(self) -> None:
-        """Enable the drives; return when the robot holds its position, immediately if it already does."""
+        """Enable the drives; return when they hold the robot's position, immediately if they already do."""
         await self.command(Command.ENABLE)
 
     async def disable(self) -> None:
@@ -486,22 +499,22 @@ class AsyncRobot:
         await self.command(Command.STOP)
 
     async def quick_stop(self) -> None:
-        """Stop each drive with its own quick-stop ramp, as fast as it can.
+        """Stop each drive with its own quick-stop ramp, as fast as the drive can stop.
 
-        The robot then has no power, and is in fault until it is reset.
+        The drives then have no power, and the robot is in fault until `reset`.
         """
         await self.command(Command.QUICK_STOP)
 
     async def reset(self) -> None:
-        """Clear a fault whose cause is gone; the robot stays disabled. Raises RefusedError if the cause persists."""
+        """Clear a fault; the robot stays disabled. Raises RefusedError if the cause of the fault persists."""
         await self.command(Command.RESET)
 
     async def home(self) -> None:
-        """Home the drives that have no absolute position; return when all are homed and the robot holds."""
+        """Home the drives that have no absolute position; return when all are homed and hold the robot's position."""
         await self.command(Command.HOME)
 
     async def pause(self) -> None:
-        """Stop on the path; return when the robot is at rest. `resume` continues the goal, unless it is a jog."""
+        """Stop on the path; return when the robot is at rest. `resume` continues the goal unless the goal is a jog."""
         await self.command(Command.PAUSE)
 
     async def resume(self) -> None:
@@ -509,26 +522,27 @@ class AsyncRobot:
         await self.command(Command.RESUME)
 
     async def override(self, percent: float) -> None:
-        """Set the speed override of current and later motions: 0, or 1 to 200 % of full speed, within the limits."""
+        """Set the speed override of current and later motions: 0, or 1 to 200 [%]. All limits still apply."""
         content = made_content(Command.OVERRIDE, lambda: Override(number(percent, "override")))
         await self.command(Command.OVERRIDE, content)
 
     async def set_output(self, name: str, value: bool) -> None:
-        """Set a digital output of the configuration, starting with the next setpoints.
+        """Set a digital output of the configuration; the new value is sent together with the next setpoints.
 
-        Raises RefusedError `unknown_output` for an unknown name. Raises `not_enabled` or `fault` if the robot is
-        disabled or in fault, unless the configuration has `always = true` for the output.
+        Raises RefusedError `unknown_output` for an unknown name. Raises RefusedError `not_enabled` or `fault` if the
+        robot is disabled or in fault, unless the configuration has `always = true` for the output.
         """
         content = made_content(Command.SET_OUTPUT, lambda: SetOutput(name, value))
         await self.command(Command.SET_OUTPUT, content)
 
     def lease(self, *, force: bool = False, timeout: float = 1.0) -> AsyncLease:
-        """Hold the lease until the context ends: only this user's goals and commands move the robot.
+        """Hold the lease until the context ends; meanwhile only this user's goals and commands move the robot.
 
-        A background task renews the lease, whatever the rest of the program does. If the renewals cease for `timeout`
-        [s], or the context ends, the robot stops within its limits and the lease is released. With `force` the client
-        takes the lease over from its holder, if the user's role allows it. Entering raises RefusedError `leased` if
-        another user holds the lease. All users can still send stop, quick_stop and disable.
+        A background task renews the lease independently of the rest of the program. If no renewal arrives for `timeout`
+        [s], or if the context ends, the robot stops within its limits and the lease is released. With `force`, the
+        client takes the lease over from another user, if this user's role allows a takeover. Entering the context
+        raises RefusedError `leased` if another user holds the lease. All users can still send stop, quick_stop and
+        disable.
 
         with robot.lease():  # of AsyncRobot: async with, and await
             robot.move_to(x=0.02, y=0.0, phi=0.0).wait()
@@ -537,18 +551,19 @@ class AsyncRobot:
         return AsyncLease(self.command, force=force, timeout=timeout)
 
     async def acquire(self, lease: AcquireLease | None = None) -> CommandReply:
-        """Acquire the lease, or renew it once; the context manager `lease` renews it automatically."""
+        """Acquire the lease, or renew it once. The context manager `lease` instead renews the lease automatically."""
         return await self.command(Command.ACQUIRE, lease)
 
     async def release(self) -> None:
-        """Release this user's lease, whichever client holds it; return when the robot is at rest."""
+        """Release this user's lease, even if another client of this user holds it; return when the robot is at rest."""
         await self.command(Command.RELEASE)
 
     async def command(self, name: str, content: CommandContent | bytes | None = None) -> CommandReply:
-        """Send a command by its name on the wire; return once the service confirms that it has carried the command out.
+        """Send a command by its name on the wire; return once the service has carried the command out.
 
-        `content` is an object of the command's content type in trirail.wire.vocabulary.Command, or its JSON. The client
-        sends commands that stop the robot to the service's stop port as well, which other connections cannot block.
+        `content` is an object of the content type that trirail.wire.vocabulary.Command specifies for the command, or
+        such an object encoded as JSON. The client also sends the commands that stop the robot to the service's stop
+        port, which other connections cannot block.
         """
         payload = content_message(name, content)
         if name in STOPS:
@@ -561,7 +576,7 @@ class AsyncRobot:
         return await self._connection.fetch(("info",), Info)
 
     async def role(self) -> Role | None:
-        """Return this user's role, or None without one.
+        """Return this user's role; None if the user has no role.
 
         If the service requires no certificates, every user is a maintainer.
         """
@@ -569,18 +584,18 @@ class AsyncRobot:
         return None if role is None else Role(role)
 
     async def users(self) -> list[str]:
-        """Return the names of the users who are connected to the robot, including this one."""
+        """Return the names of the users who are connected to the robot, including this user."""
         return await self._connection.users()
 
     async def poses(self) -> dict[str, NamedPose]:
-        """Return the named poses, both those of the configuration and taught ones."""
+        """Return the poses of the configuration and the taught poses, by name."""
         return {pose.name: pose for pose in (await self._connection.fetch(("poses",), NamedPoses)).poses}
 
     async def teach(self, name: str) -> NamedPose:
-        """Save the robot's measured pose under a name, with power or without; return the pose.
+        """Save the robot's measured pose under a name; return the pose. The drives may be enabled or disabled.
 
-        The service has written the pose to its disk when this returns. A taught pose with the same name is replaced.
-        Raises RefusedError if the robot moves, is in fault or has not been homed, and for names in [poses].
+        When the call returns, the service has written the pose to its disk. The pose replaces a taught pose of the same
+        name. Raises RefusedError if the robot moves, is in fault or has not been homed, or if the name is in [poses].
         """
         return await self._connection.fetch(("teach", self.user, check_new_pose(name)), NamedPose)
 
@@ -591,10 +606,10 @@ class AsyncRobot:
     # ------------------------------------------------------------------ states, events and records
 
     async def state(self, timeout: float = 2.0) -> State:
-        """Return the next published state; it is never older than the latest reply or event of this client.
+        """Return the next published state that is not older than the latest reply or event that this client received.
 
-        Raises ServiceError if no state arrives within `timeout` seconds.
-        `pose` is computed from the measured sliders; `commanded` is the setpoint of the drives. SI units and radians.
+        In the state, `pose` is computed from the measured slider positions, and `commanded` is the setpoint of the
+        drives, in SI units and radians. Raises ServiceError if no state arrives within `timeout` seconds.
         """
         async with aclosing(self.states(timeout)) as states:
             async for state in states:
@@ -603,21 +618,21 @@ class AsyncRobot:
         raise await self._connection.nobody("state")
 
     def states(self, timeout: float | None = None) -> AsyncGenerator[State]:
-        """Yield states as they arrive; a slow caller gets only the newest.
+        """Yield states as they arrive; skip all but the newest if the caller is slow.
 
         End after `timeout` seconds without a state.
         """
         return self._connection.states(seconds(timeout))
 
     def events(self, history: bool = False, timeout: float | None = None) -> AsyncGenerator[Event]:
-        """Yield each event once, in order; `history` yields past ones first.
+        """Yield each event once, in order; with `history`, begin with the past events.
 
         End after `timeout` seconds without an event.
         """
         return self._connection.events(history, seconds(timeout))
 
     def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
-        """Deliver every batch of records as it arrives, until the context ends; wire.records.unpack decodes a batch.
+        """Pass every batch of records to `deliver` until the context ends; trirail.wire.records.unpack decodes a batch.
 
         The event loop calls `deliver`, which must return quickly.
         """

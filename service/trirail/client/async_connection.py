@@ -1,4 +1,4 @@
-"""Connection for asyncio: Zenoh's own threads pass each message to the event loop, and calls need no threads."""
+"""Connection for asyncio. Zenoh's threads pass each message to the event loop, so calls need no other threads."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class AsyncConnection:
         before: Sequence[bytes] = (),
         copy: str | None = None,
     ) -> T:
-        """Query the key made of `parts` and decode the first valid reply as a message of `kind`.
+        """Query the key made of `parts`; return the first valid reply, decoded as a message of `kind`.
 
-        `before` are parts of the message that are sent before the last one; each of them gets a reply as well. `copy`
-        is the id that the copies of a stop share.
+        `before` are earlier parts of a message that does not fit into one query; the client sends them first and
+        ignores the replies to them. `copy` is the id that the copies of a stop share.
 
-        Raises RefusedError if the service refuses, and ServiceError if no reply arrives in time, because the service is
-        absent or the user's role does not allow the query.
+        Raises RefusedError if the service refuses the query, or if no reply arrives because the user's role does not
+        allow the query. Raises ServiceError if no valid reply arrives in time.
         """
         unreadable: ServiceError | None = None
         for part in before:
@@ -73,7 +73,7 @@ class AsyncConnection:
             return sorted({str(reply.ok.key_expr).rpartition("/")[2] async for reply in here if reply.ok is not None})
 
     async def stop(self, user: str, name: str, content: bytes | None, within: float) -> CommandReply:
-        """Request a stop, quick_stop or disable, over Zenoh and at the stop port; return the first reply.
+        """Send a stop, quick_stop or disable both over Zenoh and to the stop port; return the first reply.
 
         Raises the same errors as `fetch`.
         """
@@ -90,7 +90,10 @@ class AsyncConnection:
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
-        """Query the key made of `parts`, and deliver the outcome in the event loop; see Connection.post."""
+        """Query the key made of `parts` without waiting; pass the reply or the error to `deliver` in the event loop.
+
+        See Connection.post.
+        """
         self._connection.post(parts, kind, payload, self._in_loop(deliver))
 
     def query_unanswered(self, parts: tuple[str, ...], payload: bytes | None) -> None:
@@ -98,7 +101,10 @@ class AsyncConnection:
         self._connection.query_unanswered(parts, payload)
 
     async def nobody(self, *parts: str) -> ServiceError | RefusedError:
-        """Return the error to raise if there is no reply on the key made of `parts`."""
+        """Return the error to raise if no reply arrived on the key made of `parts`.
+
+        The method queries the user's role, since the role may be the reason.
+        """
         reply = None
         if user := self._connection.to_be_asked_for_role(*parts):
             with contextlib.suppress(ServiceError, RefusedError):
@@ -106,7 +112,7 @@ class AsyncConnection:
         return self._connection.why_nobody(parts, reply)
 
     async def states(self, timeout: float | None) -> AsyncGenerator[State]:
-        """Yield states as they arrive; a slow caller gets only the newest.
+        """Yield states as they arrive; skip all but the newest if the caller is slow.
 
         End after `timeout` seconds without a state.
         """
@@ -122,7 +128,7 @@ class AsyncConnection:
                 yield state
 
     async def events(self, history: bool, timeout: float | None) -> AsyncGenerator[Event]:
-        """Yield each event once, in order; `history` yields past ones first.
+        """Yield each event once, in order; with `history`, begin with the past events.
 
         End after `timeout` seconds without an event.
         """
@@ -132,21 +138,24 @@ class AsyncConnection:
                 yield event
 
     def overtaken(self, state: State) -> bool:
-        """Return whether a state is older than this client's newest reply or event."""
+        """Return True if a state is older than the newest reply or event that this client received."""
         return self._connection.overtaken(state)
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AbstractContextManager[Any]:
-        """Deliver every event in the event loop; `history` delivers past events as well."""
+        """Pass every event to `deliver` in the event loop; with `history`, begin with the past events."""
         return self._connection.subscribe_to_events(self._in_loop(deliver), history=history)
 
     def records(self, deliver: Callable[[bytes], None]) -> AbstractContextManager[Any]:
-        """Deliver every batch of records in the event loop, until the subscriber's context ends."""
+        """Pass every batch of records to `deliver` in the event loop, until the subscriber's context ends."""
         return self._connection.records(self._in_loop(deliver))
 
     async def _replies(
         self, get_of: Callable[[zenoh.Session], Callable[..., object]], **query: Any
     ) -> AsyncGenerator[zenoh.Reply]:
-        """Yield the replies to a query sent with a `get` of the session; closing the generator cancels the query."""
+        """Send a query and yield the replies; closing the generator cancels the query.
+
+        `get_of` returns the method of the session that sends the query.
+        """
         replies: asyncio.Queue[zenoh.Reply | None] = asyncio.Queue()
         left = zenoh.CancellationToken()
         over = self._in_loop(lambda: replies.put_nowait(None))
@@ -160,10 +169,10 @@ class AsyncConnection:
             left.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 
     def _in_loop(self, deliver: Callable[..., None]) -> Callable[..., None]:
-        """Return a callback for Zenoh's threads that delivers in the event loop."""
+        """Return a callback for Zenoh's threads that calls `deliver` in the event loop."""
 
         def deliver_in_loop(*what: object) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed, so nothing can receive it
+            with contextlib.suppress(RuntimeError):  # the loop is closed, so there is no receiver
                 self._loop.call_soon_threadsafe(deliver, *what)
 
         return deliver_in_loop

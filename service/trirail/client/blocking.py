@@ -1,4 +1,4 @@
-"""Event loop in its own thread, and blocking goals, jogs, leases and tracks for other threads."""
+"""Event loop in a separate thread, and blocking handles of goals, jogs, leases and tracks for other threads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Held = TypeVar("Held", bound=AsyncJog | AsyncLease | AsyncTrack)
 
 
 class LoopThread:
-    """Event loop in its own thread that runs coroutines for other threads."""
+    """Separate thread with an event loop that runs coroutines for other threads."""
 
     def __init__(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -35,7 +35,7 @@ class LoopThread:
         self._thread.start()
 
     def call(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine and return its result; an interrupt of the waiting thread, such as Ctrl-C, cancels it.
+        """Run a coroutine and return its result. An exception in the waiting thread, such as Ctrl-C, cancels it.
 
         Raises ServiceError if the loop is closed before the coroutine ends.
         """
@@ -99,13 +99,13 @@ class GoalHandle:
     def __init__(
         self, goal: AsyncGoalHandle, loop: LoopThread, command: Callable[[str, CommandContent], object]
     ) -> None:
-        """Set `command`, which sends a command with its content: Robot.command."""
+        """Create the handle; `command` is a function that sends a command with its content, such as Robot.command."""
         self._goal = goal
         self._loop = loop
         self._command = command
 
     def __repr__(self) -> str:
-        """Return class, id and, once there is one, the outcome."""
+        """Return the class name and id, and the outcome once the goal has ended."""
         return repr(self._goal).replace(type(self._goal).__name__, type(self).__name__, 1)
 
     @property
@@ -130,19 +130,19 @@ class GoalHandle:
 
     @property
     def expected(self) -> str:
-        """Expected duration, for people."""
+        """Expected duration as text, for people."""
         return self._goal.expected
 
     def cancel(self) -> None:
-        """Stop this goal, whether it is running or queued; return when the robot is at rest or the goal has ended.
+        """Stop this goal, running or queued; return when the robot is at rest or the goal has ended.
 
-        Other goals continue, except those that wait for this one. Raises RefusedError (`no_goal`) if the goal has
-        ended, and ServiceError if the service does not answer.
+        Other goals continue, except goals that wait for this goal. Raises RefusedError (`no_goal`) if the goal has
+        already ended, and ServiceError if the service does not answer.
         """
         self._command(Command.STOP, Stop(self.id))
 
     def wait(self, timeout: float | None = None) -> Result:
-        """Wait until the goal ends; return its result, whose `outcome` tells success from failure.
+        """Wait until the goal ends; return its result. The `outcome` of the result is "done" if the goal succeeded.
 
         Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
         """
@@ -151,7 +151,7 @@ class GoalHandle:
 
 
 class Blocking(Generic[Held]):
-    """Blocking wrapper with which other threads can enter and leave a context manager of the event loop."""
+    """Wrapper with which other threads enter and leave a context manager of the event loop; both calls block."""
 
     def __init__(self, held: Held, loop: LoopThread) -> None:
         self._held = held
@@ -166,19 +166,19 @@ class Blocking(Generic[Held]):
 
 
 class Jog(Blocking[AsyncJog]):
-    """Jog at a velocity while the context lasts; `result` is available afterwards.
+    """Context manager that moves the robot at a velocity; `result` is available after the context ends.
 
-    The client renews the jog three times per time-out, which counts real time at every override: if the program hangs
-    or dies, the robot brakes. A jog that was paused or has timed out has ended; begin a new one. Leaving the context
-    brakes immediately and waits until the robot is at rest.
+    The client renews the jog three times per time-out. The time-out counts real time whatever the override is, so the
+    robot brakes if the program hangs or dies. A pause or a time-out ends a jog; begin a new jog afterwards. Leaving the
+    context makes the robot brake immediately, and waits until the robot is at rest.
 
-    Raises RefusedError on entering if the service refuses the jog, and TimeoutError on leaving if the service does not
-    report the jog's end.
+    Entering the context raises RefusedError if the service refuses the jog. Leaving the context raises TimeoutError if
+    the service does not report the jog's end.
     """
 
     @property
     def reply(self) -> GoalReply | None:
-        """Latest reply of the service, with `slowed` for one; None before the first."""
+        """Latest reply of the service, which may contain `slowed`; None before the first reply."""
         return self._held.reply
 
     @property
@@ -188,18 +188,18 @@ class Jog(Blocking[AsyncJog]):
 
     @property
     def error(self) -> Exception | None:
-        """Error of the last renewal, if it failed."""
+        """Error of the last renewal; None if the renewal succeeded."""
         return self._held.error
 
 
 class Lease(Blocking[AsyncLease]):
-    """Lease held while the context lasts; `lost` is the error if it was taken over, released or timed out earlier.
+    """Context manager that holds the lease; `lost` is the error if the lease ends before the context does.
 
-    Entering returns when the motions of other users have stopped. If the program hangs or dies, the lease is not
-    renewed; the robot then stops and the lease is released. Leaving releases the lease, and returns when the robot is
-    at rest.
+    A lease ends early if it is taken over, released or timed out. Entering the context waits until the motions of other
+    users have stopped. If the program hangs or dies, the lease is not renewed; the robot then stops and the lease is
+    released. Leaving the context releases the lease, and waits until the robot is at rest.
 
-    Raises RefusedError on entering if another client holds the lease.
+    Entering the context raises RefusedError if another client holds the lease.
     """
 
     @property
@@ -208,18 +208,19 @@ class Lease(Blocking[AsyncLease]):
         return self._held.lost
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the lease is lost, for at most `timeout` seconds; return whether it is."""
+        """Wait at most `timeout` seconds for the lease to end. Return True if it has ended."""
         return self._loop.call(self._held.wait(timeout))
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(ServiceError):  # the connection is closed, so the wait ends with its time-out
+        with contextlib.suppress(ServiceError):  # the connection is closed, so the lease ends after its time-out
             super().__exit__()
 
 
 class Track(Blocking[AsyncTrack]):
-    """Sender of a target's pose, 10 to 200 times a second; the robot follows the target.
+    """Context manager in which the robot follows a moving target; the program calls `update` 10 to 200 times a second.
 
-    Only `update` sends messages. If its calls cease for any reason, the robot brakes on its path after the time-out.
+    Only `update` sends messages. If the program stops calling `update` for any reason, the robot brakes on its path
+    after the time-out.
     """
 
     @property
@@ -229,7 +230,7 @@ class Track(Blocking[AsyncTrack]):
 
     @property
     def lag(self) -> float | None:
-        """Greatest distance between a point of the platform and its place at the target, in the latest reply [m]."""
+        """Greatest distance of a point of the platform from its place at the target [m], from the latest reply."""
         return self._held.lag
 
     @property
@@ -242,14 +243,15 @@ class Track(Blocking[AsyncTrack]):
     ) -> None:
         """Send the target's pose x, y [m], phi [rad] and its velocity [m/s, m/s, rad/s] at a time.
 
-        `time` is wall-clock time [s since 1970] and defaults to now; the clocks must agree if the service runs on
-        another machine. The robot keeps the velocity until the next call. The first call returns when the service
-        accepts the track. Later calls return immediately, so the next call raises an earlier refusal. Raises
-        RefusedError, also if the track has ended because of a stop, a pause, another goal or a time-out, and
-        ServiceError if the service does not answer.
+        `time` is wall-clock time [s since 1970] and defaults to now. If the service runs on another machine, the clocks
+        of the two machines must agree. Until the next call, the service assumes that the target moves at this velocity.
+
+        The first call returns when the service accepts the track. Later calls return immediately, and the error of such
+        a call is raised by the call after it. Raises RefusedError if the service refuses an update, or if a stop, a
+        pause, another goal or a time-out has ended the track. Raises ServiceError if the service does not answer.
         """
         self._loop.call(self._held.update(pose, velocity, time))
 
     def close(self) -> None:
-        """Brake on the path if the robot still follows; return when it is at rest."""
+        """Brake on the path if the robot still follows the target; return when the robot is at rest."""
         self._loop.call(self._held.close())

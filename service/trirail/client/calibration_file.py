@@ -1,4 +1,4 @@
-"""File of a camera calibration, in JSON: version, date, robot, and the looks from which it was computed."""
+"""Reading and writing of camera calibration files in JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VERSION: Literal[1] = 1
 
 
 class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of the file."""
+    """Content of a camera calibration file."""
 
     version: Literal[1]
     robot: str
@@ -27,12 +27,12 @@ class CalibrationFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Time of the calibration, with its time zone."""
     calibration: CameraCalibration
     targets: dict[str, Pair] = {}
-    """Targets of the marks [pixel]: their pixels at the calibration's first look, until others are taught."""
+    """Targets of the marks [pixel]; before targets are taught, the marks' pixels at the calibration's first look."""
     geometry: str = ""
-    """Checksum of the [geometry] of the calibration; "" where an earlier version did not note it."""
+    """Checksum of the robot's [geometry] during the calibration; "" if an earlier version wrote the file without it."""
 
     def is_of_geometry(self, geometry: str) -> bool:
-        """True unless the calibration was made with another geometry."""
+        """Return True if the calibration was made with this geometry, or if the file does not contain the geometry."""
         return self.geometry in ("", geometry)
 
 
@@ -47,7 +47,10 @@ def write(
     made: datetime | None = None,
     geometry: str = "",
 ) -> None:
-    """Write the file atomically, so that a power cut leaves the old or the new one. Raises FileError."""
+    """Write a calibration file atomically: after a power cut, the file has its old or its new content.
+
+    Raises FileError.
+    """
     content = CalibrationFile(VERSION, robot, made or datetime.now(UTC), calibration, dict(targets), geometry)
     try:
         files.replace(path, msgspec.json.format(msgspec.json.encode(content)) + b"\n")
@@ -56,9 +59,9 @@ def write(
 
 
 def keep_old(path: Path) -> Path | None:
-    """Save a copy of an existing file as NAME.old, for the taught targets; return its path. Raises FileError.
+    """Copy a calibration file to NAME.old to preserve the taught targets; return the path of the copy.
 
-    Return None if there is no file.
+    Return None if there is no file. Raises FileError.
     """
     if not path.exists():
         return None
@@ -70,7 +73,7 @@ def keep_old(path: Path) -> Path | None:
 
 
 def read(path: Path) -> CalibrationFile:
-    """Read the file. Raises FileError with the file, the field and the expected value."""
+    """Read a calibration file. Raises FileError that names the file, the field and the expected value."""
     if not path.exists():
         raise FileError(f"{path}: no such file; trirail align calibrate makes it")
     text = files.text(path)

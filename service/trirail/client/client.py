@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # numpy, which most programs do not need
 __all__ = ["GoalHandle", "Jog", "Lease", "Result", "Robot", "Track"]
 
 SEEN_WITHIN = 1.0
-"""Time-out for the state that the text form of a Robot shows [s]."""
+"""Time-out for receiving the state that `repr(robot)` shows [s]."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -56,9 +56,9 @@ def _call(
 def _stop(
     method: Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot that runs a stop of AsyncRobot and waits for its result.
+    """Return the method of Robot that runs a stop method of AsyncRobot and waits for its result.
 
-    The stop has its own event loop, so calls that wait for a congested link do not delay it.
+    Stops run in a separate event loop, so calls that wait for a congested link do not delay a stop.
     """
 
     @functools.wraps(method)
@@ -71,7 +71,7 @@ def _stop(
 def _command(
     method: Callable[[AsyncRobot, str, CommandContent | bytes | None], Coroutine[Any, Any, CommandReply]],
 ) -> Callable[..., CommandReply]:
-    """Return the method of Robot that sends a command by name; commands that stop the robot use `_stop`."""
+    """Return the method of Robot that sends a command by name, in the separate event loop if it stops the robot."""
     send, stop = _call(method), _stop(method)
 
     @functools.wraps(method)
@@ -96,7 +96,7 @@ def _goal(
 def _context(
     method: Callable[Concatenate[AsyncRobot, P], Held], kind: Callable[[Held, LoopThread], T]
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot that wraps a context manager of AsyncRobot as a `kind`."""
+    """Return the method of Robot that wraps a context manager of AsyncRobot in an object of class `kind`."""
 
     @functools.wraps(method)
     def hold(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -120,7 +120,7 @@ def _iterator(
 def _conversation(
     method: Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[Robot, P], T]:
-    """Return the method of Robot for a procedure of AsyncRobot; the caller's thread takes the pictures."""
+    """Return the method of Robot that runs an alignment procedure of AsyncRobot in the caller's thread."""
 
     @functools.wraps(method)
     def converse(robot: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -139,13 +139,15 @@ def _returning(method: Callable[P, T], kind: object) -> Callable[P, T]:
 
 
 class Robot:
-    """A connection to one robot's service; several threads may share it.
+    """Connection to one robot's service; several threads may share a connection.
 
-    `name` is the name in the robot's configuration, and `connect` is the Zenoh locator of its service or of a router.
-    They default to TRIRAIL_ROBOT and TRIRAIL_CONNECT, or else to the robot demo on this machine. `user` sends the goals
-    and commands, and defaults to the login name. For a locator tls/HOST:PORT, the folder `tls` must contain ca.pem,
-    cert.pem and key.pem; it defaults to TRIRAIL_TLS or else to ~/.config/trirail/<name>. The user is then the name in
-    the certificate, and a RefusedError `not_allowed` names the role that the call requires.
+    `name` is the name in the robot's configuration, and `connect` is the Zenoh locator of the service or of a router.
+    The defaults are the environment variables TRIRAIL_ROBOT and TRIRAIL_CONNECT, or else the robot demo on this
+    machine. `user` is the name of the user who sends the goals and commands, and defaults to the login name.
+
+    For a locator tls/HOST:PORT, the folder `tls` must contain ca.pem, cert.pem and key.pem. The folder defaults to the
+    environment variable TRIRAIL_TLS, or else to ~/.config/trirail/<name>. The user is then the name in the certificate,
+    and a RefusedError `not_allowed` names the role that the call requires.
 
     A pose is x, y [m] of the platform's centre in the base frame and the platform's angle phi [rad], counterclockwise.
     Every call raises ServiceError if the service does not answer. If the service refuses the call, nothing moves, and
@@ -164,8 +166,8 @@ class Robot:
         self._connection = self._robot._connected()
         self._loop = LoopThread()
         self._loop.call(self._robot._use(self._connection))
-        # A call that waits for a congested link blocks its event loop's thread. Stops have a second loop, so that such
-        # a call cannot delay them.
+        # A call that waits for a congested link blocks the thread of its event loop. Stops run in a second event loop,
+        # so that a blocked call cannot delay a stop.
         self._stop_loop = LoopThread()
         self._stopping = self._stop_loop.call(self._robot._twin(self._connection))
 
@@ -202,7 +204,10 @@ class Robot:
         self._stop_loop.close()
 
     async def _for_running_loop(self) -> AsyncRobot:
-        """Return a robot for the running event loop; it shares this connection until either of the two is closed."""
+        """Return a robot for the running event loop that shares this robot's connection.
+
+        The returned robot works until either of the two robots is closed.
+        """
         return await self._robot._shared(self._connection)
 
     @property
@@ -260,16 +265,16 @@ class Robot:
         """Send a timed trajectory that begins at the robot's pose; return once the service accepts it.
 
         With `go_there`, the robot first moves to the first point, with a goal like that of move_to. The call waits for
-        the end of this goal, and raises RefusedError `wrong_start` if its outcome is not done.
+        the end of this goal, and raises RefusedError `wrong_start` if the outcome of this goal is not done.
 
         A point consists of t [s], x, y [m] and phi [rad], and optionally of the velocity and acceleration of x, y and
         phi. `points` may be rows of t, x, y and phi, such as an array (N, 4), or the path of a CSV or JSON file.
-        Quintic polynomials join the points. A missing velocity is the mean velocity between the neighbouring points,
-        and zero at both ends. The service refuses a trajectory that is too fast for a slider; with `stretch`, it slows
-        the whole trajectory down instead. With `settle` False, the goal is done when its path ends, even if the robot
-        is not yet measured to be in position.
+        Quintic polynomials join the points. If a point has no velocity, the client uses the mean velocity between the
+        neighbouring points, and zero at both ends. The service refuses a trajectory that is too fast for a slider; with
+        `stretch`, the service instead slows the whole trajectory down. With `settle` False, the goal is done when its
+        path ends, even if the measured position has not yet reached the target.
         """
-        points = points_of(points)  # in the caller's thread: the caller's iterator may itself call this robot
+        points = points_of(points)  # in the caller's thread, since the caller's iterator may call this robot
         how: dict[str, Any] = {
             "stretch": stretch,
             "settle": settle,
@@ -286,9 +291,9 @@ class Robot:
     events = _iterator(AsyncRobot.events)
 
     def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
-        """Deliver every batch of records as it arrives, until the context ends; wire.records.unpack decodes a batch.
+        """Pass every batch of records to `deliver` until the context ends; trirail.wire.records.unpack decodes a batch.
 
-        The connection's own thread calls `deliver`, which must return quickly.
+        A thread of the connection calls `deliver`, which must return quickly.
         """
         return self._connection.records(deliver)
 

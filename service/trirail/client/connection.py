@@ -1,4 +1,4 @@
-"""Zenoh session of one client of one robot: queries to the service, and callbacks for its publications."""
+"""Zenoh session of a client to the service of one robot, with queries and subscriptions."""
 
 from __future__ import annotations
 
@@ -34,24 +34,25 @@ POST_WITHIN = 2.0
 """Time-out of the reply to a posted query [s]."""
 CLOSED = "the connection is closed: open a new one, as Robot(…)"
 ZENOHS_TIMEOUT = b"Timeout"
-"""Reply with which Zenoh itself ends a query after its time-out."""
+"""Content of the error reply with which Zenoh ends a query after the query's time-out."""
 MAX_OVERTAKEN_S = 1.0
-"""Longest delay of a state behind the reply or event that overtook it [s].
+"""Time after a reply or event during which the client discards older states [s].
 
-After this time the client accepts the states of a restarted service, which counts from one again."""
+Afterwards the client accepts every state, since a restarted service counts its states from one again."""
 
 T = TypeVar("T", bound=msgspec.Struct)
 Message = TypeVar("Message")
 
 
 class SilenceError(ServiceError):
-    """Error of a query without an answer."""
+    """Error raised if a query gets no reply."""
 
 
 class Connection:
-    """Session to a robot's service at a Zenoh locator. Others can see the user, if given, while the session is open.
+    """Session to a robot's service at a Zenoh locator.
 
-    Raises ServiceError if the locator cannot be reached.
+    If `user` is given, all clients see this user among the connected users while the session is open. Raises
+    ServiceError if the locator cannot be reached.
     """
 
     def __init__(
@@ -61,7 +62,8 @@ class Connection:
         self._connect = connect
         self._credentials = credentials
         self._opened = zenoh_session.open_client(connect, credentials)
-        # Also at the end of a program that does not close it: Zenoh's threads must not outlive the interpreter.
+        # A finalizer also closes the session at the end of a program that does not call `close`. Zenoh's threads must
+        # not outlive the interpreter.
         self.close = weakref.finalize(self, zenoh_session.close, self._opened)
         """End the session; calls after the first do nothing."""
         self._reader = SampleReader()
@@ -82,9 +84,9 @@ class Connection:
             session.get(**self.query(parts, payload, REPLY_WITHIN), handler=handler)
 
     def query(self, parts: tuple[str, ...], payload: bytes | None, within: float) -> dict[str, Any]:
-        """Return the arguments of a session's `get` for a query of the key made of `parts`.
+        """Return the arguments of zenoh.Session.get for a query of the key made of `parts`.
 
-        A reply has the quality of service of its query: the reply to a droppable query would be droppable.
+        Zenoh sends a reply with the quality of service of its query, so the reply to a droppable query may be dropped.
         """
         boundary.check_size(len(payload or b""))
         return {
@@ -92,14 +94,17 @@ class Connection:
             "payload": payload,
             "encoding": boundary.JSON if payload else None,
             "timeout": within,
-            "consolidation": zenoh.ConsolidationMode.NONE,  # deliver each reply without waiting for others
+            "consolidation": zenoh.ConsolidationMode.NONE,  # deliver each reply without waiting for further replies
             "congestion_control": zenoh.CongestionControl.BLOCK,
             "priority": zenoh.Priority.REAL_TIME,
             "express": True,
         }
 
     def read(self, reply: zenoh.Reply, kind: type[T]) -> T | ServiceError:
-        """Return the message in a reply, or a ServiceError if it contains none. Raises RefusedError for a refusal."""
+        """Return the message in a reply; a ServiceError if the reply contains no valid message.
+
+        Raises RefusedError if the service refused the query.
+        """
         if reply.ok is not None:
             try:
                 answer: T = boundary.decode(reply.ok.payload.to_bytes(), kind, "it cannot be read")
@@ -119,7 +124,10 @@ class Connection:
 
     @contextlib.contextmanager
     def copies(self, stop: StopOrder, deliver: Callable[[Outcome], None]) -> Iterator[Outcomes]:
-        """Send all copies of a stop, and deliver the outcome of each, from any thread, until the context ends."""
+        """Send a stop over Zenoh and, if there is one, to the stop port; pass the outcome of each copy to `deliver`.
+
+        Any thread may call `deliver`, until the context ends. Yield the collector of the outcomes.
+        """
         at_door = stop.at_door(self._connect, self._credentials, lambda outcome: deliver(self._note_sequence(outcome)))
         try:
             query = self.query(stop.parts, stop.content, stop.within) | {"attachment": stop.id}
@@ -132,9 +140,9 @@ class Connection:
     def post(
         self, parts: tuple[str, ...], kind: type[T], payload: bytes, deliver: Callable[[T | TrirailError], None]
     ) -> None:
-        """Query the key made of `parts` without waiting; `deliver` receives a message of `kind` or the error.
+        """Query the key made of `parts` without waiting; pass a message of `kind` or the error to `deliver`.
 
-        A thread of the connection calls `deliver` once; it must return quickly.
+        A thread of the connection calls `deliver` once; `deliver` must return quickly.
         """
         query = self.query(parts, payload, POST_WITHIN) | {"congestion_control": zenoh.CongestionControl.DROP}
         self._post(query, kind, deliver)
@@ -157,15 +165,18 @@ class Connection:
             session.get(**query, handler=handler)
 
     def to_be_asked_for_role(self, *parts: str) -> str | None:
-        """Return the user whose role may explain a missing reply on the key made of `parts`; None if there is none."""
+        """Return the user to whom the role may not allow a query of the key made of `parts`, which got no reply.
+
+        Return None if the connection has no credentials, or if the query was itself for a role.
+        """
         user = self._credentials.name if self._credentials is not None else ""
         return user if is_name(user) and parts[0] != "role" else None
 
     def why_nobody(self, parts: tuple[str, ...], reply: RoleReply | None) -> ServiceError | RefusedError:
-        """Return the error to raise for a missing reply, given the reply to the query for the user's role.
+        """Return the error to raise for a query without a reply. `reply` is the reply to the query for the user's role.
 
-        Zenoh silently drops queries that a role does not allow, as it drops those without a receiver. Every certificate
-        may query its role; whether a reply arrives within ROLE_WITHIN distinguishes the two cases.
+        Zenoh silently drops queries that a role does not allow, and also queries without a receiver. Every certificate
+        may query its own role, so a reply to this query within ROLE_WITHIN shows that the receiver exists.
         """
         return (reply and self._denied(parts, reply.user, reply.role)) or ServiceError(
             self._no_answer_message(
@@ -174,13 +185,13 @@ class Connection:
         )
 
     def _no_answer_message(self, why: str) -> str:
-        """Return the message of a query without an answer."""
+        """Return the error message for a query without a reply; `why` is the supposed reason."""
         if is_starting(self._connect):
             why = "the service there is starting; try again when it says that it is up"
         return f"no robot {self.robot!r} answers at {self._connect}: {why}"
 
     def _denied(self, parts: tuple[str, ...], user: str, role: str | None) -> RefusedError | None:
-        """Return the refusal if the user's role does not allow the key made of `parts`, else None."""
+        """Return the error to raise if the user's role does not allow the key made of `parts`; None if it does."""
         needed = least_role(*parts)
         if role is None:
             problem = f"{user} has no role at {self.robot}: [zenoh.users] does not list this user, or it is revoked"
@@ -193,16 +204,16 @@ class Connection:
     # ------------------------------------------------------------------ subscriptions
 
     def overtaken(self, state: State) -> bool:
-        """Return whether a state is older than this client's newest reply or event."""
+        """Return True if a state is older than the newest reply or event that this client received."""
         return state.seq < self._known[0] and not self._known_is_old()
 
     def subscribe_to_states(self, deliver: Callable[[State], None]) -> zenoh.Subscriber[None]:
-        """Deliver every state, until the subscriber's context ends."""
+        """Pass every state to `deliver`, until the subscriber's context ends."""
         with self.open_session() as session:
             return session.declare_subscriber(self.key("state"), self._reader.messages(State, deliver))
 
     def subscribe_to_events(self, deliver: Callable[[Event], None], *, history: bool) -> AdvancedSubscriber[Any]:
-        """Deliver every event, including those of a restarted gateway; `history` delivers past events as well."""
+        """Pass every event to `deliver`, even if the gateway restarts; with `history`, begin with the past events."""
         with self.open_session() as session:
             return declare_advanced_subscriber(
                 session,
@@ -213,17 +224,17 @@ class Connection:
             )
 
     def records(self, deliver: Callable[[bytes], None]) -> zenoh.Subscriber[None]:
-        """Deliver every batch of records, until the subscriber's context ends."""
+        """Pass every batch of records to `deliver`, until the subscriber's context ends."""
         with self.open_session() as session:
             return session.declare_subscriber(self.key("records"), self._reader.batches(deliver))
 
     def key(self, *parts: str) -> str:
-        """Return the robot's key of these parts."""
+        """Return the robot's key made of `parts`."""
         return zenoh_session.key(self.robot, *parts)
 
     @contextlib.contextmanager
     def open_session(self) -> Iterator[zenoh.Session]:
-        """Yield the Zenoh session. Raises ServiceError once it is closed, also if that happens within the context."""
+        """Yield the Zenoh session. Raises ServiceError if the session is closed, before or within the context."""
         if not self.close.alive:
             raise ServiceError(CLOSED)
         try:
@@ -234,7 +245,7 @@ class Connection:
             raise ServiceError(CLOSED) from error
 
     def _note_sequence(self, message: Message) -> Message:
-        """Record the first state that reflects a message of the service; return the message."""
+        """Store the number of the first state that can show a reply's effect or an event; return the message."""
         seq = message.seq if isinstance(message, CommandReply) else message.cycle if isinstance(message, Event) else 0
         if seq and (seq > self._known[0] or self._known_is_old()):
             self._known = seq, time.monotonic()
@@ -245,13 +256,13 @@ class Connection:
 
 
 def _ignore(_reply: zenoh.Reply) -> None:
-    """Discard a reply that is not needed."""
+    """Discard a reply."""
 
 
 def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
-    """Return a receiver of events that delivers each once, in order, even if some are repeated.
+    """Return a callback that passes each new event to `deliver`, and ignores repeated events.
 
-    A restarted gateway repeats past events; a restarted service counts from one.
+    A restarted gateway repeats past events. A restarted service numbers events from one again, with later times.
     """
     last = 0, 0.0
 
@@ -265,7 +276,10 @@ def once(deliver: Callable[[Event], object]) -> Callable[[Event], None]:
 
 
 def robots_at(connect: str) -> list[str]:
-    """Return the names of the robots that answer at a Zenoh locator. Raises ServiceError if it cannot be reached."""
+    """Return the names of the robots that answer at a Zenoh locator.
+
+    Raises ServiceError if the locator cannot be reached.
+    """
     session = zenoh_session.open_client(connect)
     try:
         alive = session.liveliness().get(zenoh_session.key("*", "alive"), timeout=1.0)
@@ -275,7 +289,7 @@ def robots_at(connect: str) -> list[str]:
 
 
 def refusal(payload: bytes) -> RefusedError | ServiceError:
-    """Return the error to raise for an error reply; ServiceError if it is not a reply of the service."""
+    """Return the error to raise for an error reply; a ServiceError if the reply is not an ErrorReply of the service."""
     try:
         error: ErrorReply = boundary.decode(payload, ErrorReply, "not an error reply")
     except RefusedError:

@@ -1,4 +1,4 @@
-"""Fleet: all robots visible to a user at a locator, usually a router, with their newest summaries."""
+"""Fleet: all robots that a user can see at a locator, usually that of a router, with their newest summaries."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from trirail.wire.state import RobotSummary
 from trirail.wire.vocabulary import Mode
 
 MAX_SILENCE_S: Final = 3.0
-"""Age of a robot's newest data at which the robot counts as silent [s]; a summary arrives once a second.
+"""Age of a robot's newest data above which the robot counts as silent [s]; each robot sends a summary once a second.
 
 Zenoh's liveliness tokens are not used, since they outlive a killed process."""
 
 
 class Attention(IntEnum):
-    """Urgency with which a robot needs attention, in falling order."""
+    """Reason why a robot needs attention, with the most urgent reason first."""
 
     SILENT = 0
     FAULT = 1
@@ -32,7 +32,7 @@ class Attention(IntEnum):
 
 
 class Member(NamedTuple):
-    """Robot of the fleet."""
+    """Robot of the fleet with its newest summary."""
 
     robot: str
     summary: RobotSummary
@@ -44,7 +44,7 @@ class Member(NamedTuple):
         return now - self.heard + self.summary.age
 
     def need(self, now: float) -> Attention:
-        """Return the robot's need for attention."""
+        """Return the reason why the robot needs attention."""
         if self.age(now) > MAX_SILENCE_S:
             return Attention.SILENT
         return Attention.FAULT if self.summary.mode == Mode.FAULT else Attention.NOTHING
@@ -74,7 +74,7 @@ class Fleet:
         zenoh_session.close(self._session)
 
     def members(self) -> list[Member]:
-        """Return the robots with a summary, sorted by need for attention, then by name."""
+        """Return the robots that have sent a summary, sorted by the urgency of attention, then by name."""
         now = self._clock()
         with self._lock:
             return sorted(self._members.values(), key=lambda member: (member.need(now), member.robot))
@@ -83,7 +83,7 @@ class Fleet:
         _, robot, *_ = str(sample.key_expr).split("/")
         try:
             summary = boundary.decode(sample.payload.to_bytes(), RobotSummary, "not a summary", str(sample.encoding))
-        except RefusedError:  # only the robot should publish there; ignore anything but summaries
+        except RefusedError:  # not a summary; only robots should publish on this key
             return
         with self._lock:
             self._members[robot] = Member(robot, summary, self._clock())

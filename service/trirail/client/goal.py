@@ -1,4 +1,4 @@
-"""Handles of accepted goals, and jogs."""
+"""Handles and results of accepted goals, and asynchronous jogs."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from trirail.wire.messages import Event, GoalReply, Residual
 from trirail.wire.vocabulary import Command, Stop
 
 STANDS_WITHIN = 10.0
-"""Time that the end of a jog may take in addition to the jog's own time-out [s]."""
+"""Longest time from the time-out of a jog to the robot's rest [s]."""
 BRAKE_RENEWAL_S = 0.05
-"""Time-out of a jog's last renewal, which requests zero velocity [s]."""
+"""Time-out of the last renewal of a jog, which sets the velocity to zero [s]."""
 
 Velocity = tuple[float, float, float]
 """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
@@ -36,20 +36,20 @@ class Result(NamedTuple):
     message: str
     """Reason in one line, for people."""
     settle: float | None = None
-    """Time from the end of the path to the first cycle of the dwell in position, for a goal that is done [s]. This
-    field and the two below are None for goals that do not settle: a jog, a goal that blends into the next one, and a
-    trajectory with `settle` False."""
+    """Time from the end of the path to the first cycle of the dwell in position, for a goal that is done [s].
+
+    This field and the next two fields are None for goals that do not settle: a jog, a goal that blends into the next
+    goal, and a trajectory with `settle` False."""
     residual: Residual | None = None
-    """Distance from the target at the end of a goal that is done or unsettled: `sliders` [m], and `pose` [m, m, rad].
-    """
+    """Distance from the target at the end of a done or unsettled goal: `sliders` [m], and `pose` [m, m, rad]."""
     overshoot: tuple[float, float, float] | None = None
     """Greatest overshoot of the sliders A, B, C since the end of the path [m]."""
     marks: tuple[Switch, ...] = ()
-    """Output switches on the path, in the order in which they happened."""
+    """Switches of outputs on the path, in the order in which they happened."""
 
 
 def result_of(event: Event) -> Result | None:
-    """Return the result that an event reports; None if the event is not the end of a goal."""
+    """Return the result that an event reports; None if the event does not report the end of a goal."""
     if event.id is None or event.outcome is None:
         return None
     return Result(event.id, event.outcome, event.message, event.settle, event.residual, event.overshoot)
@@ -58,7 +58,7 @@ def result_of(event: Event) -> Result | None:
 class AsyncGoalHandle:
     """Handle of an accepted goal; discarding the handle does not stop the goal.
 
-    `command` sends a command with its content, as AsyncRobot.command does.
+    `command` is a function that sends a command with its content, such as AsyncRobot.command.
     """
 
     def __init__(self, goal_id: str, command: Callable[[Command, bytes], Awaitable[object]]) -> None:
@@ -70,7 +70,7 @@ class AsyncGoalHandle:
         self._ended = asyncio.Event()
 
     def __repr__(self) -> str:
-        """Return the class name and id, and the outcome once there is one."""
+        """Return the class name and id, and the outcome once the goal has ended."""
         outcome = f" {self._result.outcome}" if self._result is not None else ""
         return f"<{type(self).__name__} {self.id}{outcome}>"
 
@@ -90,15 +90,16 @@ class AsyncGoalHandle:
         return f"{self.duration:.2f} s" if self.duration is not None else "no expected end while the override is 0"
 
     async def cancel(self) -> None:
-        """Stop this goal, whether it is running or queued; return when the robot is at rest or the goal has ended.
+        """Stop this goal, running or queued; return when the robot is at rest or the goal has ended.
 
-        Other goals continue, except those that wait for this one. Cancelling a task that waits for the goal does not
-        stop it. Raises RefusedError (`no_goal`) if the goal has ended, and ServiceError if the service does not answer.
+        Other goals continue, except goals that wait for this goal. If you cancel only a task that waits for the goal,
+        the goal continues. Raises RefusedError (`no_goal`) if the goal has already ended, and ServiceError if the
+        service does not answer.
         """
         await self._command(Command.STOP, msgspec.json.encode(Stop(self.id)))
 
     async def wait(self, timeout: float | None = None) -> Result:
-        """Wait until the goal ends; return its result, whose `outcome` tells success from failure.
+        """Wait until the goal ends; return its result. The `outcome` of the result is "done" if the goal succeeded.
 
         Raises WaitTimeoutError, a TimeoutError, after `timeout` seconds; the goal itself continues.
         """
@@ -111,17 +112,17 @@ class AsyncGoalHandle:
         return self._result
 
     def end(self, result: Result) -> None:
-        """Set the result and wake the waiting tasks."""
+        """Set the result, and wake the tasks that wait for the goal."""
         self._result = result
         self._ended.set()
 
 
 class OpenGoals:
-    """Registry of the handles of goals that a client has sent and that have not ended.
+    """Registry of the handles of all goals that a client has sent and that have not ended.
 
-    Calls with the same id share a handle. These are the renewals of a jog, and goals that the service refuses because
-    their id is already in use. A refusal concerns only its own call, so a handle stays registered while another call
-    with its id is pending or accepted.
+    Calls with the same goal id share a handle. Such calls are the renewals of a jog, and goals that the service refuses
+    because their id is already in use. A refusal concerns only one call, so a handle stays registered while another
+    call with the same id is pending or accepted.
     """
 
     def __init__(self) -> None:
@@ -139,14 +140,14 @@ class OpenGoals:
         return self._handles.setdefault(handle.id, handle)
 
     def accept(self, handle: AsyncGoalHandle, reply: GoalReply) -> None:
-        """Keep the handle of an accepted goal until the goal ends."""
+        """Store the reply to an accepted goal; the handle remains registered until the goal ends."""
         handle.reply = reply
         self._end_call(handle.id)
         if self._handles.get(handle.id) is handle:  # otherwise the goal has already ended
             self._accepted.add(handle.id)
 
     def refuse(self, goal_id: str) -> bool:
-        """Unregister a call that was refused or not answered; return whether this also removed its handle."""
+        """Unregister a call that was refused or not answered. Return True if the handle was removed as well."""
         self._end_call(goal_id)
         if goal_id in self._accepted or goal_id in self._calls:
             return False
@@ -160,7 +161,7 @@ class OpenGoals:
             handle.end(result._replace(marks=tuple(self._switches.pop(result.id, ()))))
 
     def note_switches(self, switches: Iterable[Switch]) -> None:
-        """Add output switches to the results of their goals; ignore those of goals that are not registered."""
+        """Store output switches for the results of their goals; ignore switches of goals that are not registered."""
         for switch in switches:
             if switch.goal in self._handles:
                 self._switches.setdefault(switch.goal, []).append(switch)
@@ -172,9 +173,9 @@ class OpenGoals:
 
 
 class AsyncJog:
-    """Jog at a velocity while the context lasts; `result` is available afterwards.
+    """Context manager that moves the robot at a velocity; `result` is available after the context ends.
 
-    A task renews the jog three times per time-out; see trirail.client.blocking.Jog.
+    A task renews the jog three times per time-out. See trirail.client.blocking.Jog for the time-out and the errors.
 
     Parameters
     ----------
@@ -203,7 +204,7 @@ class AsyncJog:
         self._over = asyncio.Event()
         self._renewing: asyncio.Task[None] | None = None
         self.error: Exception | None = None
-        """Error of the last renewal, if that failed."""
+        """Error of the last renewal; None if the renewal succeeded or the jog ended at a limit."""
 
     @property
     def reply(self) -> GoalReply | None:

@@ -1,4 +1,4 @@
-"""Hold-to-run jog: it runs while the operator's key is held, and ends when key events cease."""
+"""Hold-to-run jog, which moves the robot while the operator holds a key and ends when no more key events arrive."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ TIMEOUT = 0.2
 """Time-out after which the service brakes a jog that is not renewed [s]."""
 
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Speeds that an operator can choose: shares of the platform's velocity limits."""
+"""Speeds that an operator can choose, as fractions of the platform's velocity limits."""
 USUAL = 3
-"""Index of the initial speed."""
+"""Index of the initial speed in SPEEDS."""
 
 
 class HeldJog:
-    """Hold-to-run control: a thread sends a short velocity goal for each key event.
+    """Hold-to-run control, in which a thread sends a short velocity goal for each key event.
 
-    Only key events renew the jog. When the key is released or the program or the network fails, the service's time-out
-    brakes the robot. A key event older than that time-out is discarded. After the service has refused or ended a jog
-    (with a stop, at a limit, or for another user's goal), a new jog begins only after the key was released.
+    Only key events renew the jog. If the program or the network fails, no more key events arrive, and the service
+    brakes the robot after TIMEOUT. A key event older than TIMEOUT is discarded. The service may refuse or end a jog,
+    for example because of a stop, a limit, or another user's goal. A new jog then begins only after the operator has
+    released the key.
 
     Parameters
     ----------
     send
         Function that sends a goal with an id, such as Robot.send.
     ended
-        Function that is called with the reason for the end, in one line.
+        Function that is called when the service refuses or ends a jog, with the reason in one line.
 
     """
 
@@ -48,24 +49,27 @@ class HeldJog:
         self._tool: Tool | None = None
         self._over = False
         self.error: TrirailError | None = None
-        """Error that ended the last jog; None if the service ended it for another reason."""
+        """Error that ended the last jog; None if the service reported the end of the jog without an error."""
         self._thread = threading.Thread(target=self._run, name="held jog", daemon=True)
         self._thread.start()
 
     def hold(self, velocity: Velocity, tool: Tool | None = None) -> None:
-        """Extend the jog on a key event, with the requested velocity of the tool."""
+        """Begin or renew the jog because of a key event, with the requested velocity of the tool."""
         with self._changed:
             self._sign = velocity, tool, time.monotonic()
             self._changed.notify()
 
     def release(self) -> None:
-        """End the jog on release: the robot brakes immediately, and the next key event begins a new jog."""
+        """End the jog because the key was released; the robot brakes immediately.
+
+        The next key event begins a new jog.
+        """
         with self._changed:
             self._sign, self._let_go = None, True
             self._changed.notify()
 
     def close(self) -> None:
-        """Release the jog, and end the thread."""
+        """End the jog and the thread."""
         with self._changed:
             self._closed = True
         self.release()
@@ -106,7 +110,7 @@ class HeldJog:
             try:
                 self._send((0.0, 0.0, 0.0), BRAKE_RENEWAL_S, goal.id)
             except TrirailError:
-                return  # it has ended, or will by its time-out
+                return  # the jog has ended, or its time-out will end it
 
     def _send(self, velocity: Velocity, timeout: float, goal_id: str | None = None) -> GoalHandle:
         goal_id = goal_id or (self._goal.id if self._goal is not None else uuid.uuid4().hex[:12])

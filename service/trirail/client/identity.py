@@ -1,4 +1,4 @@
-"""Robot, locator, user and credentials of a client, from arguments or else from the environment."""
+"""Names and credentials with which a client connects, from arguments or else from environment variables."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from trirail.wire.text import check_name, quoted
 def identity(
     robot: str | None, connect: str | None, user: str | None, tls: Path | str | None
 ) -> tuple[str, str, str, Credentials | None]:
-    """Return robot, locator, user and credentials of a client.
+    """Return the robot's name, the locator, the user's name and the credentials of a client.
 
-    Defaults come from the environment, as in a shell. Raises RefusedError, ServiceError.
+    Missing arguments are replaced by TRIRAIL_ROBOT, TRIRAIL_CONNECT, the login name and TRIRAIL_TLS. Raises
+    RefusedError if a name is invalid or is not the certificate's name, and ServiceError for invalid credentials.
     """
     robot = check_name(robot or os.environ.get("TRIRAIL_ROBOT") or "demo", "robot")
     connect = connect or os.environ.get("TRIRAIL_CONNECT") or DEFAULT_LOCATOR

@@ -1,4 +1,4 @@
-"""Lease held by a client: acquired, renewed and released."""
+"""Lease that a client acquires, renews and releases."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import AcquireLease, Command, Mode, ReleaseLease
 
 SIGNS = 4
-"""Number of renewals per time-out; all but one may be lost."""
+"""Number of renewals per time-out; the lease continues if at least one of them arrives."""
 
 
 class AsyncLease:
-    """Lease held while the context lasts and renewed by a task; see trirail.client.blocking.Lease.
+    """Context manager that holds the lease and renews it in a task; see trirail.client.blocking.Lease.
 
-    If entering is cancelled, the lease is not renewed and times out. `command` sends a command with its content, as
-    AsyncRobot.command does.
+    If a task is cancelled while it enters the context, the lease is not renewed and times out. `command` is a function
+    that sends a command with its content, such as AsyncRobot.command.
     """
 
     def __init__(
@@ -35,10 +35,10 @@ class AsyncLease:
         self._over = asyncio.Event()
         self._keeping: asyncio.Task[None] | None = None
         self.lost: TrirailError | None = None
-        """Error that ended the lease; None while it is held."""
+        """Error that ended the lease; None while the client holds the lease."""
 
     async def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the lease is lost, for at most `timeout` seconds; return whether it is."""
+        """Wait at most `timeout` seconds for the lease to end. Return True if it has ended."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds(timeout)):
                 await self._over.wait()
@@ -50,7 +50,7 @@ class AsyncLease:
         self._keeping = asyncio.create_task(self._keep(), name="lease")
         if reply.mode == Mode.STOPPING:
             try:
-                await self._command(Command.STOP, b"")  # answered when the robot stands
+                await self._command(Command.STOP, b"")  # the service replies when the robot is at rest
             except BaseException:
                 await self.__aexit__()
                 raise
@@ -62,7 +62,7 @@ class AsyncLease:
             self._keeping.cancel()
             await asyncio.wait([self._keeping])
         if self.lost is None:
-            with contextlib.suppress(TrirailError):  # without an answer it ends by its time-out
+            with contextlib.suppress(TrirailError):  # without a reply, the time-out ends the lease
                 await self._command(Command.RELEASE, msgspec.json.encode(ReleaseLease(self._sign.id)))
 
     async def _keep(self) -> None:

@@ -1,4 +1,4 @@
-"""Stop for a program without a session; it does not wait for one, since a flooded port may not accept a session."""
+"""Stop sent by a program that has no Zenoh session yet; a flooded port may delay the opening of a session."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trirail.wire.messages import CommandReply
 
 
 class NewStop:
-    """Stop, quick_stop or disable, sent to the stop port and over a session that opens in the meantime.
+    """Stop, quick_stop or disable that is sent to the stop port while a session opens, and then over the session.
 
     Raises the same errors as Robot.
     """
@@ -31,11 +31,11 @@ class NewStop:
         at_door = stop.at_door(connect, credentials, self._came.put)
         self._outcomes = Outcomes(1 if at_door is None else 2)
         self.opening = threading.Thread(target=self._query, args=(stop, connect, credentials), daemon=True)
-        """Thread with its own session, since opening a session cannot be cancelled in Zenoh."""
+        """Thread that opens the session and sends the stop; Zenoh cannot cancel the opening of a session."""
         self.opening.start()
 
     def wait(self) -> CommandReply:
-        """Return the first answer. Raises RefusedError for a refusal, ServiceError for no answer."""
+        """Return the first reply. Raises RefusedError if the service refuses, ServiceError if there is no reply."""
         while (reply := self._outcomes.decide(self._came.get())) is None:
             pass
         return reply
@@ -49,7 +49,7 @@ class NewStop:
                 connection.close()
         except TrirailError as error:
             self._came.put(error)
-        except Exception as error:  # noqa: BLE001 - the waiting thread gets an outcome in any case
+        except Exception as error:  # noqa: BLE001 - the waiting thread must get an outcome in any case
             self._came.put(ServiceError(f"no session at {connect}: {error!r}"))
 
 

@@ -1,6 +1,7 @@
-"""Messages from a program's values: numbers and arrays of any library, checked as the service checks them.
+"""Encoding of a program's values as messages, with the checks that the service applies to the messages.
 
-A number has `__float__` or `__index__`, as do those of numpy and fractions; booleans and strings are not numbers.
+Numbers and arrays of any library are accepted. A number is any object with `__float__` or `__index__`, such as the
+numbers of numpy and fractions; booleans and strings are not numbers.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ from trirail.wire.vocabulary import Command, CommandContent
 
 
 def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
-    """Return the message of a kind that `make` returns, as JSON for the service. Raises RefusedError, with `what`."""
+    """Return the message that `make` returns, as JSON.
+
+    Raises RefusedError if the message is not a valid message of `kind`; the error message begins with `what`.
+    """
     try:
         payload = _ENCODER.encode(make())
     except (TypeError, ValueError, ArithmeticError) as error:
@@ -38,19 +42,19 @@ def message(make: Callable[[], msgspec.Struct], kind: Any, what: str) -> bytes:
 
 
 def id_of(goal: Goal | Callable[[str], Goal]) -> str:
-    """Return the id of a goal, or a new one."""
+    """Return the id of a goal; a new id if the goal has none."""
     return (goal.id if isinstance(goal, Goal) else None) or uuid.uuid4().hex[:12]
 
 
 def goal_message(make: Callable[[str], Goal], goal_id: str) -> bytes:
-    """Return the goal that `make` returns for an id, as JSON. Raises RefusedError for an invalid one."""
+    """Return the goal that `make` returns for an id, as JSON. Raises RefusedError if the goal is invalid."""
     return message(lambda: make(goal_id), Goal, "not a goal")
 
 
 def goal_messages(make: Goal | Callable[[str], Goal], goal_id: str) -> list[bytes]:
-    """Return a goal with an id, or the one that `make` returns for it, as JSON in as many messages as needed.
+    """Return a goal as JSON, split into as many messages as needed.
 
-    Raises RefusedError for an invalid goal.
+    `make` is the goal, or a function that returns the goal for an id. Raises RefusedError if the goal is invalid.
     """
     try:
         goal = structs.replace(make, id=goal_id) if isinstance(make, Goal) else make(goal_id)
@@ -63,7 +67,7 @@ def goal_messages(make: Goal | Callable[[str], Goal], goal_id: str) -> list[byte
 
 
 def check_message(goal: Goal) -> bytes:
-    """Return a goal to be checked, as JSON. Raises RefusedError for an invalid one, or one without a path."""
+    """Return a goal to be checked, as JSON. Raises RefusedError if the goal is invalid or has no path."""
     return message(partial(_itself, goal), PathGoal, "not a goal to check")
 
 
@@ -72,7 +76,7 @@ def _itself(goal: Goal) -> Goal:
 
 
 def too_many(number: int) -> str:
-    """Return why a trajectory with this many points cannot be sent and what to do; "" if it can be sent."""
+    """Return an error message with a remedy if a trajectory has too many points to be sent; otherwise ""."""
     if number <= MAX_POINTS:
         return ""
     step = -(-number // MAX_POINTS)
@@ -83,19 +87,25 @@ def too_many(number: int) -> str:
 
 
 def content_message(name: str, content: CommandContent | bytes | None) -> bytes | None:
-    """Return the content of a command as JSON; None without content. Raises RefusedError for a wrong type."""
+    """Return the content of a command as JSON; None if `content` is None.
+
+    Raises RefusedError if the command does not accept this content. Content that is already JSON is not checked.
+    """
     if content is None or isinstance(content, bytes):
         return content
     return made_content(Command(name), lambda: content)
 
 
 def made_content(command: Command, make: Callable[[], CommandContent]) -> bytes:
-    """Return the content of a command that `make` returns, as JSON. Raises RefusedError for an invalid one."""
+    """Return the command content that `make` returns, as JSON. Raises RefusedError if the content is invalid."""
     return message(make, command.accepts, f"not for {command}")
 
 
 def number(value: object, what: str) -> float:
-    """Return a number as a Python float. Raises RefusedError, with `what` as its name."""
+    """Return a number as a Python float.
+
+    Raises RefusedError if the value is not a finite number; the error message calls the value `what`.
+    """
     try:
         plain = value if isinstance(value, bool) else _plain(value)
         if isinstance(plain, (int, float)) and not isinstance(plain, bool):
@@ -106,7 +116,10 @@ def number(value: object, what: str) -> float:
 
 
 def seconds(value: object) -> float | None:
-    """Return a time-out [s]; None for none, and for one beyond threading.TIMEOUT_MAX. Raises RefusedError."""
+    """Return a time-out [s]; None if there is no time-out or it is longer than threading.TIMEOUT_MAX.
+
+    Raises RefusedError if the value is not a number or is negative.
+    """
     if value is None or (isinstance(value, float) and value == math.inf):
         return None
     wait = number(value, "timeout")
@@ -116,16 +129,19 @@ def seconds(value: object) -> float | None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as a message's type. Raises TypeError if there is none, ValueError if it is not finite."""
-    numpy = sys.modules.get("numpy")  # a program with numbers of numpy has imported it
+    """Convert a value to a type that messages can contain.
+
+    Raises TypeError if the value cannot be converted, and ValueError if it is not finite.
+    """
+    numpy = sys.modules.get("numpy")  # a program that uses numpy's numbers has already imported numpy
     if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
         if value.dtype.kind == "f" and not numpy.isfinite(value).all():
             raise ValueError(f"{value!r} is not finite")
-        value = value.tolist()  # Python's own numbers, truth values and texts
+        value = value.tolist()  # numbers, booleans and strings of Python
         if isinstance(value, list | str | bool):
             return value
     for name, convert in (("__index__", operator.index), ("__float__", float)):
-        if hasattr(type(value), name):  # float() takes texts as well
+        if hasattr(type(value), name):  # float() alone would also accept strings
             with contextlib.suppress(TypeError):
                 return _finite(convert(value))
     raise TypeError(f"{value!r}, of type {type(value).__name__}, is no number")

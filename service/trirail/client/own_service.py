@@ -1,4 +1,4 @@
-"""Private service in its own process, for demos, tools and tests."""
+"""Private service in a separate process, for demos, tools and tests."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ PATIENT = {
     "heartbeat": "1.0\nsdo_timeout = 5.0",
     "gateway_timeout": "1.0",
 }
-"""Keys of a configuration that tolerates processes stalled for a second by a busy machine."""
+"""Configuration values with which a service tolerates that a busy machine stalls its processes for a second."""
 START_WITHIN = 300.0
-"""Time-out of the start [s]; at the very first start, the time-out for compiling one function."""
+"""Longest time without progress during the start [s]; at the very first start, compiling a function is one step."""
 END_WITHIN = 20.0
-"""Time-out for stopping the robot and ending [s]."""
+"""Time-out for the end of the service, which first stops the robot [s]."""
 
 Process = subprocess.Popen[bytes]
 
 
 @contextlib.contextmanager
 def service(config: Path, recording: Path, report_start: Callable[[str], None] = lambda _: None) -> Iterator[Process]:
-    """Run a service with a configuration file, recording to a file; end the service when the context ends.
+    """Run a service that records to the file `recording`; end the service when the context ends.
 
-    The context begins when the service is up. `report_start` receives messages about the start, such as the progress of
-    the compilation at the very first start.
+    Entering the context waits until the service is up. `report_start` is called with messages about the start, such as
+    the progress of the compilation at the very first start.
 
-    Raises ServiceError if the service cannot start. If the context ends with an error that is not a refusal, the
+    Raises ServiceError if the service cannot start. If a TrirailError other than a RefusedError ends the context, the
     service's output is first written to standard error.
     """
     with tempfile.TemporaryFile() as log:
@@ -51,7 +51,7 @@ def service(config: Path, recording: Path, report_start: Callable[[str], None] =
             process = start(config, log, "--record", str(recording), report_start=report_start)
             yield process
         except RefusedError:
-            raise  # the service works, and has given the reason
+            raise  # the service works, and the refusal contains the reason
         except TrirailError:
             log.seek(0)
             sys.stderr.write(log.read().decode())
@@ -68,12 +68,13 @@ def start(
     report_start: Callable[[str], None] = lambda _: None,
     **environment: str,
 ) -> Process:
-    """Start a service, and wait until it is up; the caller must `end` it.
+    """Start a service, and wait until the service is up; the caller must `end` the service.
 
-    `arguments` are added to `trirail run`, and `environment` to its environment variables; the output is written to
-    `log`. The service is up when it reports so, as it does to systemd. A query on its port could instead reach another
-    service, and move that robot. Raises ServiceError if the service ends before it is up, or makes no progress for
-    START_WITHIN seconds; the service has then been ended.
+    `arguments` are appended to the command `trirail run`, and `environment` is added to the environment variables. The
+    output is written to `log`. The service reports with systemd's notification protocol that it is up. A query on the
+    service's port would be no substitute, since the query could reach another service and move that robot. Raises
+    ServiceError if the service ends before it is up, or makes no progress for START_WITHIN seconds; the function then
+    ends the service.
     """
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
         ready.bind(f"{folder}/ready")
@@ -94,18 +95,18 @@ def start(
 
 
 def end(process: Process) -> int:
-    """End a service, which first stops the robot; return its exit code, 0 for a regular end.
+    """End a service, which first stops the robot; return the exit code, 0 for a regular end.
 
-    Raises subprocess.TimeoutExpired if it has not ended within END_WITHIN seconds.
+    Raises subprocess.TimeoutExpired if the service has not ended within END_WITHIN seconds.
     """
     process.send_signal(signal.SIGTERM)
     return process.wait(END_WITHIN)
 
 
 def private(folder: Path, live_port: int = 0) -> tuple[Path, str]:
-    """Write a configuration of the simulated robot for a service that no other program can reach.
+    """Write a configuration of the simulated robot for a private service, at a Unix socket in `folder`.
 
-    The time-outs tolerate a busy machine that stalls for a second, since only simulated sliders move.
+    The time-outs are long enough for a busy machine that stalls for a second, since only simulated sliders move.
 
     Parameters
     ----------

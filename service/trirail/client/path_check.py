@@ -1,4 +1,7 @@
-"""Check before a motion whether a pose is reachable or a file can be followed; the service decides in the end."""
+"""Checks before a motion if a pose is reachable, or if the trajectory in a file can be followed.
+
+The service makes the final decision.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +24,17 @@ from trirail.wire.packed_trajectory import packed
 from trirail.workspace.violations import violations
 
 CHECKED_POSES = 40
-"""Number of poses checked on the line in pose space, from its end."""
+"""Number of poses that are checked on the straight line in pose space, from its end to its start."""
 DRAWN_POINTS = 200
-"""Number of points drawn of a path, evenly spaced in time."""
+"""Number of points with which a path is drawn, evenly spaced in time."""
 
 
 class Obstacle(Struct, frozen=True, omit_defaults=True):
-    """Reason why a pose cannot be reached, as text, and as code and values for the page's languages."""
+    """Reason why a pose cannot be reached, as a message, and as a code and values that the web page translates."""
 
     message: str
     on_way: bool = False
-    """Whether the obstacle is on the way to the end, and not at the end itself."""
+    """True if the obstacle is on the way to the end pose, False if it is at the end pose."""
     code: str = ""
     """Name of the exceeded limit, "unreachable", or a RefusalCode."""
     what: str = ""
@@ -42,10 +45,10 @@ class Obstacle(Struct, frozen=True, omit_defaults=True):
 
 
 def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | None, frame: str) -> Obstacle | None:
-    """Check CHECKED_POSES poses on the straight line of the tool in pose space.
+    """Check if the tool can move along a straight line in pose space; CHECKED_POSES poses are checked.
 
-    The check covers positions, passive travel and the singularity margin. The service checks the speeds, and the path
-    between these poses.
+    The function checks positions, passive travel and the singularity margin. Only the service checks the speeds, and
+    the path between the checked poses.
 
     Parameters
     ----------
@@ -63,7 +66,7 @@ def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | No
     Returns
     -------
     Obstacle | None
-        Obstacle nearest to the end; None if the check finds none.
+        Obstacle nearest to the end of the line; None if there is no obstacle.
     """
     names = NamedFrames(robot.frames)
     try:
@@ -86,28 +89,31 @@ def find_obstacle(robot: DrawnRobot, start: Triple, end: Triple, tool: Tool | No
 
 
 class CheckedPath(Struct, frozen=True, omit_defaults=True):
-    """Result of checking a file's path."""
+    """Result of the check of a trajectory file."""
 
     why: str = ""
-    """Reason why it cannot be followed; empty if it can."""
+    """Reason why the trajectory cannot be followed; empty if it can be followed."""
     code: str = ""
-    """RefusalCode or "unreadable"; empty if it can be followed."""
+    """RefusalCode or "unreadable"; empty if the trajectory can be followed."""
     line: Sequence[Triple] = ()
-    """Poses along it, in the base frame [m, rad]; only its points if it cannot be followed."""
+    """Poses along the path, in the base frame [m, rad]; only the file's points if they cannot be followed."""
     duration: float = 0.0
     """Duration at full speed [s]."""
     slowed: float = 1.0
-    """Ratio of that duration to the requested one."""
+    """Ratio of `duration` to the duration in the file."""
 
 
 def check_path(robot: DrawnRobot, name: str, text: str, stretch: bool) -> CheckedPath:
-    """Parse a trajectory and plan it from its first point, as the service does, which checks the whole path."""
+    """Parse a trajectory, and plan it from its first point in the same way as the service.
+
+    The planner checks the whole path. `name` is the name of the file, and `stretch` is that of Robot.follow.
+    """
     line: list[Triple] = []
     try:
         points = tuple(trajectory.parse(name, text))
         line = [(point.x, point.y, point.phi) for point in points]
         goal, period = TrajectoryGoal(points, stretch=stretch), 1.0 / robot.rate_hz
-        goal_messages(goal, "checked")  # as the client does
+        goal_messages(goal, "checked")  # the checks of the client
         planner, schedule = GoalPlanner(robot.geometry, robot.limits, period), Schedule(rest(line[0]), period)
         planned = planner.plan(packed(goal), schedule, 1.0, 0)
     except (TrirailError, ValueError) as error:

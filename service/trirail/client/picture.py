@@ -1,4 +1,4 @@
-"""State of a robot as a line of text, and as HTML with a drawing, for notebooks."""
+"""Presentation of a robot's state in notebooks: one line of text, or HTML with a drawing."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ LINE, THICK = 0.005, 0.02
 
 
 def line(name: str, state: State) -> str:
-    """Return mode, goal, fault and pose of a robot in one line."""
+    """Return one line with the mode, goal, first fault and pose of a robot."""
     goal = f" to {state.goal.id}" if state.goal is not None else ""
     fault = f": {state.faults[0]}" if state.faults else ""
     return f"<Robot {name}: {state.mode}{goal}{fault}, {_pose(state.pose)}>"
 
 
 def html(info: Info, state: State) -> str:
-    """Return the state with a drawing of rails, sliders and platform; the commanded platform is pale."""
+    """Return HTML with the state and a drawing of the robot."""
     robot = DrawnRobot.from_info(info)
     mode = palette.code(next(colour for mode, colour in palette.MODES.items() if str(mode) == state.mode))
     goal = f" to <b>{escape(state.goal.id)}</b>" if state.goal is not None else ""
@@ -45,7 +45,10 @@ def html(info: Info, state: State) -> str:
 
 
 def drawing(robot: DrawnRobot, state: State) -> str:
-    """Return the robot at a state as an SVG picture, x to the right and y upwards."""
+    """Return an SVG drawing of the rails, sliders and platform, with x to the right and y upwards.
+
+    The platform is drawn at its measured pose and, in a pale colour, at its commanded pose.
+    """
     parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     placed = part_positions.transform_lines(parts.outline, state.pose)
     everything = np.concatenate([parts.bounds, *placed])

@@ -1,4 +1,4 @@
-"""Decoding of published samples by a client: invalid samples are skipped, counted, and reported once."""
+"""Decoding of published samples by a client, which skips and counts invalid samples and logs the first of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LOG = logging.getLogger("trirail")
 
 
 class SampleReader:
-    """Decoder of samples for one client; each of its Zenoh callbacks handles one kind of content.
+    """Factory of Zenoh callbacks for one client; each callback decodes one kind of content.
 
     Any program on the network may publish anything on any key, so invalid content must never raise an error.
     """
@@ -28,9 +28,10 @@ class SampleReader:
         """Number of samples that were not valid messages."""
 
     def messages(self, kind: type[T], deliver: Callable[[T], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return a callback that decodes messages of a `kind`, JSON or msgpack by their encoding, for `deliver`.
+        """Return a callback that decodes messages of a `kind` and passes them to `deliver`.
 
-        The connection's own thread calls `deliver`, which must return quickly.
+        The encoding of the sample, JSON or msgpack, selects the decoder. A thread of the connection calls `deliver`,
+        which must return quickly.
         """
 
         def read(sample: zenoh.Sample) -> T:
@@ -41,8 +42,8 @@ class SampleReader:
         return self._handler(read, deliver)
 
     def batches(self, deliver: Callable[[bytes], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
-        """Return a callback that passes whole batches of records, packed as in wire.records, to `deliver`."""
-        from trirail.wire import records  # with numpy, which most commands do without
+        """Return a callback that passes valid batches of records, in the format of wire.records, to `deliver`."""
+        from trirail.wire import records  # imports numpy, which most commands do not need
 
         return self._handler(lambda sample: records.checked(sample.payload.to_bytes()), deliver)
 
@@ -57,7 +58,7 @@ class SampleReader:
             else:
                 deliver(content)
 
-        # Not indirect: that would start a thread of Zenoh that keeps Python from ending.
+        # An indirect callback would start a thread of Zenoh that prevents Python from exiting.
         return zenoh.handlers.Callback(on_sample, indirect=False)
 
     def _skip(self, key: str, refusal: RefusedError) -> None:

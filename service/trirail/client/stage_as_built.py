@@ -1,6 +1,7 @@
-"""True pose of a stage that differs from its service's model, in its geometry and by backlash in its drives.
+"""Simulation of a real stage that differs from the service's model in its geometry and by backlash in its drives.
 
-Used for simulated cameras. The encoder measurements are from the records that a service publishes.
+Simulated cameras use the pose of this stage. The positions of its motors are taken from the records that a service
+publishes.
 """
 
 from __future__ import annotations
@@ -19,13 +20,16 @@ from trirail.kinematics.robot import forward
 from trirail.wire.records import unpack
 
 HISTORY = 5000
-"""Number of cycles that are kept."""
+"""Number of latest cycles for which positions are stored."""
 COMES_WITHIN = 2.0
 """Longest wait for the records of a given time [s]."""
 
 
 def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, angles: float) -> Geometry:
-    """Return a robot whose legs differ at random by up to `places` [m] per coordinate and `angles` [rad] per angle."""
+    """Return a copy of a geometry with random errors in its legs.
+
+    The errors are at most `places` [m] for each coordinate and `angles` [rad] for each angle.
+    """
 
     def near(place: tuple[float, float]) -> tuple[float, float]:
         x, y = (np.array(place) + rng.uniform(-places, places, 2)).tolist()
@@ -44,11 +48,11 @@ def built_otherwise(robot: Geometry, rng: np.random.Generator, places: float, an
 
 
 class StageAsBuilt:
-    """Sliders and table of a robot, computed from its records: `robot.records(stage.add_records)`.
+    """Simulated slider positions and table pose, computed from the motor positions in a robot's records.
 
-    `built` is the geometry of the stage itself, with its own errors as a correction. `play` is the backlash of each
-    slider [m]: the distance that its motor moves after a reversal before the slider follows. Each motor starts in the
-    middle of its backlash.
+    `robot.records(stage.add_records)` supplies the records. `built` is the true geometry of the stage. `play` is the
+    backlash of each slider [m], the distance that the motor moves after a reversal before the slider follows. Each
+    motor starts in the middle of its backlash.
     """
 
     def __init__(self, built: Geometry, play: Triple = (0.0, 0.0, 0.0)) -> None:
@@ -73,7 +77,7 @@ class StageAsBuilt:
     def sliders_at(self, time: float) -> Triple:
         """Return the positions of the sliders [m] at a monotonic time [s], interpolated linearly between two cycles.
 
-        Waits for records of that time. Raises ServiceError if none arrive or the records are no longer stored.
+        Wait for the records of that time. Raises ServiceError if these records do not arrive or are no longer stored.
         """
         with self._changed:
             if not self._changed.wait_for(lambda: self._cycles and self._cycles[-1][0] >= time, COMES_WITHIN):
@@ -89,6 +93,9 @@ class StageAsBuilt:
         return a, b, c
 
     def pose_at(self, time: float) -> Triple:
-        """Return the table's pose at a time: x, y [m], phi [rad]. Raises ServiceError, KinematicsError for no pose."""
+        """Return the table's pose x, y [m], phi [rad] at a monotonic time [s].
+
+        Raises the ServiceError of `sliders_at`, and KinematicsError if no pose belongs to the slider positions.
+        """
         x, y, phi = forward(self._built, self.sliders_at(time)).tolist()
         return x, y, phi

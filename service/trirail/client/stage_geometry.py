@@ -1,4 +1,4 @@
-"""Geometry of a stage by its own cameras, for a connection to its service."""
+"""Preparation of the calibration of a stage's geometry with cameras, from the data of the stage's service."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INSTALL = "pip install 'trirail[analysis]'"
 
 
 def geometry_id(info: Info) -> str:
-    """Return the checksum of a service's [geometry], as correction maps have it."""
+    """Return the checksum of a service's [geometry], as stored in correction maps."""
     return as_built.geometry_of(DrawnRobot.from_info(info).geometry)
 
 
@@ -34,9 +34,12 @@ def geometry_task(
     looks: int,
     approach: Triple | None,
 ) -> GeometryTask:
-    """Return the task for the stage of a service. Raises RefusedError, or TrirailError without SciPy."""
+    """Return the task of a geometry calibration for the stage of a service.
+
+    Raises RefusedError if the task is invalid, and TrirailError if SciPy is not installed.
+    """
     if "scipy" in sys.modules and sys.modules["scipy"] is None:
-        del sys.modules["scipy"]  # kept out of services, where numba would import it (processes.compiling)
+        del sys.modules["scipy"]  # processes.compiling blocks SciPy in services, since numba would import it
     try:
         from trirail.alignment.geometry_calibration import GeometryTask
     except ImportError as error:

@@ -1,7 +1,7 @@
-"""Stop sent in two ways in parallel, to the service's stop port and over Zenoh; the first reply counts.
+"""Stop that is sent in parallel to the service's stop port and over Zenoh; the first reply counts.
 
 Both copies have the same id, so the service carries out the stop once. A separate thread connects to the stop port, and
-tries again if the port closes the connection without a reply, as it may under a flood.
+tries again if the port closes the connection without a reply, which may happen when the port is flooded.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.stop_protocol import MAX_LINE, StopAddress, StopAnswer, StopRequest, encode, stop_address
 
 HEARD_WITHIN: Final = 2.0
-"""Time-out of a connection to the stop port before another attempt [s]."""
+"""Time-out of one attempt to connect to the stop port [s]."""
 AGAIN_AFTER: Final = 0.05
-"""Delay between two attempts [s]."""
+"""Delay between two attempts to connect [s]."""
 
 Outcome = CommandReply | TrirailError
 
 
 class NoDoorError(ServiceError):
-    """Raised when a stop gets no reply at the stop port."""
+    """Error raised if a stop gets no reply from the stop port."""
 
 
 class StopOrder(NamedTuple):
-    """Stop, quick_stop or disable to send, with the content of each copy."""
+    """Content of a stop, quick_stop or disable, shared by both copies."""
 
     robot: str
     user: str
     name: str
     content: bytes | None
     within: float
-    """Time-out for carrying it out [s]."""
+    """Time within which the service must carry the command out [s]."""
     id: str
-    """Id shared by both copies, so that the service carries the stop out once."""
+    """Id by which the service recognizes the two copies as the same stop."""
 
     @classmethod
     def create(cls, robot: str, user: str, name: str, content: bytes | None, within: float) -> StopOrder:
@@ -55,13 +55,16 @@ class StopOrder(NamedTuple):
 
     @property
     def parts(self) -> tuple[str, str, str]:
-        """Parts of the key over Zenoh."""
+        """Parts of the Zenoh key of the command."""
         return "cmd", self.user, self.name
 
     def at_door(
         self, locator: str, credentials: Credentials | None, deliver: Callable[[Outcome], None]
     ) -> StopCall | None:
-        """Send the stop to the stop port of a locator, and deliver the outcome; return None if it has no port."""
+        """Send the stop to the stop port that belongs to a locator, and pass the outcome to `deliver`.
+
+        Return None, without sending, if the locator has no stop port or the message is too long for the port.
+        """
         address = stop_address(locator)
         content = (self.content or b"").decode()
         line = encode(StopRequest(zenoh_session.key(self.robot, *self.parts), self.id, content))
@@ -78,10 +81,10 @@ class Outcomes:
         self._errors: list[TrirailError] = []
 
     def decide(self, outcome: Outcome) -> CommandReply | None:
-        """Add an outcome; return the reply, or None while another copy may still bring one.
+        """Add the outcome of one copy; return the reply, or None if this copy failed and another copy is pending.
 
-        Raises RefusedError or ServiceError if no copy got a reply. A refusal as busy does not count while another copy
-        is pending.
+        Raises RefusedError if the service refuses the stop, except with code BUSY while another copy is pending. Raises
+        the most informative error if all copies failed.
         """
         if isinstance(outcome, CommandReply):
             return outcome
@@ -94,7 +97,7 @@ class Outcomes:
 
 
 class StopCall:
-    """Stop sent to the stop port of a locator; a thread delivers the outcome once."""
+    """Stop that a thread sends to a stop port; the thread calls `deliver` once with the outcome."""
 
     def __init__(
         self,
@@ -118,7 +121,7 @@ class StopCall:
         self._thread.join()
 
     def cancel(self) -> None:
-        """Stop trying to reach the stop port."""
+        """Make no more attempts to reach the stop port."""
         self._cancelled.set()
 
     def _run(self) -> None:
@@ -126,11 +129,14 @@ class StopCall:
             self._deliver(self._query_until_answered())
         except TrirailError as error:
             self._deliver(error)
-        except Exception as error:  # noqa: BLE001 - the caller gets an outcome in any case
+        except Exception as error:  # noqa: BLE001 - the caller must get an outcome in any case
             self._deliver(NoDoorError(f"cannot ask at {self._address}: {error!r}"))
 
     def _query_until_answered(self) -> CommandReply:
-        """Send the request until there is an answer. Raises RefusedError for a refusal, ServiceError for no answer."""
+        """Send the request repeatedly until a reply arrives; return the reply.
+
+        Raises RefusedError if the service refuses, and NoDoorError if no reply arrives in time.
+        """
         secured = tls.client(self._credentials) if self._address.secured and self._credentials is not None else None
         why: OSError | None = None
         while (left := self._deadline - time.monotonic()) > 0.0 and not self._cancelled.is_set():
@@ -143,7 +149,7 @@ class StopCall:
                 ssl.SSLEOFError,
                 ssl.SSLZeroReturnError,
             ) as error:
-                why = error  # it closed the connection before reading the request
+                why = error  # the port has closed the connection without a reply
             except OSError as error:
                 raise NoDoorError(f"nobody takes stops at {self._address}: {error}") from error
             self._cancelled.wait(AGAIN_AFTER)
@@ -180,7 +186,10 @@ def _connect(address: StopAddress, within: float) -> socket.socket:
 
 
 def _read(line: bytes) -> CommandReply:
-    """Return the reply in an answer's line. Raises RefusedError for a refusal, NoDoorError for an invalid answer."""
+    """Return the reply in a line from the stop port.
+
+    Raises RefusedError if the service refuses, and NoDoorError if the line is invalid or is from another robot.
+    """
     try:
         answer = decoded(line, StopAnswer)
     except (msgspec.MsgspecError, ValueError) as error:

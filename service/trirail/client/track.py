@@ -1,4 +1,4 @@
-"""Client side of tracking: updates of a moving target that the platform follows."""
+"""Client side of tracking, which sends updates of a moving target that the platform follows."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from trirail.wire.goals import Goal, TrackGoal
 from trirail.wire.messages import GoalReply
 
 Taker = Callable[[GoalReply | TrirailError], None]
-"""Callback for the answer to a goal, called once, in the event loop."""
+"""Callback that gets the reply to a goal or the error; it is called once, in the event loop."""
 
 
 class AsyncTrack:
-    """Sender of a target's pose, 10 to 200 times a second; the robot follows the target.
+    """Context manager in which the robot follows a moving target; the program calls `update` 10 to 200 times a second.
 
-    `begin` sends a goal and returns its handle once the service accepts it, as AsyncRobot.send does; `post` sends a
-    goal and returns immediately. Only `update` sends messages. If its calls cease for any reason, the robot brakes on
-    its path after the time-out.
+    `begin` is a function that sends a goal and returns its handle once the service accepts the goal, such as
+    AsyncRobot.send. `post` sends a goal and returns immediately. Only `update` sends messages. If the program stops
+    calling `update` for any reason, the robot brakes on its path after the time-out.
     """
 
     def __init__(
@@ -40,13 +40,13 @@ class AsyncTrack:
         self._goal: AsyncGoalHandle | None = None
         self._numbers = itertools.count(1)
         self._answered = 0
-        """Number of the newest answered update."""
+        """Number of the newest update that got a reply."""
         self._error: TrirailError | None = None
         self._lag: float | None = None
 
     @property
     def lag(self) -> float | None:
-        """Greatest distance between a point of the platform and its place at the target, in the latest reply [m]."""
+        """Greatest distance of a point of the platform from its place at the target [m], from the latest reply."""
         return self._lag
 
     @property
@@ -65,11 +65,12 @@ class AsyncTrack:
     ) -> None:
         """Send the target's pose x, y [m], phi [rad] and its velocity [m/s, m/s, rad/s] at a time.
 
-        `time` is wall-clock time [s since 1970] and defaults to now; the clocks must agree if the service runs on
-        another machine. The robot keeps the velocity until the next call. The first call returns when the service
-        accepts the track. Later calls return immediately, so the next call raises an earlier refusal. Raises
-        RefusedError, also if the track has ended because of a stop, a pause, another goal or a time-out, and
-        ServiceError if the service does not answer.
+        `time` is wall-clock time [s since 1970] and defaults to now. If the service runs on another machine, the clocks
+        of the two machines must agree. Until the next call, the service assumes that the target moves at this velocity.
+
+        The first call returns when the service accepts the track. Later calls return immediately, and the error of such
+        a call is raised by a later call. Raises RefusedError if the service refuses an update, or if a stop, a pause,
+        another goal or a time-out has ended the track. Raises ServiceError if the service does not answer.
         """
         self._check()
         goal = self._goal_of(pose, velocity, clocks.time() if time is None else time)
@@ -80,11 +81,11 @@ class AsyncTrack:
             self._post(goal, functools.partial(self._on_answer, next(self._numbers)))
 
     async def close(self) -> None:
-        """Brake on the path if the robot still follows; return when it is at rest."""
+        """Brake on the path if the robot still follows the target; return when the robot is at rest."""
         if self._goal is None:
             return
         if self._goal.result is None:
-            with contextlib.suppress(RefusedError):  # it has just ended
+            with contextlib.suppress(RefusedError):  # the track has just ended
                 await self._goal.cancel()
         await self._goal.wait(STANDS_WITHIN)
 
@@ -96,7 +97,7 @@ class AsyncTrack:
             raise RefusedError(RefusalCode.MALFORMED, f"not a target: {error}") from error
 
     def _check(self) -> None:
-        """Raise the error of an earlier update."""
+        """Raise the error of an earlier update, if there is one. Raises RefusedError if the track has ended."""
         if (ended := self.result) is not None:
             raise RefusedError(RefusalCode.JOG_OVER, f"the track is over: {ended.message}")
         error, self._error = self._error, None
@@ -104,7 +105,7 @@ class AsyncTrack:
             raise error
 
     def _on_answer(self, number: int, answer: GoalReply | TrirailError) -> None:
-        """Handle the reply to an update; ignore a lost reply if a later one has arrived."""
+        """Handle the reply to an update; ignore a missing reply if the reply to a later update has arrived."""
         if isinstance(answer, ServiceError) and number < self._answered:
             return
         self._answered = max(self._answered, number)

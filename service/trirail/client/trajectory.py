@@ -1,4 +1,4 @@
-"""Timed trajectories: from points, rows of numbers, or files of CSV or JSON."""
+"""Conversion of points, rows of numbers, and CSV or JSON files to timed trajectories."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ POINTS_FORMAT = (
     "TrajectoryPoints, rows of t [s], x, y [m], phi [rad], as an array (N, 4), or the path of a CSV or JSON file"
 )
 MIN_POINTS = 2
-"""Minimum number of points of a trajectory; the first is the robot's pose."""
+"""Minimum number of points of a trajectory; the first point is the robot's pose at the start."""
 prepare(list[TrajectoryPoint])
 VELOCITY, ACCELERATION = ("vx", "vy", "w"), ("ax", "ay", "e")
 
 
 def points_of(source: Points) -> tuple[TrajectoryPoint, ...]:
-    """Return the points of a trajectory. Raises TrirailError for an invalid source.
+    """Return the points of a trajectory. Raises TrirailError if the source is invalid.
 
-    `source` may be a sequence of points, an array of rows t [s], x, y [m], phi [rad], or the path of a file.
+    `source` may be a sequence of points, an array with rows of t [s], x, y [m], phi [rad], or the path of a file.
     """
     if isinstance(source, str | os.PathLike):
         return tuple(read(Path(source)))
@@ -50,8 +50,11 @@ def points_of(source: Points) -> tuple[TrajectoryPoint, ...]:
 
 
 def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint:
-    """Return a point as it is, or make one of a row. Raises TypeError if it is no row, RefusedError for bad values."""
-    if isinstance(row, TrajectoryPoint):  # its goal computes with its time
+    """Convert a row of numbers to a point; return a point unchanged, but with its time as a float.
+
+    Raises TypeError if the row is not iterable, and RefusedError if its values are invalid.
+    """
+    if isinstance(row, TrajectoryPoint):  # a goal computes with the times of its points
         return row if isinstance(row.t, float) else structs.replace(row, t=number(row.t, f"points: t of point {n}"))
     values = [] if isinstance(row, str | bytes | Mapping) else list(row)
     if len(values) != len(COLUMNS):
@@ -62,7 +65,10 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
 
 
 def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
-    """Return a function that returns, for an id, the goal to the first pose of a trajectory."""
+    """Return a function that takes a goal id and returns the goal to the first pose of a trajectory.
+
+    Raises RefusedError if the trajectory has no points.
+    """
     if not points:
         raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; expected {POINTS_FORMAT}")
     x, y, phi = points[0].x, points[0].y, points[0].phi
@@ -70,19 +76,25 @@ def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
 
 
 def check_arrived(result: Result) -> None:
-    """Raise RefusedError if the goal to a trajectory's first point was not done."""
+    """Raise RefusedError if the outcome of the goal to a trajectory's first point is not done."""
     if result.outcome != "done":
         text = f"the robot is not at the first point of the trajectory, which was not sent: {result.message}"
         raise RefusedError(RefusalCode.WRONG_START, text)
 
 
 def read(path: Path) -> list[TrajectoryPoint]:
-    """Read the points of a trajectory. Raises TrirailError with the file, the line and the expected value."""
+    """Read the points of a trajectory file.
+
+    Raises TrirailError that names the file, the line and the expected value.
+    """
     return parse(path, files.text(path))
 
 
 def parse(name: Path | str, text: str) -> list[TrajectoryPoint]:
-    """Parse the points in a text, as JSON if the file's name ends in .json, otherwise as CSV. Raises TrirailError."""
+    """Parse the content of a trajectory file, as JSON if the file's name ends in .json, otherwise as CSV.
+
+    Raises TrirailError if the content is invalid.
+    """
     path = Path(name)
     points = _points(path, text)
     if len(points) < MIN_POINTS:
@@ -136,7 +148,7 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
 
 
 def _numbers(where: str, names: Sequence[str], row: Sequence[str]) -> dict[str, float]:
-    """Return the numbers of a row by their columns. Raises TrirailError."""
+    """Return the numbers of a row by column name. Raises TrirailError if the row is invalid."""
     if len(row) != len(names):
         raise TrirailError(f"{where}: {len(row)} columns; expected {len(names)}")
     values = {}

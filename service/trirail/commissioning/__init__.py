@@ -1,1 +1,1 @@
-"""Commissioning of real drives: one drive at a time, slowly, with each step judged and the configuration corrected."""
+"""Commissioning of real drives with slow motions of one drive at a time; each step can correct the configuration."""

@@ -1,4 +1,4 @@
-"""Drive cycle of a commissioning: power for a single drive, slow motions, and the conditions that stop all drives."""
+"""Cycle that runs the drives during a commissioning, can enable a single drive, and stops all drives on a problem."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ from trirail.config import Config
 from trirail.kinematics.arrays import Array
 
 MAX_FOLLOWING_ERROR_M: Final = 0.0003
-"""Following error of a powered slider that stops all drives [m]. At 5 mm/s, a drive without velocity feed-forward
-and with a position loop of 20 /s lags by 0.25 mm."""
+"""Following error of a powered slider above which all drives are stopped [m].
+
+At 5 mm/s, a drive without velocity feed-forward and with a position-loop gain of 20 /s lags by 0.25 mm."""
 SETTLE_TIME_S: Final = 0.3
-"""Time that a slider has to settle after a motion [s]."""
+"""Time within which a slider settles after a motion [s]."""
 INTERRUPTED: Final = "stopped by Ctrl-C"
 FAULT_WINDOW_S: Final = 0.05
-"""Time within which drives that missed the same heartbeat all report it [s]."""
+"""Time within which all drives that missed the same heartbeat report the missing heartbeat [s]."""
 REST_CHECK_S: Final = 0.05
 """Time for which the sliders are observed before power is applied [s]."""
 RESET_TIMEOUT_S: Final = 1.0
-"""Time that a fault has to clear after a reset [s]."""
+"""Time within which a fault must clear after a reset [s]."""
 FEEDBACK_DELAY_CYCLES: Final = 2
-"""SYNCs between writing a setpoint and the position that answers it: one to apply the setpoint, and one to sample."""
+"""Number of SYNCs from a written setpoint to the first position that shows its effect.
+
+The drive applies the setpoint at the first SYNC, and samples the position at the second."""
 
 _HISTORY_CYCLES: Final = FEEDBACK_DELAY_CYCLES + 8
 _POWERED_STATES: Final = (
@@ -37,19 +40,19 @@ _POWERED_STATES: Final = (
     PowerState.FAULT_REACTION_ACTIVE,
 )
 _DRIVE_REPORTED_CAUSES: Final = ("emcy", "fault", "state")
-"""Fault causes that the drive itself reported; the others are missing messages."""
+"""Causes of faults that a drive itself reports. All other causes are missing messages of a drive."""
 _ZERO_VELOCITY: Final = (0.0, 0.0, 0.0)
 
 
 class DrivesStoppedError(Exception):
-    """All drives were stopped and have no power. The text gives the reason."""
+    """Error raised after all drives were stopped and their power was switched off. The text contains the reason."""
 
 
 class MeasuredMotion(NamedTuple):
     """Feedback of the drives during a motion."""
 
     position: Array
-    """Measured slider positions, one row per cycle, (N, 3) [m]."""
+    """Measured slider positions, with one row for each cycle, (N, 3) [m]."""
     following_error: tuple[float, float, float]
     """Maximum following error of each slider [m]."""
 
@@ -58,17 +61,17 @@ class WatchdogReaction(NamedTuple):
     """Reaction of a powered drive to missing SYNCs and heartbeats."""
 
     seconds: float | None
-    """Time until the drive switched its power off [s]; None if it did not."""
+    """Time until the drive switched its power off [s]; None if the drive did not react."""
     drive: str
-    """Drive that reported the loss; "" if none did."""
+    """Drive that reported the loss; "" if no drive reported it."""
     message: str
-    """Message of that drive; "" if there was none."""
+    """Fault message of this drive; the state of the powered drive if no fault was reported."""
     code: int = 0
-    """EMCY error code; 0 for none."""
+    """EMCY error code; 0 if there is no code."""
 
 
 class Bench:
-    """Runner of the drives' cycle. Any problem while a drive has power stops all drives in the same cycle."""
+    """Runner of the drives' cycle. A problem while a drive has power stops all drives in the same cycle."""
 
     def __init__(
         self,
@@ -77,22 +80,22 @@ class Bench:
         tick: Callable[[], int],
         interrupted: Callable[[], bool],
     ) -> None:
-        """Take over configured drives.
+        """Create a bench for drives that have been configured.
 
         Parameters
         ----------
         tick
-            Waits for the next cycle and returns the number of cycles missed.
+            Function that waits for the next cycle and returns the number of missed cycles.
         interrupted
-            True once Ctrl-C was pressed.
+            Function that returns True after Ctrl-C was pressed.
         """
         self.config = config
         self.period = config.period
         self._labels = config.geometry.labels
         self.missed_cycles = 0
-        """Cycles missed while a drive had power."""
+        """Number of cycles missed while a drive had power."""
         self.max_errors = [0.0, 0.0, 0.0]
-        """Maximum following errors since power was applied [m]."""
+        """Maximum following error of each slider since power was applied [m]."""
         self._drives = drives
         self._tick = tick
         self._interrupted = interrupted
@@ -107,14 +110,14 @@ class Bench:
         return self.feedback.position
 
     def cycle(self, rates: Triple = _ZERO_VELOCITY) -> Feedback:
-        """Run one cycle; hold powered drives at their targets, with target velocities `rates` [m/s].
+        """Run one cycle; send their target positions and the target velocities `rates` [m/s] to powered drives.
 
         Raises
         ------
         DrivesStoppedError
-            On any problem while a drive has power.
+            If there is a problem while a drive has power.
         KeyboardInterrupt
-            On Ctrl-C, once no drive has power.
+            If Ctrl-C was pressed; all drives are first stopped.
         """
         missed = self._tick()
         self._drives.sync()
@@ -128,7 +131,7 @@ class Bench:
         if reason := self._check(feedback, missed):
             self._stop_and_raise(reason)
         for index, position in enumerate(feedback.position):
-            # The target of a drive that does not follow yet is its own position: enabling must not make it jump.
+            # Until a drive follows setpoints, its measured position is its target, so that enabling causes no jump.
             if index not in self._powered or not feedback.follows[index]:
                 self._target[index] = position
         a, b, c = self._target
@@ -137,19 +140,20 @@ class Bench:
         return feedback
 
     def wait(self, seconds: float) -> Feedback:
-        """Run cycles for `seconds` [s]."""
+        """Run cycles for `seconds` [s]; return the last feedback."""
         for _ in range(max(1, round(seconds / self.period))):
             self.cycle()
         return self.feedback
 
     @contextmanager
     def power(self, alone: str | None = None) -> Iterator[None]:
-        """Enable all drives, or only the drive named `alone`, and disable them on exit.
+        """Enable all drives, or only the drive named `alone`; disable them when the context ends.
 
         Raises
         ------
         DrivesStoppedError
-            If a slider moves before power is applied, or a drive is not enabled within `watchdogs.enable_timeout`.
+            If a slider moves before power is applied, if a drive is not enabled within `watchdogs.enable_timeout`, or
+            if the drives report a fault.
         """
         self.clear_fault()
         before = self.feedback.position
@@ -184,7 +188,7 @@ class Bench:
             raise DrivesStoppedError(fault.message)
 
     def play(self, move: SlowMove) -> MeasuredMotion:
-        """Move the powered sliders along `move` from their targets, and let them settle."""
+        """Move the powered sliders from their targets along `move`, and wait until they have settled."""
         start = tuple(self._target)
         measured = []
         for offset, rate in zip(move.position.tolist(), move.velocity.tolist(), strict=True):
@@ -196,7 +200,7 @@ class Bench:
         return MeasuredMotion(np.array(measured), (a, b, c))
 
     def home(self, timeout: float) -> None:
-        """Home the only powered drive within `timeout` [s]. Raises DrivesStoppedError."""
+        """Home the powered drive. Raises DrivesStoppedError if the drive is not homed within `timeout` [s]."""
         self._drives.home()
         for _ in range(round(timeout / self.period)):
             self.cycle()
@@ -205,7 +209,10 @@ class Bench:
         self._stop_and_raise(f"not homed within {timeout:g} s")
 
     def provoke_watchdog(self, seconds: float) -> WatchdogReaction:
-        """Send neither SYNC nor heartbeat for `seconds` [s], or until the powered drive switches off its power."""
+        """Send neither SYNC nor heartbeat until the powered drive reacts, at most for `seconds` [s].
+
+        Return the reaction. Afterwards, all drives are stopped.
+        """
         (index,) = self._powered
         for number in range(1, round(seconds / self.period) + 1):
             feedback = self._read_without_sync()
@@ -214,7 +221,7 @@ class Bench:
                 return self._reaction(index, number * self.period)
             if self._interrupted():
                 self._stop_and_raise(INTERRUPTED)
-        # A drive that sends its status only in answer to SYNC could not report a state change until now.
+        # A drive that sends its status only in answer to SYNC can report a change of state only after another SYNC.
         self._drives.sync()
         state = self._read_without_sync().state[index]
         self._stop()
@@ -226,10 +233,13 @@ class Bench:
         return self.feedback
 
     def _reaction(self, index: int, after: float) -> WatchdogReaction:
-        """Collect the drives' fault messages, then stop all drives."""
+        """Collect the fault messages of the drives, and stop all drives; return the reaction of the powered drive.
+
+        `index` is the index of the powered drive, and `after` the time since the last SYNC [s].
+        """
         fault, state = self.feedback.fault, self.feedback.state[index]
         if fault is not None and fault.drive != NAMES[index]:
-            # Another drive missed the same heartbeat and reported first; the driver has stopped all drives for it.
+            # Another drive missed the same heartbeat and reported first. The driver has then stopped all drives.
             for _ in range(round(FAULT_WINDOW_S / self.period)):
                 self._read_without_sync()
         own = self._drives.reported_faults[index]
@@ -241,7 +251,7 @@ class Bench:
         return WatchdogReaction(after if is_own else None, own.drive, own.message, own.code)
 
     def clear_fault(self) -> None:
-        """Reset a fault, if there is one. Raises DrivesStoppedError if it does not clear."""
+        """Reset a fault, if there is one. Raises DrivesStoppedError if the fault persists."""
         if self.feedback.fault is not None:
             self._drives.reset()
             if (fault := self.wait(RESET_TIMEOUT_S).fault) is not None:
@@ -251,7 +261,7 @@ class Bench:
         return all(feedback.state[index] is PowerState.OPERATION_ENABLED for index in self._powered)
 
     def _check(self, feedback: Feedback, missed: int) -> str:
-        """Return the reason to stop the drives now; "" for none."""
+        """Return the reason why the drives must be stopped; "" if there is no problem."""
         if feedback.fault is not None:
             return feedback.fault.message
         if self._interrupted():
@@ -265,11 +275,11 @@ class Bench:
                     return f"drive {name}: enabled, although this step leaves it without power"
                 continue
             if state is PowerState.OPERATION_ENABLED and feedback.follows[index]:
-                # An old position answers an older setpoint: compare it with the one of its own cycle.
+                # Compare an old position with the setpoint that was in effect when the position was sampled.
                 sent = self._setpoints[-FEEDBACK_DELAY_CYCLES - min(feedback.age[index], 7)]
                 error = sent[index] - feedback.position[index]
                 self.max_errors[index] = max(self.max_errors[index], abs(error))
-                if not abs(error) <= MAX_FOLLOWING_ERROR_M:  # also true of nan
+                if not abs(error) <= MAX_FOLLOWING_ERROR_M:  # also true if the error is NaN
                     slider = f"slider {self._labels[index]}"
                     limit = MAX_FOLLOWING_ERROR_M * 1e3
                     return f"{slider}: following error {error * 1e3:.3f} mm exceeds the limit of {limit:g} mm"
@@ -289,7 +299,7 @@ class Bench:
         self._wait_without_power()
 
     def _wait_without_power(self) -> None:
-        """Run cycles until no drive has power, at most for `drives.stop_timeout` plus the settling time."""
+        """Run cycles until no drive has power, at most for `drives.stop_timeout` plus SETTLE_TIME_S."""
         self._powered = ()
         for _ in range(round((self.config.drives.stop_timeout + SETTLE_TIME_S) / self.period)):
             self._tick()

@@ -1,4 +1,4 @@
-"""Edits of a configuration file that keep the user's comments, order and spelling."""
+"""Edits of a configuration file that preserve the user's comments, order of keys and formatting."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from trirail.kinematics.geometry import Geometry
 
 
 def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
-    """Return the text of a configuration with new values for the keys in `changes`, which are full paths.
+    """Return the text of a configuration with new values. The keys in `changes` are full paths, as `drives.A.node`.
 
-    Raises ConfigError if the result is not a valid configuration, or differs in any other value.
+    Raises ConfigError if the result is not a valid configuration, or if any other value has changed.
     """
     document = tomlkit.parse(text)
     for path, value in changes.items():
@@ -33,7 +33,7 @@ def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
         else:
             table.add(key, value)
     result = tomlkit.dumps(document)
-    # tomlkit edits the text; only the parsed result shows that nothing else has changed.
+    # tomlkit edits the text. Parse the result to check that nothing else has changed.
     if parse(result) != replace_values(parse(text), changes):
         raise ConfigError(f"changes {dict(changes)}: cannot be written to this file; edit it by hand")
     return result
@@ -42,9 +42,9 @@ def edit_text(text: str, changes: Mapping[str, int | float]) -> str:
 def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | None) -> str:
     """Return a configuration's text with the legs of `robot`, corrected encoder scales, and another correction map.
 
-    A slider moves by 1 + scale for each metre of its encoder. A correction map of the old geometry is removed.
-    `map_file` names its replacement, or is None. Raises ConfigError if the result is not a valid configuration, or
-    differs in any other value.
+    Each slider moves by (1 + scale) metres for each metre that its encoder counts. The correction map of the old
+    geometry is removed. `map_file` is the name of a new correction map; None for no map. Raises ConfigError if the
+    result is not a valid configuration, or if any other value has changed.
     """
     document = tomlkit.parse(text)
     if "correction" in document:
@@ -81,7 +81,7 @@ def edit_geometry(text: str, robot: Geometry, scales: Triple, map_file: str | No
 
 
 def _rounded(value: object) -> object:
-    """Return numbers rounded to a nanometre or nanoradian, the resolution of a checksum of the geometry."""
+    """Round numbers to a nanometre or nanoradian, the resolution of the geometry's checksum."""
     if isinstance(value, tuple):
         return [round(each, 9) for each in value]
     return round(value, 9) if isinstance(value, float) else value
@@ -100,7 +100,7 @@ def replace_values(config: Config, changes: Mapping[str, int | float]) -> Config
 def add_simulated_build(text: str, drives: Drives) -> str:
     """Return a configuration's text with `can.simulated.built` set to the node, scale and direction of `drives`.
 
-    Simulated faults are relative to the simulated robot, so a correction in [drives] must not move that reference.
+    Simulated faults are deviations from these values, so a correction in [drives] must not change the values.
     """
     document = tomlkit.parse(text)
     rows = tomlkit.array().multiline(True)
@@ -116,7 +116,7 @@ def add_simulated_build(text: str, drives: Drives) -> str:
 
 
 def resolve_eds_paths(text: str, folder: Path) -> str:
-    """Return a configuration's text with the EDS paths of the drives made absolute. They are relative to `folder`."""
+    """Return a configuration's text with absolute EDS paths of the drives, which were relative to `folder`."""
     document = tomlkit.parse(text)
     for name in NAMES:
         drive = document["drives"][name]
@@ -126,7 +126,10 @@ def resolve_eds_paths(text: str, folder: Path) -> str:
 
 
 def find_free_path(path: Path, word: str = "commissioned") -> Path:
-    """Return an unused path beside a configuration for the corrected one. Its name contains `word`."""
+    """Return an unused path for a corrected configuration, in the folder of the original `path`.
+
+    The file's name contains `word`.
+    """
     number, free = 1, path.with_name(f"{path.stem}-{word}.toml")
     while free.exists():
         number += 1
@@ -135,7 +138,7 @@ def find_free_path(path: Path, word: str = "commissioned") -> Path:
 
 
 def write_new_file(path: Path, text: str) -> None:
-    """Write a new file. Raises ConfigError if the file exists."""
+    """Write a new file. Raises ConfigError if the file exists or cannot be written."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

@@ -1,4 +1,4 @@
-"""Coupling of drives to sliders: which drive moves which slider, its direction and its scale; pure functions."""
+"""Judgement of the coupling between drives and sliders: assignment, direction and scale. All functions are pure."""
 
 from __future__ import annotations
 
@@ -12,75 +12,83 @@ from trirail.commissioning.judgement import Changes, Judgement, format_mm
 from trirail.naming import Labels, label
 
 SCALE_TOLERANCE: Final = 0.02
-"""Relative difference between drive and rule above which the scale is wrong, for a stroke by hand."""
+"""Relative difference between drive and rule above which the scale counts as wrong, for a stroke by hand."""
 MAX_RULE_UNCERTAINTY: Final = 0.5
-"""Uncertainty of the rule, relative to the stroke, above which the rule shows no scale."""
+"""Uncertainty of the rule, relative to the stroke, above which the rule cannot show the scale."""
 PLAY_TOLERANCE: Final = 0.1
-"""The same tolerance for 1 mm under power. Play in screw or belt is a larger share of such a short stroke."""
+"""Relative difference between drive and rule above which the scale counts as wrong, for a stroke of 1 mm under power.
+
+The tolerance is larger than SCALE_TOLERANCE, because play in the screw or belt is a larger share of a short stroke."""
 MAX_BACKLASH_M: Final = 0.0004
-"""Loss in both directions that may be backlash [m]: over 1 mm it looks like a wrong scale."""
+"""Maximum loss of travel in both directions that backlash can explain [m].
+
+Over a stroke of 1 mm, backlash has the same effect as a wrong scale."""
 MIN_COUNTED_SHARE: Final = 0.2
-"""Share of a stroke below which the encoder counts as not moving."""
+"""Fraction of a stroke below which an encoder does not move, for a stroke under power."""
 MIN_PUSHED_SHARE: Final = 0.02
-"""The same share for a stroke by hand, where the scale may be far off."""
+"""Fraction of a stroke below which an encoder does not move, for a stroke by hand.
+
+It is smaller than MIN_COUNTED_SHARE, because the scale may be very wrong."""
 MIN_REVERSED_SHARE: Final = 0.05
-"""Share of a stroke counted backwards above which the encoder counts against its motor."""
+"""Fraction of a stroke, counted in the wrong direction, above which an encoder counts against its motor."""
 LOOSE_ENCODER_REMEDY: Final = "fasten the encoder of drive {} on its shaft, and check its cable; no power before that"
 
 
 class MoveObservation(NamedTuple):
-    """Observation of a single powered drive that moved its slider out and back. Lengths are signed [m]."""
+    """Measurements while a single powered drive moves out and back. Lengths are signed [m]."""
 
     drive: str
     commanded: float
     out: float
-    """Distance by its encoder."""
+    """Distance on the way out, measured by the drive's encoder."""
     back: float
-    """Distance by its encoder on the way back."""
+    """Distance on the way back, measured by the drive's encoder."""
     following: float
-    """Its maximum following error."""
+    """Maximum following error of the drive."""
     stopped: str
-    """Reason for a stop on the way, or ""."""
+    """Reason why the drives were stopped during the motion; "" if they were not stopped."""
     slider: str | None
-    """Slider that the person saw moving, if any."""
+    """Slider that the person saw moving; None if no slider moved."""
     rule_out: float
-    """Distance by the rule beside that slider."""
+    """Distance of the slider on the way out, measured by the rule."""
     rule_back: float
-    """Rule reading after the way back, relative to the start."""
+    """Reading of the rule after the way back, relative to the reading at the start."""
     rule_resolution: float
     encoder_resolution: float
     labels: Labels = NAMES
 
 
 class PushObservation(NamedTuple):
-    """Observation of a slider pushed out and back by hand, without power. Lengths are signed [m]."""
+    """Measurements while a person pushes a slider out and back by hand, without power. Lengths are signed [m]."""
 
     slider: str
     rule: float
+    """Distance on the way out, measured by the rule."""
     counted: tuple[float, float, float]
-    """Distances by the encoders of drives A, B, C."""
+    """Distances on the way out, measured by the encoders of the drives A, B, C."""
     rule_back: float
-    """Distance by the rule on the way back, to about the start."""
+    """Distance on the way back, measured by the rule."""
     counted_back: tuple[float, float, float]
+    """Distances on the way back, measured by the encoders of the drives A, B, C."""
     rule_resolution: float
     encoder_resolution: float
     labels: Labels = NAMES
 
 
 class _Stroke(NamedTuple):
-    """Motion in one direction, by the encoder and by the rule [m]."""
+    """Distance of a motion in one direction, measured by the encoder and by the rule [m]."""
 
     counted: float
     rule: float
 
     @property
     def ratio(self) -> float:
-        """Ratio of counted to real distance."""
+        """Ratio of the distance that the encoder counted to the distance on the rule."""
         return abs(self.counted / self.rule)
 
 
 def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
-    """Determine which slider a drive moved, in which direction and how far, and whether its encoder follows."""
+    """Judge if a powered drive moved its slider in the right direction and by the right distance."""
     name, slider = seen.drive, seen.slider
     by_encoder = (
         f"drive {name} counted {format_mm(seen.out)} of {format_mm(seen.commanded)}, "
@@ -123,7 +131,7 @@ def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
     losses = [abs(stroke.counted) - abs(stroke.rule) for stroke in (out, back)]
     uncertainty = 2.0 * (seen.rule_resolution + seen.encoder_resolution)
     readable = uncertainty <= MAX_RULE_UNCERTAINTY * min(abs(out.rule), abs(back.rule))
-    # A loss within the uncertainty of the rule may be the reading alone.
+    # A loss that is smaller than the uncertainty of the rule may be only an error of the reading.
     is_lossy = min(losses) > max(PLAY_TOLERANCE * abs(seen.out), uncertainty)
     if slider == name and readable and is_lossy and max(losses) <= MAX_BACKLASH_M:
         return Judgement(
@@ -140,7 +148,7 @@ def judge_move(seen: MoveObservation, drives: Drives) -> Judgement:
 
 
 def judge_push(seen: PushObservation, drives: Drives) -> Judgement:
-    """Determine which drive has its encoder on the pushed slider, and its direction and scale."""
+    """Judge if the encoder on a pushed slider belongs to the right drive, with the right direction and scale."""
     at = NAMES.index(seen.slider)
     sizes = [max(abs(out), abs(back)) for out, back in zip(seen.counted, seen.counted_back, strict=True)]
     largest = sizes.index(max(sizes))
@@ -175,10 +183,10 @@ def _judge_coupling(
     words: tuple[str, ...],
     tolerance: float,
 ) -> Judgement:
-    """Judge a drive by two strokes of the slider that it moves.
+    """Judge the node, direction and scale of the drive `name` from two strokes of the slider that belongs to it.
 
-    A wrong scale is the same factor in both directions, slip and play are not: the ratios of the strokes must agree
-    within `tolerance`, or within the uncertainty of the rule.
+    A wrong scale has the same effect in both directions, but slip and play do not. A scale is therefore judged only if
+    the ratios of the two strokes agree within `tolerance`, or within the uncertainty of the rule.
     """
     drive, configured = _drive(drives, name), _drive(drives, slider)
     rule_resolution, encoder_resolution = seen.rule_resolution, seen.encoder_resolution
@@ -230,7 +238,7 @@ def _node_change(slider: str, configured: Drive, drive: Drive) -> Changes:
 def _propose_changes(
     slider: str, configured: Drive, values: Mapping[str, int | float], reasons: Sequence[str]
 ) -> Judgement:
-    """Return a judgement that proposes the values that differ from the configured ones."""
+    """Return a judgement that proposes those of the `values` that differ from the configured values."""
     different = {key: value for key, value in values.items() if value != getattr(configured, key)}
     if not different:
         return Judgement("ok", tuple(reasons))
@@ -245,7 +253,7 @@ def _drive(drives: Drives, name: str) -> Drive:
 
 
 def _round_counts(counts: float, uncertainty: float) -> float:
-    """Round to the digits that a relative uncertainty supports, and one more."""
+    """Round to one digit more than a relative uncertainty justifies."""
     digits = 2
     while 10.0**-digits > uncertainty / 10.0 and digits < 8:
         digits += 1

@@ -1,4 +1,4 @@
-"""Text lines that describe an inspected drive: its identity, and the values that its set-up changes."""
+"""Text lines that describe an inspected drive: the drive's identity, and the values that the set-up changes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from trirail.naming import Labels
 
 
 def format_identity(drive: dict[str, Any], labels: Labels) -> list[str]:
-    """Return lines with a drive's identity, modes and units; `drive` is an entry of the protocol's `inspect`."""
+    """Return lines with the identity, modes and units of a drive.
+
+    `drive` is one of the entries that the `inspect` function of the drive's protocol returns.
+    """
     lines = [f"{naming.drive(drive['name'], labels)}, node {drive['node']}"]
     if "device_type" in drive:
         numbers = ", ".join(f"{key} {drive[key]}" for key in ("vendor", "product", "revision", "serial"))
@@ -22,7 +25,10 @@ def format_identity(drive: dict[str, Any], labels: Labels) -> list[str]:
 
 
 def format_differences(drive: dict[str, Any], *, applied: bool) -> list[str]:
-    """Return lines with the values that its set-up writes, or has written (`applied`), missing objects and refusals."""
+    """Return lines with the values that the set-up changes, the objects that the drive lacks, and refusals.
+
+    `drive` is an entry as in `format_identity`. `applied` is True if the set-up has written the values.
+    """
     lines = []
     if "device_type" in drive:
         verb = "written" if applied else "would be written"

@@ -1,4 +1,7 @@
-"""Guide through the steps in order. Each step can be skipped and repeated, and may require earlier steps."""
+"""Guide that leads a person through the steps of a commissioning.
+
+The person can skip and repeat each step. A step may require that earlier steps were successful.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,10 @@ from trirail.config import Config
 
 
 def merge_changes(proposals: Sequence[Changes], drives: Drives) -> tuple[dict[str, int | float], str]:
-    """Return the changes of all steps together, and the reason why node ids cannot be exchanged; "" if they can.
+    """Merge the changes that the steps propose; return them, and the reason why node ids cannot be changed, or "".
 
-    If a node id moves to another slider, its own slider has none. The two node ids are therefore exchanged, unless
-    another step contradicts this.
+    If a node id moves to another slider, the slider that had this node id needs another one. The two node ids are
+    therefore exchanged, unless another step contradicts the exchange.
     """
     changes = {key: value for each in proposals for key, value in each.items()}
     nodes = {name: drive.node for name, drive in zip(NAMES, drives.each, strict=True)}
@@ -53,12 +56,12 @@ class GuideStep(NamedTuple):
     drive: str
     title: str
     description: str
-    """Line that announces motion or power to the person, and describes their task."""
+    """Line that warns the person of motion or power, and describes the person's task."""
     run: Callable[[], StepOutcome]
     needs: tuple[tuple[str, str], ...] = ()
-    """Steps that must be ok before this step."""
+    """Steps, each with its drive, that must be ok before this step runs."""
     not_after: tuple[tuple[str, str], ...] = ()
-    """Steps that must not have found a defect before this step."""
+    """Steps, each with its drive, that prevent this step if they have found a defect."""
 
 
 def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
@@ -184,10 +187,10 @@ def plan_steps(steps: Steps, config: Config) -> list[GuideStep]:
 
 
 class Guide:
-    """Guide that runs the steps with a person and records the judgements."""
+    """Guide that runs the steps together with a person, and records the judgements in a report."""
 
     def __init__(self, config: Config, path: Path, steps: Steps, operator: Operator, report_file: ReportFile) -> None:
-        """Create the guide. `path` is the path of the configuration."""
+        """Create the guide; `path` is the path of the configuration file."""
         self._config = config
         self._path = path
         self._steps = steps
@@ -216,9 +219,9 @@ class Guide:
             at = self._run_step(step, at)
 
     def write(self, out: Path | None) -> Path | None:
-        """Write the corrected configuration to `out`, or to an unused path beside the original.
+        """Write the corrected configuration to `out`, or to an unused path in the folder of the original.
 
-        Returns the path of the file; None if nothing needs a correction.
+        Return the path of the new file; None if the configuration needs no correction.
         """
         latest = self._report_file.report.latest.values()
         changes, conflict = merge_changes([entry.changes for entry in latest], self._config.drives)
@@ -246,7 +249,10 @@ class Guide:
         return written
 
     def _run_step(self, step: GuideStep, at: int) -> int:
-        """Run a step, skip it or go back, as the person chooses. Return the index of the next step."""
+        """Ask the person to run a step, skip it or return to the previous step; return the index of the next step.
+
+        `at` is the index of the step.
+        """
         choices = {"y": "run it", "s": "skip it", "b": "previous step"}
         choice = self._ask("  Run it? Enter or y, s skip, b back, q quit:", "y", choices)
         if choice == "s" and (step.name, step.drive) not in self._report_file.report.latest:

@@ -1,4 +1,4 @@
-"""Judgements of a step's measurements: a verdict in words and its remedy; pure functions."""
+"""Judgement of a step's measurements, with a verdict, reasons and a remedy. All functions are pure."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from trirail_drivers.interface import NAMES
 from trirail.naming import Labels, label
 
 Verdict = Literal["ok", "wrong", "failed", "skipped"]
-"""The step is correct; it found a defect; it could not be carried out; it was skipped."""
+"""Verdict on a step: "ok", "wrong" if it found a defect, "failed" if it could not be carried out, or "skipped"."""
 Changes = Mapping[str, int | float]
-"""New values of configuration keys, each by its whole path, as `drives.A.node`."""
+"""New values of configuration keys, by the full path of each key, as `drives.A.node`."""
 
 
 SWITCHES: Final = {1: "negative limit switch", 2: "positive limit switch", 4: "home switch"}
-"""Bits of the digital inputs 60FDh (CiA 402-2)."""
+"""Names of the switches by their bits in the digital inputs 60FDh (CiA 402-2)."""
 LIMIT_BITS: Final = (1, 2)
 HEARTBEAT_MISSING: Final = 0x8130
-"""EMCY code of a lost heartbeat or life guarding (CiA 301, emergency error codes)."""
+"""EMCY error code for a life guard or heartbeat error (CiA 301, emergency error codes)."""
 
 
 class Judgement(NamedTuple):
-    """Verdict on a step, with its reasons and the changes that it proposes."""
+    """Verdict on a step, with reasons, a remedy and proposed changes of the configuration."""
 
     verdict: Verdict
     words: tuple[str, ...]
@@ -33,7 +33,10 @@ class Judgement(NamedTuple):
 
 
 def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judgement:
-    """Evaluate the power test of a drive that was enabled on its own for `seconds` [s] and moved by `drift` [m]."""
+    """Judge the power test, in which a single enabled drive held its slider for `seconds` [s].
+
+    `drift` is the maximum following error [m]. `stopped` is the reason why the drives were stopped, or "".
+    """
     if stopped:
         return Judgement(
             "failed",
@@ -46,16 +49,16 @@ def judge_power(drive: str, drift: float, seconds: float, stopped: str) -> Judge
 
 
 def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: Labels = NAMES) -> Judgement:
-    """Evaluate the test of a slider's switches.
+    """Judge the test of a slider's switches.
 
     Parameters
     ----------
     rest
         Bits of 60FDh while no switch is pressed.
     changed
-        Bits that changed when the person pressed each switch.
+        Bits that changed while the person pressed the switches.
     confirmed
-        True if the person agrees that these are all switches of the slider.
+        True if the person confirmed that these are all switches of the slider.
     """
     states = [f"{switch} {'changed' if changed & bit else 'never changed'}" for bit, switch in SWITCHES.items()]
     words = (f"drive {name} reported: {', '.join(states)}",)
@@ -79,7 +82,11 @@ def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: 
 def judge_homing(
     drive: str, travel: float, position: float, confirmed: bool, stopped: str, labels: Labels = NAMES
 ) -> Judgement:
-    """Evaluate a homing that ended at `position` [m] after `travel` [m]. The person confirms the home switch."""
+    """Judge a homing that ended at `position` [m] after `travel` [m].
+
+    `confirmed` is True if the person confirmed that the slider is at its home switch. `stopped` is the reason why the
+    drives were stopped, or "".
+    """
     slider = f"slider {label(drive, labels)}"
     if stopped:
         return Judgement(
@@ -98,7 +105,10 @@ def judge_homing(
 
 
 def judge_watchdog(drive: str, seconds: float | None, reporter: str, message: str, code: int) -> Judgement:
-    """Evaluate a powered drive's reaction to missing SYNCs and heartbeats, as in `WatchdogReaction`."""
+    """Judge the reaction of a powered drive to missing SYNCs and heartbeats.
+
+    The other parameters are the fields of trirail.commissioning.bench.WatchdogReaction.
+    """
     if seconds is not None:
         words = (f"drive {drive} switched its power off {seconds * 1e3:.0f} ms after the last SYNC: {message}",)
         if code == HEARTBEAT_MISSING:
@@ -117,16 +127,18 @@ def judge_watchdog(drive: str, seconds: float | None, reporter: str, message: st
 def judge_square(
     deviation: float, following: Sequence[float], confirmed: bool, stopped: str, labels: Labels = NAMES
 ) -> Judgement:
-    """Evaluate the motion of the platform around a square.
+    """Judge the motion of the platform around a square.
 
     Parameters
     ----------
     deviation
-        Maximum distance of the measured pose from the commanded pose [m].
+        Maximum distance of the measured positions of the platform from the square [m].
     following
         Maximum following error of each slider [m].
     confirmed
         True if the person saw the platform move around the square.
+    stopped
+        Reason why the drives were stopped; "" if they were not stopped.
     """
     if stopped:
         return Judgement("failed", (stopped,), "repeat the steps of the slider that is named")

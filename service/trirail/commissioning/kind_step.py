@@ -1,4 +1,7 @@
-"""Step that identifies the kind of mechanism: all three drives move, and a person reads an instrument beside a mark."""
+"""Step that identifies the kind of mechanism, 3-PRP or 3-PPR.
+
+All three drives move, and a person measures the travel of a mark on the platform with an instrument.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,10 @@ REMEDY = "move the sliders, by hand or by homing, until the platform is well wit
 
 
 class KindStep:
-    """Turn of the platform and a straight motion. The middle part of the motion is measured from outside."""
+    """Step with three motions; a person measures the travel of a mark in the second motion.
+
+    The first motion turns the platform, the second moves it along a straight line, and the third returns to the start.
+    """
 
     def __init__(self, session: Session, observer: Observer) -> None:
         self._session = session
@@ -79,13 +85,16 @@ class KindStep:
             return Judgement("failed", (str(error),), "repeat the steps of the slider that is named"), {}
         try:
             seen = predict_mark(self._robot, other, first, second, move.axis)
-        except KinematicsError as error:  # at the edge of the other kind's reach the sliders may miss it by a count
+        except KinematicsError as error:  # the measured positions may be just outside the reach of the other kind
             return Judgement("failed", (str(error),), REMEDY), {}
         moved = after - before
         return judge_kind(kinds, move, seen, moved, resolution), _measured(seen, moved, resolution)
 
     def _move_to(self, target: Array) -> None:
-        """Move all three sliders to `target`, (3,) [m], enabled for that time only. Raises DrivesStoppedError."""
+        """Move all three sliders to `target`, (3,) [m], with the drives enabled only during the motion.
+
+        Raises DrivesStoppedError.
+        """
         bench = self._session.bench()
         distances = target - np.array(bench.position)
         with bench.power():

@@ -1,7 +1,8 @@
-"""Test of the mechanism's kind, 3-PRP or 3-PPR: a motion on which both kinds differ, and its judgement; pure functions.
+"""Test of the mechanism's kind, 3-PRP or 3-PPR, with a motion that differs between the kinds. All functions are pure.
 
-A 3-PRP platform at angle phi that receives the slider motion of a 3-PPR along x leaves its line by sin phi cos phi of
-the distance; in the opposite case by tan phi. That is of first order in phi; a turn alone differs in second order.
+Consider the slider motion with which a 3-PPR platform at angle phi moves along x. The same slider motion makes a 3-PRP
+platform leave the line by sin phi cos phi times the distance. In the opposite case, the factor is tan phi. The two
+kinds thus differ in first order of phi; for a pure rotation, they differ only in second order.
 """
 
 from __future__ import annotations
@@ -20,48 +21,56 @@ from trirail.kinematics.geometry import Geometry, travels
 from trirail.kinematics.robot import forward, inverse
 
 MIN_SEPARATION: Final = 8.0
-"""Minimum separation of both predictions, in multiples of the instrument's resolution."""
+"""Minimum separation of the predictions for the two kinds, in multiples of the instrument's resolution."""
 AMPLE_SEPARATION: Final = 24.0
-"""Separation at which the search for a larger motion ends, in the same multiples."""
+"""Separation that is large enough to end the search for a motion, in multiples of the instrument's resolution."""
 MARK_RADIUS_M: Final = 0.005
 """Maximum distance of the mark from the platform's centre [m]."""
 SHARES: Final = tuple(np.linspace(0.05, 1.0, 20).tolist())
-"""Candidate ends of the motion, as shares of the platform's limits."""
+"""Candidates for the size of the motion, as fractions of the way from the start to the platform's limits."""
 LIMIT_SAMPLES: Final = 33
-"""Points of each part of the motion at which the limits are checked."""
+"""Number of points in each part of the motion at which the limits are checked."""
 AXES: Final = ("x", "y")
 
 
 class KindTestMove(NamedTuple):
-    """Slider positions of the test, (3,) each [m], and the axis of the measurement: 0 for x, 1 for y."""
+    """Motion that distinguishes the two kinds. The travel of the mark is measured from `first` to `second`."""
 
     first: Array
+    """Slider positions at the start of the measurement, (3,) [m]."""
     second: Array
+    """Slider positions at the end of the measurement, (3,) [m]."""
     axis: int
+    """Axis along which the travel of the mark is measured: 0 for x, 1 for y."""
     turn: float
     """Platform angle at both positions [rad]."""
     along: int
-    """Axis along which the configured kind moves from the first to the second position."""
+    """Axis along which a platform of the configured kind moves from `first` to `second`: 0 for x, 1 for y."""
     distance: float
-    """Length of that motion [m]."""
+    """Distance of the motion from `first` to `second`, with its sign [m]."""
 
 
 class MarkPrediction(NamedTuple):
-    """Predicted travel of the mark along the axis [m]."""
+    """Predicted travel of the mark along the axis of the measurement, for both kinds of mechanism."""
 
     configured: float
+    """Travel for the configured kind [m]."""
     other: float
+    """Travel for the other kind [m]."""
     uncertainty: float
-    """Uncertainty, because the position of the mark on the platform is unknown."""
+    """Uncertainty of both predictions, since the position of the mark on the platform is unknown [m]."""
 
     @property
     def separation(self) -> float:
-        """Minimum difference of the two kinds [m]."""
+        """Minimum difference between the predictions for the two kinds [m]."""
         return abs(self.other - self.configured) - 2.0 * self.uncertainty
 
 
 def predict_mark(robot: Geometry, other: Geometry, first: Array, second: Array, axis: int) -> MarkPrediction:
-    """Return the travel of both kinds' centres between two slider positions. Raises KinematicsError."""
+    """Predict the travel of the mark along `axis` between the slider positions `first` and `second`, for both kinds.
+
+    Raises KinematicsError if the positions are out of reach for one of the kinds.
+    """
     travels = []
     for each in (robot, other):
         start = forward(each, first)
@@ -73,12 +82,14 @@ def predict_mark(robot: Geometry, other: Geometry, first: Array, second: Array, 
 def find_test_move(
     config: Config, robot: Geometry, other: Geometry, sliders: Array, resolution: float
 ) -> tuple[KindTestMove, MarkPrediction] | None:
-    """Return the smallest test motion with ample separation, else the one with the largest; None if there is none.
+    """Return the smallest test motion with ample separation, and the prediction for this motion.
 
-    The motion starts and ends at `sliders`. Both kinds stay within all limits.
+    If no motion has ample separation, return the motion with the largest separation. Return None if there is no
+    suitable motion. The motion starts and ends at the slider positions `sliders`, and stays within all limits for both
+    kinds.
     """
     best: tuple[KindTestMove, MarkPrediction] | None = None
-    # Shares ascend, so the first motion with ample separation is the smallest.
+    # The shares ascend, so the first motion with ample separation is the smallest of these.
     for share, along, turn in itertools.product(SHARES, (0, 1), (1, 0)):
         try:
             move = _make_move(config, robot, sliders, share, along, config.limits.platform.phi[turn])
@@ -111,7 +122,7 @@ def _make_move(config: Config, robot: Geometry, sliders: Array, share: float, al
 
 
 def _stays_within_limits(config: Config, robots: tuple[Geometry, Geometry], sliders: Array, move: KindTestMove) -> bool:
-    """Return True if sliders, cross slides and platform of both kinds stay within their limits, out and back."""
+    """Return True if the sliders, cross slides and platforms of both kinds stay within their limits during a motion."""
     platform, shares = config.limits.platform, np.linspace(0.0, 1.0, LIMIT_SAMPLES)[:, None]
     corners = (sliders, move.first, move.second, sliders)
     path = np.concatenate([a + shares * (b - a) for a, b in itertools.pairwise(corners)])
@@ -130,14 +141,14 @@ def _stays_within_limits(config: Config, robots: tuple[Geometry, Geometry], slid
 def judge_kind(
     kinds: tuple[str, str], move: KindTestMove, expected: MarkPrediction, moved: float | None, resolution: float
 ) -> Judgement:
-    """Determine the kind of mechanism from the travel of the mark.
+    """Judge from the travel of the mark if the mechanism is of the configured kind.
 
     Parameters
     ----------
     kinds
         Configured kind and the other kind.
     moved
-        Measured travel of the mark [m]; None if the motion was not run because the separation is too small.
+        Measured travel of the mark [m]; None if the motion was not run because the separation was too small.
     resolution
         Resolution of the instrument [m].
     """
@@ -155,7 +166,8 @@ def judge_kind(
         remedy = "use an instrument with a finer resolution, or start nearer to the middle of the travel"
         return Judgement("skipped", (planned, reason), remedy)
     measured = f"it moved {format_mm(moved)}"
-    # A quarter on either side leaves half of the separation as a gap in which the answer is "neither".
+    # With a tolerance of a quarter of the separation around each prediction, half of the separation remains as a gap in
+    # which the answer is "neither".
     allowed = expected.separation / 4.0 + expected.uncertainty
     if abs(moved - expected.configured) <= allowed:
         return Judgement("ok", (planned, f"{measured}: it is a {configured}, as configured"))

@@ -1,4 +1,4 @@
-"""Small, slow, jerk-limited motions of one slider, of all three, and of the platform around a square."""
+"""Small, slow and jerk-limited motions of one slider, of all three sliders, and of the platform around a square."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from trirail.motion.ruckig_call import try_solve
 from trirail.quantities import beyond
 
 TEST_DISTANCE_M = 0.001
-"""Travel of a slider, and side of the platform's square [m]."""
+"""Travel of a single slider, and length of the sides of the platform's square [m]."""
 MAX_VELOCITY = 0.005
-"""Velocity limit [m/s]."""
+"""Velocity limit of all motions [m/s]."""
 MAX_ACCELERATION = 0.05
-"""Acceleration limit [m/s²]."""
+"""Acceleration limit of all motions [m/s²]."""
 MAX_JERK = 1.0
-"""Jerk limit [m/s³]."""
+"""Jerk limit of all motions [m/s³]."""
 
 MIN_DISTANCE_M = 1e-9
-"""Travel below which a motion counts as none [m], because Ruckig cannot plan it."""
+"""Minimum travel of a motion that Ruckig can plan [m]."""
 
 
 class SlowMove(NamedTuple):
-    """Motion of the three sliders relative to its start, one row per cycle."""
+    """Motion of the three sliders relative to the start of the motion, with one row for each cycle."""
 
     position: Array
     """Offsets from the start, (N, 3) [m]."""
@@ -37,9 +37,9 @@ class SlowMove(NamedTuple):
 
 
 def plan_profile(distance: float, limits: SliderLimits, period: float) -> tuple[Array, Array]:
-    """Return positions [m] and velocities [m/s] from rest to rest, (N,) each, the last one at `distance` [m].
+    """Plan a motion from rest to rest over `distance` [m]; return the positions [m] and velocities [m/s], (N,) each.
 
-    The constants above and the configured `limits` both apply.
+    The first row is for the first cycle after the start. The limits of this module and the configured `limits` apply.
     """
     request = InputParameter(1)
     request.target_position = [distance]
@@ -55,7 +55,7 @@ def plan_profile(distance: float, limits: SliderLimits, period: float) -> tuple[
 
 
 def plan_joint_move(distances: Array, limits: SliderLimits, period: float) -> SlowMove:
-    """Return a motion of all three sliders over `distances` (3,) [m], on a straight line between both ends."""
+    """Plan a motion of all three sliders over `distances` (3,) [m], on a straight line in slider space."""
     longest = float(np.abs(distances).max())
     along, rate = plan_profile(max(longest, MIN_DISTANCE_M), limits, period)
     shares = distances / max(longest, MIN_DISTANCE_M)
@@ -63,7 +63,7 @@ def plan_joint_move(distances: Array, limits: SliderLimits, period: float) -> Sl
 
 
 def plan_slider_move(index: int, distance: float, limits: SliderLimits, period: float) -> SlowMove:
-    """Return a motion of one slider over `distance` [m]; the others hold."""
+    """Plan a motion of the slider `index` over `distance` [m]; the other sliders do not move."""
     along, rate = plan_profile(distance, limits, period)
     position, velocity = np.zeros((len(along), 3)), np.zeros((len(along), 3))
     position[:, index], velocity[:, index] = along, rate
@@ -71,16 +71,17 @@ def plan_slider_move(index: int, distance: float, limits: SliderLimits, period: 
 
 
 def plan_square(config: Config, sliders: tuple[float, float, float]) -> tuple[SlowMove, Array]:
-    """Return the slider motion that moves the platform around a square from its current pose, and the poses, (N, 3).
+    """Plan a slider motion that moves the platform around a square; return the motion and the platform's poses.
 
-    The platform moves by `TEST_DISTANCE_M` along x, along y, back along x, and back along y.
+    The poses are an array (N, 3) [m, m, rad]. The platform starts at the pose that belongs to the slider positions
+    `sliders` [m]. It moves by `TEST_DISTANCE_M` along x, along y, back along x, and back along y.
 
     Raises
     ------
     KinematicsError
-        If no pose matches the slider positions.
+        If no pose belongs to the slider positions, or if a pose of the square is out of reach.
     ValueError
-        If the square leaves a limit.
+        If the motion exceeds a limit.
     """
     robot = geometry(config.geometry)
     start = forward(robot, sliders)

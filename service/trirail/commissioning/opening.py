@@ -1,4 +1,4 @@
-"""Opening of the bus for a commissioning; the drives are left without power in every case."""
+"""Opening of the bus for a commissioning. When the bus is closed, the drives have no power, even after an error."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from trirail.processes.clock import Ticker
 
 
 class SimulatedClock:
-    """Clock of simulated drives: it advances by one period per cycle, so that a busy machine misses no cycle."""
+    """Clock of simulated drives, which advances by one period in each cycle so that a busy machine misses no cycle."""
 
     def __init__(self, period: float, sleep: Callable[[float], None]) -> None:
         self._period = period
@@ -35,14 +35,17 @@ class SimulatedClock:
         return self._now if self._free_since is None else self._now + time.monotonic() - self._free_since
 
     def tick(self) -> int:
-        """Wait for the next cycle and advance by a period; return 0, the number of cycles missed."""
+        """Wait for the next cycle, and advance the clock by one period; return 0, since no cycle can be missed."""
         self._now += self._period
         self._due = max(self._due + self._period, time.monotonic() - self._period)
         self._sleep(max(0.0, self._due - time.monotonic()))
         return 0
 
     def run_freely(self) -> None:
-        """Follow the machine's clock from now on: closing a driver waits, and no cycle advances this clock."""
+        """Advance with the machine's clock from now on.
+
+        The closing of a driver waits for some time, while no cycle advances this clock.
+        """
         self._free_since = time.monotonic()
 
 
@@ -54,10 +57,10 @@ def open_steps(
     interrupted: Callable[[], bool],
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Steps]:
-    """Yield the steps on the configured bus; `faults` are faults on demand of simulated drives.
+    """Open the configured bus, and yield the steps of a commissioning.
 
-    With real drives the process takes real-time rights, as the service does: `loop.realtime`. Raises BusError,
-    FaultSyntaxError, ServiceError.
+    `faults` are the faults that simulated drives shall show. If the drives are real, the process acquires real-time
+    rights according to `loop.realtime`, like the service. Raises BusError, FaultSyntaxError and ServiceError.
     """
     warm_up()
     driver: DriveGroup | None = None

@@ -1,4 +1,4 @@
-"""Interface to the person beside the robot: lines to show and questions to ask."""
+"""Interface to the person at the robot, with lines to show and questions to ask."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail.wire.units import LENGTH, quantity
 
 
 class QuitRequest(Exception):
-    """Raised when the person ends the commissioning."""
+    """Exception raised when the person ends the commissioning."""
 
 
 class Question(NamedTuple):
@@ -18,11 +18,11 @@ class Question(NamedTuple):
 
     text: str
     default: str | None = None
-    """Meaning of an empty answer; None if an answer is required."""
+    """Answer that replaces an empty answer; None if an empty answer is not allowed."""
 
 
 class Operator(Protocol):
-    """Person who answers. Raises QuitRequest when there are no more answers."""
+    """Interface to the person who answers questions. Raises QuitRequest if there can be no more answers."""
 
     def show(self, line: str) -> None:
         """Show a line."""
@@ -31,14 +31,18 @@ class Operator(Protocol):
         """Show the judgement of a step."""
 
     def ask(self, question: Question, idle: Callable[[], object]) -> str:
-        """Return the answer, stripped; never empty if there is a default.
+        """Ask a question; return the answer without surrounding blanks, or the default for an empty answer.
 
-        `idle` keeps the drives alive: it must be called at least once per cycle, and waits for the next one itself.
+        `idle` runs one cycle of the drives, and includes the wait for the next cycle. It must be called repeatedly, at
+        least once in each cycle, until the person has answered.
         """
 
 
 def ask_choice(operator: Operator, idle: Callable[[], object], question: Question, choices: dict[str, str]) -> str:
-    """Return one of the choices, which map an answer to its meaning; ask until it is one. Raises QuitRequest."""
+    """Ask a question until the answer is one of the choices; return this choice.
+
+    `choices` maps each allowed answer to its meaning. Raises QuitRequest if the answer is q or quit.
+    """
     while True:
         answer = operator.ask(question, idle).lower()
         if answer in ("q", "quit"):
@@ -53,9 +57,9 @@ def ask_choice(operator: Operator, idle: Callable[[], object], question: Questio
 def ask_length(
     operator: Operator, idle: Callable[[], object], question: Question, low: float = -10.0, high: float = 10.0
 ) -> float:
-    """Return a length [m] between both bounds, typed in mm unless it has a unit; ask until it is valid.
+    """Ask a question until the answer is a length from `low` to `high` [m]; return the length [m].
 
-    Raises QuitRequest.
+    An answer without a unit is in mm. Raises QuitRequest if the answer is q or quit.
     """
     while True:
         answer = operator.ask(question, idle)

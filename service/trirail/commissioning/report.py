@@ -1,4 +1,4 @@
-"""Report of a commissioning. It is saved after every step, as JSON for programs and as text for people."""
+"""Report of a commissioning, which is saved after every step, as JSON for programs and as text for people."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Number = float | int | str | bool | None
 
 
 class StepReport(Struct, frozen=True):
-    """Entry for a step that was carried out or skipped."""
+    """Entry in the report for a step that was run or skipped."""
 
     step: str
     drive: str
@@ -25,15 +25,15 @@ class StepReport(Struct, frozen=True):
     words: tuple[str, ...]
     remedy: str
     measured: dict[str, Number]
-    """Measured lengths [m] and times [s], with sign."""
+    """Measured values by name; lengths are signed [m], and times are in [s]."""
     changes: dict[str, int | float]
-    """Proposed values of configuration keys."""
+    """Proposed new values of configuration keys."""
     at: str
     """Wall-clock time at the end of the step (ISO 8601)."""
 
 
 class CommissioningReport(Struct):
-    """Report of all steps in the order in which they were run. The last run of a repeated step counts."""
+    """Report of all steps, in the order in which they were run. If a step was repeated, its last run counts."""
 
     robot: str
     config: str
@@ -44,28 +44,28 @@ class CommissioningReport(Struct):
     """All steps of the guide, each with its drive."""
     steps: list[StepReport] = []
     changes: dict[str, int | float] = {}
-    """Proposed values of configuration keys, from all steps together."""
+    """Proposed new values of configuration keys, merged from all steps."""
     written: str | None = None
-    """Path of the corrected configuration."""
+    """Path of the corrected configuration; None if no corrected configuration was written."""
 
     @property
     def latest(self) -> dict[tuple[str, str], StepReport]:
-        """Last run of each step."""
+        """Entry for the last run of each step, by the step's name and drive."""
         return {(entry.step, entry.drive): entry for entry in self.steps}
 
     @property
     def ok(self) -> bool:
-        """True if no step that was run found a defect or failed."""
+        """True if all steps that were run are ok; skipped steps do not matter."""
         return all(entry.verdict in ("ok", "skipped") for entry in self.latest.values())
 
     @property
     def complete(self) -> bool:
-        """True if every step was run and is ok."""
+        """True if all steps of the guide were run and are ok."""
         return bool(self.steps) and not self.incomplete
 
     @property
     def incomplete(self) -> list[str]:
-        """Steps that were not run, or are not ok."""
+        """Names of the steps that were not run or are not ok."""
         latest = self.latest
         return [
             f"{step} {drive}".rstrip()
@@ -75,10 +75,10 @@ class CommissioningReport(Struct):
 
 
 class ReportFile:
-    """A report's JSON file, and the text file for people beside it."""
+    """JSON file of a report, and a text file for people in the same folder."""
 
     def __init__(self, report: CommissioningReport, path: Path) -> None:
-        """Create the report files. Raises FileError if the file exists or cannot be created."""
+        """Create the JSON file at `path`. Raises FileError if the file exists or cannot be created."""
         self.report = report
         self.path = path
         try:
@@ -94,7 +94,7 @@ class ReportFile:
         return self.path.with_suffix(".txt")
 
     def add(self, step: str, drive: str, judgement: Judgement, measured: dict[str, Number]) -> None:
-        """Add a step and save the report."""
+        """Add an entry for a step, and save the report."""
         entry = StepReport(
             step, drive, judgement.verdict, judgement.words, judgement.remedy, measured, dict(judgement.changes), now()
         )
@@ -107,18 +107,18 @@ class ReportFile:
         self.save()
 
     def save(self) -> None:
-        """Replace both files, each atomically."""
+        """Write both files; each file is replaced atomically."""
         _replace(self.path, msgspec.json.format(msgspec.json.encode(content(self.report)), indent=2).decode() + "\n")
         _replace(self.text_path, "\n".join(format_lines(self.report)) + "\n")
 
 
 def content(report: CommissioningReport) -> dict[str, object]:
-    """Return a report as plain values, with its overall result."""
+    """Return the content of a report as built-in types, with the overall results `ok` and `complete`."""
     return {"ok": report.ok, "complete": report.complete, **msgspec.to_builtins(report)}
 
 
 def format_lines(report: CommissioningReport) -> list[str]:
-    """Return a report as human-readable lines."""
+    """Return the lines of a report for people."""
     lines = [f"Commissioning of robot {report.robot}, {report.config}", f"started {report.began}, {report.software}"]
     if report.simulated:
         lines.append("simulated drives")
@@ -136,7 +136,7 @@ def format_lines(report: CommissioningReport) -> list[str]:
 
 
 def now() -> str:
-    """Return the wall-clock time, to the second."""
+    """Return the local date and time (ISO 8601), to the second."""
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
 
 

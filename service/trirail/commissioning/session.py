@@ -1,4 +1,4 @@
-"""State of a commissioning on its bus: the drives that answer, their set-up, and the bench."""
+"""State of a commissioning that all steps share: the inspected drives, and the bench that runs their cycle."""
 
 from __future__ import annotations
 
@@ -21,33 +21,34 @@ from trirail.config import Config
 SETUP_CHECK_S = 0.5
 """Time for which drives are observed after they are set up [s]."""
 POLL_INTERVAL_S = 0.01
-"""Interval between checks for an answer before the drives are set up [s]."""
+"""Interval between checks for the person's answer before the drives are set up [s]."""
 
 StepOutcome = tuple[Judgement, dict[str, Number]]
-"""Judgement of a step, and its measurements by name."""
+"""Judgement of a step, and the measured values by name."""
 
 
 class Environment(NamedTuple):
-    """Everything that a commissioning needs from its surroundings."""
+    """Objects and functions that a commissioning uses: configuration, bus, drives and person."""
 
     config: Config
     bus: can.BusABC
     make_bench: Callable[[], Bench]
-    """Function that configures the drives and starts their cycle."""
+    """Function that configures the drives and returns a bench for their cycle."""
     rules: Carriages | None
-    """Rules beside simulated sliders; None for real ones."""
+    """Rules at simulated sliders; None if the sliders are real."""
     operator: Operator
     interrupted: Callable[[], bool]
-    """Function that returns True once Ctrl-C was pressed."""
+    """Function that returns True after Ctrl-C was pressed."""
     inputs: Callable[[str], int | None] | None = None
-    """Function that reads a drive's digital inputs (object 60FDh), or None if it has none; None without such a
-    protocol."""
+    """Function that returns the digital inputs (object 60FDh) of a drive, or None if the drive does not report them.
+    None if the protocol of the drives has no digital inputs."""
     press: Callable[[int, int], None] | None = None
-    """Function that presses switches of a simulated drive, given its index and bits of 60FDh."""
+    """Function that presses switches of a simulated drive, given the drive's index and bits of 60FDh. None if the
+    drives are real."""
 
 
 class Session:
-    """State that the steps share."""
+    """State of a commissioning that the steps share."""
 
     def __init__(self, environment: Environment) -> None:
         self.environment = environment
@@ -57,11 +58,11 @@ class Session:
 
     @property
     def reports_inputs(self) -> bool:
-        """True if drives of this protocol report their digital inputs."""
+        """True if the protocol of the drives can report digital inputs."""
         return self.environment.inputs is not None
 
     def inspect_bus(self) -> StepOutcome:
-        """Read the identity of every drive."""
+        """Run the step that reads the identity of every drive and writes nothing."""
         drives = self._config.drives
         inspect = PROTOCOLS[drives.protocol].inspect
         if inspect is None:
@@ -90,7 +91,7 @@ class Session:
         return Judgement("ok", lines), measured
 
     def set_up(self) -> StepOutcome:
-        """Configure all drives, without power, and start their cycle."""
+        """Run the step that configures all drives, without power, and starts their cycle."""
         self._bench = None
         try:
             self._bench = self.environment.make_bench()
@@ -108,7 +109,7 @@ class Session:
         return Judgement("ok", words), {"written": written}
 
     def describe_setup(self) -> list[str]:
-        """Return the changes made by the set-up as lines. A change that several drives share takes one line."""
+        """Return lines with the changes that the set-up will make, with one line for a change that drives share."""
         drives: dict[str, list[str]] = {}
         for each in self._inspected:
             for line in drive_report.format_differences(each, applied=False):
@@ -116,13 +117,16 @@ class Session:
         return [f"{', '.join(names)}: {line}" for line, names in drives.items()]
 
     def bench(self) -> Bench:
-        """Return the bench. Raises RuntimeError before the set-up."""
+        """Return the bench. Raises RuntimeError if the drives have not been set up."""
         if self._bench is None:
             raise RuntimeError("the drives are not set up")
         return self._bench
 
     def idle(self) -> None:
-        """Wait for a cycle, and keep the drives alive."""
+        """Run one cycle of the drives, or wait for a short time if the drives have not been set up.
+
+        Raises KeyboardInterrupt if Ctrl-C was pressed.
+        """
         if self._bench is not None:
             self._bench.cycle()
         elif self.environment.interrupted():

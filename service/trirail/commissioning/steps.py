@@ -1,4 +1,4 @@
-"""Steps of a commissioning: each asks, moves or measures, and returns its judgement."""
+"""Steps of a commissioning, which ask, move or measure, and return a judgement."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from trirail.kinematics.robot import forward
 HOLD_TIME_S = 1.0
 """Time for which a drive holds its slider when it is enabled for the first time [s]."""
 PUSH_DISTANCE_M = 0.010
-"""Recommended travel of a slider by hand [m]."""
+"""Recommended travel of a slider that is pushed by hand [m]."""
 INPUT_POLL_S = 0.05
 """Interval at which digital inputs are read while switches are pressed [s]."""
 
@@ -80,7 +80,10 @@ class Steps:
         return judge_push(seen, self._config.drives), measured
 
     def _observe_push(self, index: int, by: float, text: str) -> Reading:
-        """Ask the person to push a slider by a distance `by` [m], and return the readings afterwards."""
+        """Ask the person to push a slider by the distance `by` [m]; return the readings after the push.
+
+        A simulated slider is pushed without a person.
+        """
         bench = self.session.bench()
         if self._environment.rules is None:
             self._operator.show(f"  {text}")
@@ -127,7 +130,7 @@ class Steps:
     # With power, one drive alone.
 
     def power(self, name: str) -> StepOutcome:
-        """Enable one drive, let it hold its slider, and disable it."""
+        """Enable one drive for HOLD_TIME_S, in which it must hold its slider, and disable it."""
         bench, stopped = self.session.bench(), ""
         try:
             with bench.power(name):
@@ -138,7 +141,7 @@ class Steps:
         return judge_power(name, drift, HOLD_TIME_S, stopped), {"drift": drift}
 
     def move(self, name: str) -> StepOutcome:
-        """Move one slider out and back with only its drive enabled. The person reports which one moved, and how far."""
+        """Move a single enabled drive out and back. The person reports which slider moved, and how far."""
         index, drives = NAMES.index(name), self._config.drives
         resolution = self._observer.ask_rule_resolution()
         commanded = self._choose_distance(index)
@@ -201,12 +204,12 @@ class Steps:
         return judgement, {"way": travel, "position": position, "stopped": stopped}
 
     def watchdog(self, name: str) -> StepOutcome:
-        """Stop SYNC and heartbeat while one drive is enabled. The drive must switch off its power."""
+        """Enable one drive, and stop sending SYNC and heartbeat. The drive must then switch its power off."""
         bench, heartbeat = self.session.bench(), self._config.drives.heartbeat
         try:
             with bench.power(name):
                 bench.wait(HOLD_TIME_S / 2.0)
-                # Drives react within three heartbeats, see drives.heartbeat.
+                # Drives react within three intervals of the heartbeat; see the key drives.heartbeat.
                 reaction = bench.provoke_watchdog(3.0 * heartbeat + HOLD_TIME_S)
         except DrivesStoppedError as error:
             return Judgement("failed", (str(error),), "repeat this step"), {}
@@ -233,7 +236,7 @@ class Steps:
                 rest = moves.SlowMove(move.position[half:] - move.position[half - 1], move.velocity[half:])
                 second = bench.play(rest)
             poses = forward(robot, np.concatenate([first.position, second.position]))[:, :2]
-            # Every fourth commanded pose is enough: at 5 mm/s and 1 kHz they are 20 µm apart.
+            # Every fourth commanded pose is enough, since at 5 mm/s and 1 kHz these poses are 20 µm apart.
             distances = np.linalg.norm(poses[:, None, :] - path[None, ::4, :2], axis=2).min(axis=1)
             deviation = float(distances.max())
         except DrivesStoppedError as error:
@@ -244,11 +247,11 @@ class Steps:
         return judgement, {"deviation": deviation, "missed_cycles": bench.missed_cycles, **following}
 
     def kind(self) -> StepOutcome:
-        """Check the mechanism's kind by a mark that is measured from outside."""
+        """Check the kind of the mechanism with the measured travel of a mark on the platform."""
         return KindStep(self.session, self._observer).run()
 
     def _move_slider(self, index: int, distance: float) -> _SliderMotion:
-        """Move one slider over `distance` [m]. Only its drive is enabled, and it is disabled afterwards."""
+        """Move one slider over `distance` [m]. Only the drive of this slider is enabled, and only during the motion."""
         bench, stopped = self.session.bench(), ""
         before = bench.position[index]
         try:
@@ -260,7 +263,10 @@ class Steps:
         return _SliderMotion(bench.position[index] - before, bench.max_errors[index], stopped)
 
     def _choose_distance(self, index: int) -> float:
-        """Return the signed test distance of a slider [m]. It leads away from a near limit if the position is known."""
+        """Return the signed test distance of a slider [m].
+
+        The distance is negative if the slider is known to be near the upper end of its travel.
+        """
         bench = self.session.bench()
         is_near_end = (
             bench.position[index] + 2.0 * moves.TEST_DISTANCE_M > self._config.limits.slider.positions[index][1]
@@ -272,11 +278,11 @@ class Steps:
 
 
 class _SliderMotion(NamedTuple):
-    """Motion of one slider, as its drive reports it."""
+    """Motion of one slider, as measured by the drive."""
 
     travel: float
     """Signed travel [m]."""
     following: float
     """Maximum following error [m]."""
     stopped: str
-    """Reason for a stop, or ""."""
+    """Reason why the drives were stopped during the motion; "" if they were not stopped."""

@@ -1,4 +1,4 @@
-"""Checks for values of a configuration that are valid but probably unintended."""
+"""Checks of a configuration for values that are valid but probably not intended, and measurement of loop timing."""
 
 from trirail.diagnosis.check import Check, Verdict
 from trirail.diagnosis.configured import diagnose, failed_checks

@@ -1,9 +1,9 @@
-"""Bare loop that only exchanges a cycle's frames in one compiled call: the best timing that this machine allows.
+"""Measurement of the best timing that this machine allows, with a bare loop that only exchanges the frames of a cycle.
 
-Each cycle waits for an absolute deadline, sends SYNC, reads the frames that have arrived and sends three setpoints,
-with the same compiled functions as the service's cycle. A separate process, on another processor if there is one,
-replaces the drives. It answers each SYNC with three positions over a pair of AF_UNIX sockets, so that each SYNC wakes a
-process.
+Each cycle waits for an absolute deadline, sends SYNC, reads the frames that have arrived, and sends three setpoints.
+The loop consists of the same compiled functions as the service's cycle. A separate process replaces the drives, on
+another processor if the machine has one. This process answers each SYNC with three positions over a pair of AF_UNIX
+sockets, so that each SYNC wakes a process.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from trirail.processes.operating_system import python
 from trirail.wire.state import Percentiles
 
 BATCH_S: Final = 0.25
-"""Duration of one compiled call, after which Python handles signals and progress [s]."""
+"""Duration of one call of the compiled loop [s]. Between the calls, Python handles signals and reports progress."""
 _MODULE: Final = "trirail.diagnosis.bare_loop"
 _SYNC, _SETPOINT, _POSITION = 0x080, 0x201, 0x181
-"""Identifiers of SYNC, setpoint and position of the first node, from CiA 301's predefined connection set."""
+"""CAN identifiers of SYNC and of the first node's setpoint and position (CiA 301, predefined connection set)."""
 _DATA: Final = bytes(8)
 
 
 class Cycles(NamedTuple):
-    """Measured times of the cycles."""
+    """Measured times of n cycles."""
 
     lateness: NDArray[np.int64]
-    """Delay of each cycle's start, including ticks missed before it, (n,) [ns]."""
+    """Delay of the start of each cycle, including the ticks missed before the cycle, (n,) [ns]."""
     work: NDArray[np.int64]
-    """Time from the start until the setpoints were sent, (n,) [ns]."""
+    """Time from the start of each cycle until its setpoints were sent, (n,) [ns]."""
     period: int
-    """Cycle period [ns]."""
+    """Period of the cycle [ns]."""
     answers: int
-    """Number of positions received; three per cycle if none is lost."""
+    """Number of positions received, which is three for each cycle if no position is lost."""
 
     @property
     def missed(self) -> NDArray[np.int64]:
-        """Ticks skipped before each cycle, (n,)."""
+        """Number of ticks missed before each cycle, (n,)."""
         return self.lateness // self.period
 
 
@@ -66,8 +66,11 @@ class _Bus:
         self._times, self._moment = np.zeros(1, TIMES), np.zeros(2, np.int64)
 
     def exchange(self, period_ns: int, lateness: NDArray[np.int64], work: NDArray[np.int64]) -> int:
-        """Run n cycles and fill `lateness` and `work`, (n,) each; return the number of frames received."""
-        # Loading compiled code takes seconds, and only a measurement needs it.
+        """Run n cycles, and write their times to `lateness` and `work`, (n,) each [ns].
+
+        Return the number of frames received.
+        """
+        # Imported here, because compiled code takes seconds to load and only a measurement needs it.
         from trirail.processes.cycle_frames import exchange_frames
 
         sync, setpoints, arrived = self._sync, self._setpoints, self._arrived
@@ -77,13 +80,16 @@ class _Bus:
 
 
 def prepare() -> None:
-    """Compile the loop before its first cycle."""
+    """Compile the loop, so that the first cycle is not delayed."""
     none = np.zeros(0, np.int64)
     _Bus(0).exchange(1, none, none)
 
 
 def measure(loop: LoopTable, rate_hz: int, seconds: float, progress: Callable[[float], None] | None = None) -> Cycles:
-    """Run the bare loop for `seconds` [s] with this process's rights; `progress` receives the completed fraction."""
+    """Run the bare loop for `seconds` [s] with the present rights of this process.
+
+    `progress` is called with the fraction of the cycles that has been completed.
+    """
     period = 1_000_000_000 // rate_hz
     cycles = max(1, round(seconds * rate_hz))
     lateness, work = np.zeros(cycles, np.int64), np.zeros(cycles, np.int64)
@@ -100,7 +106,10 @@ def measure(loop: LoopTable, rate_hz: int, seconds: float, progress: Callable[[f
 
 
 def measure_alone(loop: LoopTable, rate_hz: int, seconds: float) -> Cycles:
-    """Run the bare loop with the loop's real-time rights, which this process keeps until it ends."""
+    """Acquire the real-time rights of the service's loop, and run the bare loop for `seconds` [s].
+
+    The process has these rights until it ends.
+    """
     prepare()
     realtime.acquire(loop)
     return measure(loop, rate_hz, seconds)
@@ -108,7 +117,10 @@ def measure_alone(loop: LoopTable, rate_hz: int, seconds: float) -> Cycles:
 
 @contextlib.contextmanager
 def _drives(loop: LoopTable) -> Iterator[socket.socket]:
-    """Start the process that replaces three drives; it ends when its socket is closed."""
+    """Start the process that replaces the three drives, and yield the socket to it.
+
+    The process ends when the context ends.
+    """
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     processor, priority = realtime.processor(loop), max(1, loop.priority - realtime.DRIVES_BELOW)
     command = python("-m", _MODULE, *(str(each) for each in (theirs.fileno(), processor, priority)))
@@ -124,7 +136,7 @@ def _drives(loop: LoopTable) -> Iterator[socket.socket]:
 
 
 def _answer(carrier: socket.socket, processor: int, priority: int) -> None:
-    """Answer every SYNC with three positions, until the loop closes its socket."""
+    """Answer every SYNC with three positions until the loop closes its socket; main function of the drives' process."""
     with contextlib.suppress(OSError):
         others = set(range(os.cpu_count() or 1)) - {processor}
         if others:
@@ -134,7 +146,7 @@ def _answer(carrier: socket.socket, processor: int, priority: int) -> None:
     positions = [CAN_FRAME.pack(_POSITION + i, 8, _DATA) for i in range(len(NAMES))]
     sync = CAN_FRAME.pack(_SYNC, 0, _DATA)
     carrier.send(b"\n")
-    with contextlib.suppress(ConnectionError):  # the loop has gone
+    with contextlib.suppress(ConnectionError):  # the loop has closed its socket
         while frame := carrier.recv(CAN_FRAME.size):
             if frame == sync:
                 for position in positions:
@@ -142,7 +154,7 @@ def _answer(carrier: socket.socket, processor: int, priority: int) -> None:
 
 
 def compute_percentiles(values: NDArray[Any]) -> Percentiles:
-    """Return the percentiles [µs] of times in nanoseconds."""
+    """Return the percentiles [µs] of times [ns]."""
     return Percentiles(*(float(each) / 1e3 for each in np.percentile(values, (50.0, 99.0, 99.9, 100.0))))
 
 

@@ -1,4 +1,4 @@
-"""All checks of a configuration, and the errors in a file as failed checks."""
+"""Function that runs all checks of a configuration, and conversion of errors in a file to failed checks."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CONFIG_CHECKS = (
 
 
 def diagnose(config: Config, impossible: Sequence[str] = ()) -> list[Check]:
-    """Return the results of all checks that do not read an `impossible` key."""
+    """Run all checks that do not depend on `impossible` keys, which have impossible values; return the results."""
     return [check for each in CONFIG_CHECKS if not overlap(each.reads, impossible) for check in each.run(config)]
 
 
 def failed_checks(path: Path, mistakes: Sequence[Mistake]) -> list[Check]:
-    """Return each error in a file as a failed check."""
+    """Return a failed check for each error in a configuration file."""
     return [
         Check("configuration", "failure", shortened(f"{path}: {text}"), key=shortened(key)) for key, text in mistakes
     ]

@@ -1,4 +1,7 @@
-"""Limits that contradict each other or the robot. They are warnings, because each limit alone may be intended."""
+"""Checks for limits that contradict each other or the robot.
+
+The results are warnings, because each limit alone may be intended.
+"""
 
 from __future__ import annotations
 
@@ -15,30 +18,32 @@ from trirail.kinematics.geometry import gains, travels
 from trirail.quantities import FAMILIAR_UNITS
 
 RAMP_TIMES_S = 1e-3, 10.0
-"""Plausible times to reach a velocity or acceleration limit, shortest and longest [s]."""
+"""Shortest and longest plausible time to reach a velocity or acceleration limit [s]."""
 MAX_ASYMMETRY = 300.0
-"""Plausible ratio of a range's two sides."""
+"""Greatest plausible ratio between the two sides of a range."""
 MAX_RATE_MISMATCH = 30.0
-"""Plausible ratio between a slider's limit and the rate that the platform's limits require, in either direction."""
+"""Greatest plausible ratio between a slider's limit and the rate that the platform's limits require, or vice versa."""
 MAX_RATE_EXCESS = 5.0
-"""Plausible ratio of an axis' limit to the rate that the sliders reach; it is 0.7 for the shipped robots."""
+"""Greatest plausible ratio between a platform limit and the rate that the sliders reach.
+
+The ratio is 0.7 for the shipped robots."""
 MIN_REACHED_SHARE = 0.1
-"""Plausible minimum of the fraction of the platform's limits that the sliders reach."""
+"""Smallest plausible fraction of the platform's limits that the sliders reach."""
 MAX_WINDOW_SHARE = 0.02
-"""Plausible maximum of an in-position window, relative to its range."""
+"""Greatest plausible in-position window, as a fraction of the axis' range."""
 _SAMPLES = 15
-"""Samples of the platform's limits along each axis."""
+"""Number of samples of the platform's limits along each axis."""
 _ORDERS = (("velocity", "acceleration", "", "/s"), ("acceleration", "jerk", "/s²", "/s³"))
 _AXES = (("x", "m"), ("y", "m"), ("phi", "rad"))
 
 
 def _each(slider: SliderLimits, quantity: str) -> Triple:
-    """Return the limit of each slider for a quantity."""
+    """Return the velocity, acceleration or jerk limit of each slider."""
     return {"velocity": slider.velocities, "acceleration": slider.accelerations, "jerk": slider.jerks}[quantity]
 
 
 def _ramps(config: Config) -> Iterator[Check]:
-    """Check the time in which acceleration reaches the velocity limit, and jerk the acceleration limit."""
+    """Check the times in which velocity and acceleration reach their limits."""
     slider, platform = config.limits.slider, config.limits.platform
     for rate, by, _, _ in _ORDERS:
         sliders = list(zip(_each(slider, rate), _each(slider, by), strict=True))
@@ -63,7 +68,7 @@ def _ramps(config: Config) -> Iterator[Check]:
 
 
 def _ranges(config: Config) -> Iterator[Check]:
-    """Check that the sides of each range are of similar size, and that it contains 0."""
+    """Check that each range contains 0, and that its two sides have a plausible ratio."""
     platform, slider = config.limits.platform, config.limits.slider
     ranges = {f"limits.platform.{axis}": getattr(platform, axis) for axis, _ in _AXES}
     ranges |= dict(zip(slider.keys("position"), slider.positions, strict=True))
@@ -80,7 +85,7 @@ def _ranges(config: Config) -> Iterator[Check]:
 
 
 def _reached(config: Config) -> Iterator[Check]:
-    """Check that the sliders and passive joints reach a sufficient part of the platform's limits."""
+    """Check that the sliders and passive joints can reach a sufficient part of the platform's limits."""
     platform = config.limits.platform
     axes = [np.linspace(*each, _SAMPLES) for each in (platform.x, platform.y, platform.phi)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -113,7 +118,10 @@ def _rates(config: Config) -> Iterator[Check]:
 
 
 def _too_fast(config: Config, per_pose: NDArray[np.float64], quantity: str) -> Iterator[Check]:
-    """Find platform limits far beyond what the sliders reach, which may have been given in mm or degrees."""
+    """Find platform limits that greatly exceed the rates that the sliders reach.
+
+    Such limits may have been written in mm or degrees.
+    """
     limits = getattr(config.limits.platform, quantity)
     shares = (per_pose * limits / np.array(_each(config.limits.slider, quantity))[:, None]).max(axis=0).tolist()
     per = dict(zip(("velocity", "acceleration", "jerk"), ("/s", "/s²", "/s³"), strict=True))[quantity]
@@ -126,7 +134,10 @@ def _too_fast(config: Config, per_pose: NDArray[np.float64], quantity: str) -> I
 
 
 def _windows(config: Config) -> Iterator[Check]:
-    """Check the following-error and in-position windows: more than a cycle's motion, far less than the travel."""
+    """Check the following-error and in-position windows.
+
+    A following-error window must exceed the motion in a cycle, and all windows must be much smaller than the travel.
+    """
     slider, drives, settling = config.limits.slider, config.drives, config.limits.in_position
     step, travel = slider.fastest * config.period, min(high - low for low, high in slider.positions)
     for key, window in (
@@ -154,7 +165,11 @@ def _windows(config: Config) -> Iterator[Check]:
 
 
 def _simulated(config: Config) -> Iterator[Check]:
-    """Check that simulated servos can follow: their lag is the motion without feed-forward during a time constant."""
+    """Check that simulated servos can follow the setpoints.
+
+    The lag of a servo is the motion during its time constant that feed-forward does not compensate, plus the motion in
+    a cycle.
+    """
     if not is_simulated(config.can):
         return
     slider, servo = config.limits.slider, config.can.simulated

@@ -1,4 +1,4 @@
-"""Slider travels for small motions of a stage's table, with which a dial gauge can identify the stage's kind."""
+"""Report of the slider travels for small motions of a stage's table, with which a dial gauge can identify its kind."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ MOTIONS = (
     ("1 mm in y", (0.0, 0.001, 0.0)),
     ("1° in φ", (0.0, 0.0, math.radians(1.0))),
 )
-"""Motions from x = y = φ = 0 [m, rad]."""
+"""Motions of the table that start at x = y = φ = 0 [m, m, rad]."""
 GAUGE_RESOLUTION_M = 1e-6
-"""Difference between the two kinds that a dial gauge can resolve [m]."""
+"""Difference between the slider travels of the two kinds that a dial gauge can resolve [m]."""
 _KINDS = {"3-PRP": "pivots on the carriages", "3-PPR": "cross slides on the carriages"}
 
 
@@ -34,7 +34,7 @@ def _format(robot: Geometry, distances: list[float]) -> str:
 
 
 def _kind(config: Config) -> Iterator[Check]:
-    """Report the slider travels of the configured mechanism and of the other kind with the same carriages."""
+    """Report the slider travels of the configured kind of mechanism, and of the other kind if they differ."""
     robot = geometry(config.geometry)
     motions = [f"{name} moves {_format(robot, _travel(robot, pose))}" for name, pose in MOTIONS]
     turned = MOTIONS[-1][1]
@@ -51,7 +51,7 @@ def _kind(config: Config) -> Iterator[Check]:
 
 
 def _zero(config: Config) -> Iterator[Check]:
-    """Check that no slider exceeds its travel at x = y = φ = 0, if that pose is within the limits."""
+    """Check that no slider exceeds its travel at x = y = φ = 0, if this pose is within the platform's limits."""
     platform = config.limits.platform
     if not all(low <= 0.0 <= high for low, high in (platform.x, platform.y, platform.phi)):
         return

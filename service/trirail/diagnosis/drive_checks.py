@@ -1,4 +1,4 @@
-"""Checks of the drives: agreement, zero position, missing protections, following-error windows and bus load."""
+"""Checks of the drives: differences between them, zero position, missing protections, following error and bus load."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from trirail.diagnosis.check import Check, ConfigCheck
 from trirail.diagnosis.stopping import stops
 
 MAX_SCALE_RATIO = 8.0
-"""Plausible ratio between the scales of two drives of one robot."""
+"""Greatest plausible ratio between the scales of two drives of one robot."""
 _NUMBERS = ("counts_per_metre", "revolutions_per_metre")
 _UNITS = ("velocity_unit", "acceleration_unit")
 
 
 def _alike(config: Config) -> Iterator[Check]:
-    """Find the drive that differs from the other two."""
+    """Find drives with a scale or a unit that differs from the other drives."""
     drives = dict(zip(NAMES, config.drives.each, strict=True))
     wrong = False
     for key in _NUMBERS:
@@ -51,7 +51,10 @@ def _alike(config: Config) -> Iterator[Check]:
 
 
 def _zero(config: Config) -> Iterator[Check]:
-    """Check that a drive's zero or home is on the rail; the zero of an absolute encoder may be elsewhere."""
+    """Check that the zero or home position of each drive is on the rail.
+
+    The result is only a warning for drives without homing, since the zero of an absolute encoder may be off the rail.
+    """
     stop = stops(config)
     low, high = stop.rail or stop.travel
     for name, drive in zip(NAMES, config.drives.each, strict=True):
@@ -66,7 +69,10 @@ def _zero(config: Config) -> Iterator[Check]:
 
 
 def protections(config: Config) -> Iterator[Check]:
-    """List the protections that the configuration does not require; they stop a drive when the service cannot."""
+    """Report the protections that the drives may lack according to `accept_without`.
+
+    Protections stop a drive when the service cannot stop it.
+    """
     known = PROTOCOLS[config.drives.protocol].protections
     drives: dict[str, list[str]] = {}
     for name, drive in zip(NAMES, config.drives.each, strict=True):
@@ -81,9 +87,9 @@ def protections(config: Config) -> Iterator[Check]:
 
 
 def windows(config: Config) -> Iterator[Check]:
-    """Check that the service detects a following error before a drive does.
+    """Check that the service detects a following error before the drive detects it.
 
-    The service stops all three drives, but a drive stops only itself.
+    The service then stops all three drives. A drive would stop only itself.
     """
     ours, theirs = config.limits.slider.following_error, config.drives.following_error
     if theirs > ours:

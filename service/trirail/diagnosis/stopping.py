@@ -1,4 +1,4 @@
-"""Stopping distances and times of the sliders, and whether rails and time-outs allow them."""
+"""Checks that the rails and time-outs are long enough for the stopping distances and times of the sliders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trirail.diagnosis.check import Check, ConfigCheck, format_value, is_simulat
 
 
 class Stops(Struct, frozen=True):
-    """Stops of a slider from its velocity limit, and the rail available for them."""
+    """Distances and durations of a slider's stops from its velocity limit, and the slider's rail."""
 
     velocity: float
     """Velocity limit [m/s]."""
@@ -21,29 +21,30 @@ class Stops(Struct, frozen=True):
     time: float
     """Duration of a controlled stop [s]."""
     quick_way: float
-    """Distance of the drives' quick-stop ramp [m]."""
+    """Distance of a quick stop with the drive's ramp [m]."""
     quick_time: float
-    """Duration of that ramp [s]."""
+    """Duration of a quick stop with the drive's ramp [s]."""
     travel: tuple[float, float]
-    """Travel from limits.slider.position [m]."""
+    """Ends of the slider's travel, from limits.slider.position [m]."""
     rail: tuple[float, float] | None
-    """Ends of the rail [m]; None for measured legs, whose configuration does not contain them."""
+    """Ends of the rail [m]; None if the configuration contains measured legs, which do not specify the ends."""
 
     @property
     def left(self) -> float | None:
-        """Length of rail beyond the travel, on the side with less [m]."""
+        """Length of the rail outside the travel, on the side where it is shorter [m]; None if the rail is unknown."""
         return None if self.rail is None else min(self.travel[0] - self.rail[0], self.rail[1] - self.travel[1])
 
 
 def stops(config: Config) -> Stops:
-    """Return the stops of the slider that needs the largest part of its travel for them.
+    """Return the stops of the slider for which a controlled stop needs the largest fraction of the travel.
 
-    A controlled stop from v, limited in acceleration a and jerk j, takes t = v / a + a / j, or 2 sqrt(v / j) if a is
-    not reached, over a distance v t / 2. A quick stop at deceleration q takes v / q, over v² / 2q.
+    A controlled stop from velocity v with acceleration limit a and jerk limit j takes the time t = v / a + a / j, or
+    t = 2 sqrt(v / j) if the acceleration does not reach a. The distance is v t / 2. A quick stop with deceleration q
+    takes the time v / q and the distance v² / 2q.
     """
     slider, quick = config.limits.slider, config.drives.quick_stop_deceleration
     rail = None
-    if config.geometry.l0 is not None:  # the rails are the sides of the paper's triangle, 0 is at a third of each
+    if config.geometry.l0 is not None:  # the rails are the sides of the paper's triangle, with 0 at a third of each
         third = config.geometry.l0 / math.sqrt(3.0)
         rail = -third, 2.0 * third
     candidates = []
@@ -54,7 +55,10 @@ def stops(config: Config) -> Stops:
 
 
 def _rail(config: Config) -> Iterator[Check]:
-    """Check that a slider at full velocity at the end of its travel, after a wrong scale or home, stops on the rail."""
+    """Check that a slider that reaches the end of its travel at full velocity can still stop on the rail.
+
+    This can happen if the scale or the home position of the slider is wrong.
+    """
     stop = stops(config)
     speed = f"from {stop.velocity * 1e3:g} mm/s"
     ways = f"{speed} a quick stop takes {stop.quick_way * 1e3:.3g} mm, a controlled stop {stop.way * 1e3:.3g} mm"
@@ -93,7 +97,10 @@ def _travel(config: Config) -> Iterator[Check]:
 
 
 def _quick_stop(config: Config) -> Iterator[Check]:
-    """Check the duration of a quick stop; after stop_timeout, power is cut during the motion, with a fault."""
+    """Check that a quick stop ends within drives.stop_timeout, and that its ramp is plausible.
+
+    After this time-out, the service switches the power off during the motion, with a fault.
+    """
     stop, timeout = stops(config), config.drives.stop_timeout
     key = "drives.quick_stop_deceleration"
     ramp = format_value(key, config.drives.quick_stop_deceleration, "m/s²")

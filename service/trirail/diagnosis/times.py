@@ -1,4 +1,4 @@
-"""Times and counts that are valid but so small or large that they defeat their purpose."""
+"""Checks for times and counts that are valid, but too small or too large for their purpose."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from trirail.diagnosis.check import Check, ConfigCheck
 
 
 class _Bounds(NamedTuple):
-    """Plausible range of a time."""
+    """Value of a configuration key, and the plausible range of the time that it represents."""
 
     key: str
     value: float
-    """Value in the file."""
+    """Value in the configuration."""
     time: float
-    """The value as a time [s]."""
+    """Time that the value represents [s]."""
     low: float
     """Shortest plausible time [s]."""
     high: float
@@ -27,6 +27,7 @@ class _Bounds(NamedTuple):
     shorter: str
     """Consequence of a shorter time."""
     longer: str
+    """Consequence of a longer time."""
 
 
 def _bounds(config: Config) -> Iterator[_Bounds]:
@@ -76,7 +77,7 @@ def _times(config: Config) -> Iterator[Check]:
 
 
 def _sizes(config: Config) -> Iterator[Check]:
-    """Check the size of a recording's files: smaller than the total that is kept, and not thousands of files."""
+    """Check that a recording's files are smaller than the maximum for all recordings, but not too small."""
     rotate, keep = config.telemetry.rotate_mb, config.telemetry.keep_mb
     if rotate > keep:
         finding = f"telemetry.rotate_mb = {rotate:g} exceeds telemetry.keep_mb = {keep:g}, the total of all recordings"
@@ -89,7 +90,7 @@ def _sizes(config: Config) -> Iterator[Check]:
 
 
 def _homing(config: Config) -> Iterator[Check]:
-    """Check that homing reaches its switch within the time-out, and stops shortly beyond the switch."""
+    """Check that homing reaches the switch within the time-out, and stops soon after it has reached the switch."""
     slider = config.limits.slider
     for name, drive, (low, high), limit in zip(
         NAMES, config.drives.each, slider.positions, slider.velocities, strict=True

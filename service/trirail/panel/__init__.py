@@ -1,1 +1,1 @@
-"""Operator's page: a client of the service like any other, with a browser as its front end."""
+"""Operator's web page. Its server is an ordinary client of the service, and browsers are the user interface."""

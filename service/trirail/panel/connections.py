@@ -1,4 +1,4 @@
-"""Connections to the panel's server. Idle connections block neither new connections nor the shutdown."""
+"""Connections to the panel's server, of which idle ones block neither new connections nor the shutdown."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from collections.abc import Callable
 from typing import Any
 
 MAX_REQUESTS = 32
-"""Maximum number of open connections that are not tabs.
+"""Maximum number of open connections that are not tabs; a new connection then replaces the oldest connection.
 
-Browsers hold none open; a new connection replaces the oldest.
+Browsers leave no such connection open.
 """
 MAX_TABS = 16
-"""Maximum number of tabs, which may also use at most half of all connections."""
+"""Maximum number of tabs. In addition, tabs may use at most half of all connections."""
 DESCRIPTORS_PER_CONNECTION = 4
-"""File descriptors per connection: its own, and three for websockets."""
+"""Number of file descriptors for each connection: one for the connection, and three for the websockets library."""
 RESERVED_DESCRIPTORS = 24
-"""File descriptors reserved for the rest of the process, in addition to those that are open at the start."""
+"""Number of file descriptors for the rest of the process, in addition to the descriptors that are open at the start."""
 ACCEPT_DELAY_S = 0.1
-"""Delay before the next attempt to accept after the system had no descriptor or memory for a connection [s]."""
+"""Delay before the next attempt to accept a connection if the system had no descriptor or no memory [s]."""
 CLOSE_TIMEOUT_S = 1.0
-"""Time limit for the end of a closed connection [s]."""
+"""Time to wait until connections that are being closed have ended [s]."""
 
 
 class Connections:
-    """Accepts connections and handles each one in its own thread.
+    """Acceptor of connections, which handles each connection in a separate thread.
 
-    A client that holds silent connections, or all descriptors, does not lock out others.
+    A client that opens silent connections, or uses all descriptors, does not prevent other clients from connecting.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class Connections:
     handle
         Function that receives the socket and address of a connection, and closes the socket.
     refusal
-        Bytes sent to a refused or displaced client, if sending does not block.
+        Bytes that are sent to a client before its connection is refused or replaced, if sending does not block.
     """
 
     def __init__(self, listening: socket.socket, handle: Callable[[socket.socket, Any], None], refusal: bytes) -> None:
@@ -54,7 +54,7 @@ class Connections:
         self._max_connections = max(2, min(MAX_REQUESTS + MAX_TABS, left // DESCRIPTORS_PER_CONNECTION))
 
     def accept(self) -> None:
-        """Accept connections until closed."""
+        """Accept connections until `close` is called."""
         while True:
             try:
                 connection, address = self._listening.accept()
@@ -71,7 +71,7 @@ class Connections:
                 connection.close()
 
     def make_tab(self, connection: socket.socket) -> bool:
-        """Mark a connection as a tab, which is never displaced; return whether there is room for it."""
+        """Mark a connection as a tab, which is never replaced. Return False if there are too many tabs already."""
         with self._changed:
             if len(self._tabs) >= min(MAX_TABS, self._max_connections // 2) or connection not in self._requests:
                 return False
@@ -80,7 +80,7 @@ class Connections:
             return True
 
     def close(self) -> None:
-        """Stop accepting, end all connections, and wait for them up to ENDING seconds."""
+        """Stop accepting connections, close all connections, and wait up to CLOSE_TIMEOUT_S until they have ended."""
         with self._changed:
             self._closed = True
             for ended in (self._listening, *self._requests, *self._tabs):
@@ -90,7 +90,7 @@ class Connections:
         self._listening.close()
 
     def _begin(self, connection: socket.socket, address: object) -> bool:
-        """Start to handle a connection; return whether that succeeded."""
+        """Start a thread that handles a connection. Return True if the thread was started."""
         with self._changed:
             if self._closed:
                 return False
@@ -115,7 +115,10 @@ class Connections:
             self._changed.notify_all()
 
     def _make_room(self) -> bool:
-        """Drop the oldest connection that is not a tab, and wait until it has closed; return whether there was one."""
+        """Close the oldest connection that is not a tab, and wait until it has ended.
+
+        Return False if all connections are tabs.
+        """
         with self._changed:
             eldest = next(iter(self._requests), None)
             if eldest is None:

@@ -1,4 +1,4 @@
-"""Description of a robot for a tab, which uses it to draw the robot and to label its buttons."""
+"""Description of a robot, with which a tab draws the robot and labels the page's buttons."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from trirail.wire.vocabulary import Command, Role
 from trirail.workspace.part_positions import RobotParts
 
 STAGE = 0.05
-"""Maximum travel of the platform along x for which lengths are shown in micrometres, as for a stage [m]."""
+"""Maximum travel of the platform along x for which the page shows lengths in micrometres [m]."""
 MICROMETRES: dict[str, Any] = {
     "unit": "µm",
     "scale": 1e6,
@@ -35,7 +35,10 @@ MILLIMETRES: dict[str, Any] = {
     "steps": (1e-5, 1e-4, 1e-3, 1e-2),
     "angle_steps": (1e-2, 0.1, 1.0, 1.0),
 }
-"""Unit of lengths on the page, units per metre, decimals of lengths and degrees, and jog steps [m] and [°]."""
+"""Display of lengths in MICROMETRES or MILLIMETRES on the page.
+
+`scale` is the number of units per metre. `decimals` applies to lengths, and `angle_decimals` to degrees. The jog steps
+`steps` are in [m], and `angle_steps` in [°]."""
 
 
 def drawn_robot(info: Info) -> DrawnRobot:
@@ -47,7 +50,10 @@ def drawn_robot(info: Info) -> DrawnRobot:
 
 
 def describe(info: Info, robot: DrawnRobot, user: str, role: Role | None) -> dict[str, Any]:
-    """Return the description for a tab, ready to be encoded; `role` is the role of the user."""
+    """Return the description of a robot for a tab, as values that can be encoded as JSON.
+
+    `role` is the role of the user; None if the user has no role.
+    """
     parts = RobotParts.from_geometry(robot.geometry, robot.limits.slider)
     platform = robot.limits.platform
     return {

@@ -1,4 +1,4 @@
-"""Data published by the service, received once for all tabs: newest state, latest events, description of the robot."""
+"""Data from the service that all tabs share: the newest state, the latest events and the description of the robot."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ SILENCE_S = 1.0
 USERS_PERIOD_S = 2.0
 """Interval between queries of the connected users [s]."""
 MAX_EVENTS = 200
-"""Number of events kept for tabs that are opened later."""
+"""Maximum number of events that are stored for tabs that are opened later."""
 MAX_LOOKS = 50
-"""Maximum number of kept events of the last alignment."""
+"""Maximum number of events of the latest alignment that are stored."""
 
 
 class Feed:
-    """Subscription to one robot, shared by all tabs.
+    """Subscription to one robot that all tabs share.
 
-    A tab reads data while it holds `changed`, which is notified when there is new data. Raises ServiceError if the
-    service does not answer.
+    A tab must acquire the condition `changed` to read data; the condition is notified when there is new data. Raises
+    ServiceError if the service does not answer.
     """
 
     def __init__(self, robot: AsyncRobot, loop: LoopThread) -> None:
@@ -48,18 +48,19 @@ class Feed:
         self.changed = threading.Condition()
         self._pose: Triple | None = None
         self.messages: dict[str, bytes] = {}
-        """Messages for a tab as JSON, sent once and after each change: robot, names of its poses, connected users. The
-        robot is first, because the page cannot draw anything without it.
+        """Messages for tabs as JSON: the robot, the names of its poses, and the connected users. Each tab gets a
+        message when the tab is opened and when the message changes. The robot is first, because the page cannot draw
+        anything without it.
         """
         loop.call(self._fetch_robot())
         self.messages["poses"] = loop.call(self._fetch_poses())
         self.state: bytes | None = None
-        """Newest state with its stamp, as JSON; None while the service is silent."""
+        """Newest state and its stamp as JSON; None while the service is silent."""
         self.stamp = 0
         """Arrival time of the newest state, in milliseconds of this process's monotonic clock."""
         self._events: deque[tuple[int, bytes]] = deque(maxlen=MAX_EVENTS)
         self._alignment_events: list[tuple[int, bytes]] = []
-        """Events of the last alignment, which later events do not displace."""
+        """Events of the latest alignment, which are stored even after MAX_EVENTS later events."""
         self._alignment = ("", "")
         self._subscriptions: list[Future[object]] = []
 
@@ -75,18 +76,21 @@ class Feed:
             subscription.cancel()
 
     def events(self, after: int) -> list[tuple[int, bytes]]:
-        """Return the events with numbers higher than `after` in order of arrival, each with its number and as JSON."""
+        """Return the numbers and the JSON of the events with numbers higher than `after`, in order of arrival."""
         return [event for event in sorted({*self._alignment_events, *self._events}) if event[0] > after]
 
     def find_obstacle(self, goal: PoseGoal) -> Obstacle | None:
-        """Return the obstacle between the measured pose and a goal, as in path_check.find_obstacle."""
+        """Return the obstacle between the measured pose and a goal; None if there is none.
+
+        See trirail.client.path_check.find_obstacle.
+        """
         if self._pose is None:
             return Obstacle("nobody knows where the robot is", code="unknown")
         end = (goal.x, goal.y, goal.phi)
         return path_check.find_obstacle(self._robot_drawing, self._pose, end, goal.tool, goal.frame)
 
     def check_path(self, name: str, text: str, stretch: bool) -> CheckedPath:
-        """Check the path in a file and return the result."""
+        """Check the path in a file; return the result. See trirail.client.path_check.check_path."""
         return path_check.check_path(self._robot_drawing, name, text, stretch)
 
     async def _receive_states(self) -> None:
@@ -111,14 +115,17 @@ class Feed:
                 self._publish("users", msgspec.json.encode({"tell": "users", "names": await self._robot.users()}))
 
     async def _describe(self) -> None:
-        """Query the robot again, because a service that was silent may have restarted."""
+        """Query the description of the robot again, because a service that was silent may have restarted."""
         poses = await self._fetch_poses()
-        with contextlib.suppress(TrirailError):  # the old description stays in use until the service answers
+        with contextlib.suppress(TrirailError):  # the old description remains in use until the service answers
             await self._fetch_robot()
             self._publish("poses", poses)
 
     async def _fetch_robot(self) -> None:
-        """Query the robot and the user's permissions. Raises ServiceError if the service has another version."""
+        """Query the description of the robot and the user's permissions, and publish the description to tabs.
+
+        Raises ServiceError if the service has another version.
+        """
         info, role = await self._robot.info(), await self._robot.role()
         robot = drawn_robot(info)
         about = msgspec.json.encode(describe(info, robot, self._robot.user, role))
@@ -133,7 +140,7 @@ class Feed:
         try:
             poses = await self._robot.poses()
         except TrirailError:
-            poses = {}  # a service without poses
+            poses = {}  # the service has no named poses
         taught = [name for name, pose in poses.items() if pose.taught]
         return msgspec.json.encode({"tell": "poses", "names": list(poses), "taught": taught})
 
@@ -157,12 +164,12 @@ class Feed:
             self.changed.notify_all()
 
     def _keep(self, look: AlignmentLook, event: tuple[int, bytes]) -> None:
-        """Keep an event with the others of the same alignment."""
+        """Store an event together with the earlier events of the same alignment; forget an earlier alignment."""
         name = look.id, look.purpose
         self._alignment_events = [*(self._alignment_events if name == self._alignment else ()), event][-MAX_LOOKS:]
         self._alignment = name
 
 
 def now() -> int:
-    """Return the present time for stamps, in milliseconds of the monotonic clock."""
+    """Return the present time on the monotonic clock [ms], which serves as the stamp of a state."""
     return time.monotonic_ns() // 1_000_000

@@ -1,6 +1,6 @@
-"""Messages from the page to its server: goals and commands in the service's format, and the page's own messages.
+"""Messages from the web page to its server. Goals and commands in them have the service's format.
 
-The server sends State, Event and other messages, each with its kind in `tell`.
+In the other direction, the server sends State, Event and other messages, with the kind of each message in `tell`.
 """
 
 from __future__ import annotations
@@ -16,56 +16,56 @@ from trirail.wire.sizes import MAX_FILE
 from trirail.wire.vocabulary import Command
 
 Content = Annotated[str, Meta(max_length=MAX_FILE)]
-"""Content of a file."""
+"""Content of a trajectory file."""
 
 
 class _PageMessage(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
     """Base class of the page's messages."""
 
     permission: ClassVar[str | None] = None
-    """Permission that the message requires, or None."""
+    """Permission that all messages of the class require; None if they require no permission."""
 
     @property
     def required_permission(self) -> str | None:
-        """Return the permission that the message requires."""
+        """Permission that this message requires; None if it requires no permission."""
         return self.permission
 
 
 class StateDrawn(_PageMessage, frozen=True, tag="seen"):
-    """Notice that the page has drawn a state."""
+    """Message that the page has drawn a state."""
 
     stamp: int
     """Stamp of the drawn state."""
 
 
 class JogHeld(_PageMessage, frozen=True, tag="hold"):
-    """Notice that a jog button is held down. It is repeated as long as the button is held."""
+    """Message that a jog button is pressed. The page repeats the message until the button is released."""
 
     permission = GOAL
 
     velocity: Coordinates
     """Velocity of x, y [m/s] and phi [rad/s], in the base frame."""
     seen: int
-    """Stamp of the newest state that the page has drawn, since nobody may jog while looking at an outdated picture."""
+    """Stamp of the newest state that the page has drawn. The server ignores the message if this state is outdated."""
     tool: FrameName | None = None
-    """Tool of [frames.tool] about which the platform turns; the platform's centre if None."""
+    """Name of the tool in [frames.tool] about which the platform turns; None for the platform's centre."""
 
 
 class JogReleased(_PageMessage, frozen=True, tag="release"):
-    """Notice that all jog buttons have been released."""
+    """Message that all jog buttons have been released."""
 
 
 class SendCommand(_PageMessage, frozen=True, tag="command"):
-    """The operator pressed the button or moved the slider of a command."""
+    """Request to send a command, because the operator pressed the button or moved the slider of the command."""
 
     name: Command
-    """The command."""
+    """Name of the command."""
     content: Raw = Raw()
-    """Content of the command, forwarded unchanged."""
+    """Content of the command, which the server forwards unchanged."""
 
     @property
     def required_permission(self) -> str:
-        """Return the permission that the command itself requires."""
+        """Permission to send the command."""
         return self.name
 
 
@@ -76,34 +76,34 @@ class TakeOver(_PageMessage, frozen=True, tag="takeover"):
 
 
 class SendGoal(_PageMessage, frozen=True, tag="goal"):
-    """The operator pressed the button for a named pose, a typed-in pose or a step."""
+    """Request to send a goal, because the operator pressed the button for a named pose, a typed-in pose or a step."""
 
     permission = GOAL
 
     goal: PoseGoal | NamedGoal | MoveGoal
-    """Goal, forwarded unchanged."""
+    """Goal, which the server forwards unchanged."""
     seen: int | None = None
-    """Stamp of the newest state that the page has drawn, if the goal is relative to it."""
+    """Stamp of the newest state that the page has drawn, if the goal is relative to this state; otherwise None."""
 
 
 class CheckPose(_PageMessage, frozen=True, tag="check"):
-    """Request to check whether a pose can be reached, without moving."""
+    """Request to check, without moving, if a pose can be reached."""
 
     goal: PoseGoal
-    """Goal that would be sent."""
+    """Goal that the page would send to move to the pose."""
     number: int
-    """Number that is repeated in the answer."""
+    """Number by which the page matches the answer to the request."""
 
 
 class CheckPath(_PageMessage, frozen=True, tag="check path"):
-    """Request to check whether the path in a file can be followed, without moving."""
+    """Request to check, without moving, if the path in a file can be followed."""
 
     name: str
-    """Name of the file; .json means JSON, any other suffix CSV."""
+    """Name of the file. The suffix .json means JSON; every other suffix means CSV."""
     text: Content
     """Content of the file."""
     number: int
-    """Number that is repeated in the answer."""
+    """Number by which the page matches the answer to the request."""
     stretch: bool = False
     """Whether to slow down a path that is too fast."""
 
@@ -122,7 +122,7 @@ class Follow(_PageMessage, frozen=True, tag="follow"):
 
 
 class Teach(_PageMessage, frozen=True, tag="teach"):
-    """Request to save the robot's current position as a pose."""
+    """Request to save the robot's measured pose under a name."""
 
     permission = POSES
 
@@ -140,5 +140,5 @@ class Forget(_PageMessage, frozen=True, tag="forget"):
 
 
 ServiceRequest = SendCommand | TakeOver | SendGoal | Follow | Teach | Forget
-"""Requests to the service, except those of held jog buttons."""
+"""Requests that the server passes on to the service, except jogs."""
 AnyPageMessage = StateDrawn | JogHeld | JogReleased | CheckPose | CheckPath | ServiceRequest

@@ -1,4 +1,4 @@
-"""Permissions of a role on the page. The page offers nothing else, and the service checks them again."""
+"""Permissions of a role on the page. The page offers only permitted actions; the service checks each action again."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from trirail.wire import access
 from trirail.wire.vocabulary import Command, Role
 
 GOAL, POSES, TAKEOVER = "goal", "poses", "takeover"
-"""Permissions to move, to teach poses and to take over the lease. Permissions of commands have the commands' names."""
+"""Permissions to send goals, to teach poses and to take over the lease. A command's permission has the command's name.
+"""
 
 
 def permissions(role: Role | None, takeover: Role) -> frozenset[str]:
-    """Return the permissions of a role; None has none. `takeover` is the lowest role that may take over the lease."""
+    """Return the permissions of a role; an empty set if `role` is None.
+
+    `takeover` is the lowest role that may take over the lease.
+    """
     least = {GOAL: access.GOAL_ROLE, POSES: access.POSE_ROLE, TAKEOVER: takeover} | {
         each.value: each.role for each in Command
     }

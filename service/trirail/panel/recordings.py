@@ -1,4 +1,4 @@
-"""Recordings of the service, if their folder is on the panel's machine: list, downloads and reports."""
+"""List, downloads and reports of the service's recordings, if their folder is on the panel's machine."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from trirail.telemetry.sessions import RecordedSession
 from trirail.wire.decoding import decoded, prepare
 
 MAX_SESSIONS = 100
-"""Maximum number of listed sessions; the newest are listed."""
+"""Maximum number of sessions in the list, which contains the newest sessions."""
 RECORDING_NAME = re.compile(r"[\w.-]+\.rrd", re.ASCII)
-"""Names of recordings that can be used in a header."""
+"""Pattern of the names of recordings, which are safe in an HTTP header."""
 REPORT_TIMEOUT_S = 300.0
-"""Time limit for a report, and for reading recordings for the list [s]."""
+"""Time limit for a report, and for reading the recordings for the list [s]."""
 
 
 def _open_here(path: str, flags: int) -> int:
-    """Open a file without blocking, and without following links out of its folder."""
+    """Open a file without blocking, and without following a symbolic link, which could lead out of the folder."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 class AlreadySent(Response):
-    """Response that has already been sent."""
+    """Response that has already been sent, so that the websockets library sends nothing."""
 
     def serialize(self) -> bytes:
-        """Return no bytes, which ends the connection."""
+        """Return no bytes; the connection then ends."""
         return b""
 
 
 class _SessionList(msgspec.Struct):
-    """Output of `trirail sessions --json`, limited to the fields used here."""
+    """Output of `trirail sessions --json`, without the fields that are not needed here."""
 
     sessions: list[RecordedSession]
 
@@ -52,7 +52,7 @@ prepare(_SessionList)
 
 
 class Recordings:
-    """Recordings of one robot."""
+    """Recordings of one robot in a folder."""
 
     def __init__(self, robot: str, folder: str) -> None:
         self._robot = robot
@@ -60,11 +60,18 @@ class Recordings:
         self._one_report = threading.Lock()
 
     def listed(self) -> dict[str, Any]:
-        """Return the folder, whether it is on this machine, and its sessions, newest first, ready to be encoded."""
+        """Return the list of sessions for the page, as values that can be encoded as JSON.
+
+        `folder` is the folder, `here` is True if the folder on this machine contains recordings, and `sessions` are
+        the sessions, newest first.
+        """
         return {"folder": str(self._folder), "here": self._here, "sessions": self._sessions()[: -MAX_SESSIONS - 1 : -1]}
 
     def send_file(self, opened: ServerConnection, name: str, headers: dict[str, str]) -> Response | None:
-        """Send a recording of any size as a download; return None if it is not a regular file of the folder."""
+        """Send a recording of any size as a download.
+
+        Return None, without sending anything, if the recording is not a regular file in the folder.
+        """
         if not self._here or RECORDING_NAME.fullmatch(name) is None:
             return None
         try:
@@ -81,12 +88,13 @@ class Recordings:
             with contextlib.suppress(OSError):  # the browser has disconnected
                 opened.socket.sendall(Response(status.value, status.phrase, Headers(own | headers)).serialize())
                 if size:
-                    opened.socket.sendfile(file, count=size)  # a file still being written: its current part
+                    opened.socket.sendfile(file, count=size)  # if the file is still being written, its present part
         return AlreadySent(status.value, status.phrase, Headers())
 
     def report(self, session: str) -> str | None:
-        """Return the output of `trirail report` for a session, run in a separate process; None if the session does not
-        exist.
+        """Run `trirail report` for a session in a separate process; return the output.
+
+        Return None if the session does not exist.
         """
         files = next((each.files for each in self._sessions() if each.session == session), None)
         if files is None or not all(stat.S_ISREG((self._folder / name).lstat().st_mode) for name in files):
@@ -106,8 +114,9 @@ class Recordings:
         return decoded(done.stdout, _SessionList).sessions if done.returncode == 0 else []
 
     def _run(self, *command: str) -> subprocess.CompletedProcess[bytes]:
-        """Run a `trirail` command in the folder at low priority, because the page moves a robot while it reads
-        recordings.
+        """Run a `trirail` command in the folder.
+
+        The command has a low priority, because the page may move a robot at the same time.
         """
         return subprocess.run(
             ["nice", sys.executable, "-m", "trirail", *command], cwd=self._folder, capture_output=True,

@@ -1,6 +1,6 @@
-"""Server of the panel.
+"""Web server of the panel, on the loopback interface.
 
-On the loopback interface, it serves the page's files and a WebSocket per tab to token holders.
+The server sends the page's files and opens a WebSocket for each tab. Every request must contain the secret token.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from trirail.panel.tab import Tab
 from trirail.wire.sizes import MAX_FILE
 
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
-"""Accepted host names. A foreign page whose name resolves to this machine (DNS rebinding) sends a different name."""
+"""Accepted names in the Host header. A browser sends another name for a malicious page with a host name that resolves
+to this machine (DNS rebinding)."""
 
 
 def refused(token: str, path: str, hosts: Sequence[str], origins: Sequence[str]) -> str | None:
-    """Return the reason for refusing a request; None if it is accepted.
+    """Return the reason to refuse a request; None if the request is accepted.
 
-    `path` is the requested /TOKEN/FILE; `hosts` and `origins` contain the values of all headers with these names. A
-    browser sends the origin with every request from a script, and it must be the page's own origin.
+    `path` is the requested path /TOKEN/FILE. `hosts` and `origins` are the values of all Host and Origin headers. A
+    browser sends the Origin header with every request from a script, and this origin must be that of the panel's page.
     """
     try:
         (host,) = hosts
@@ -56,17 +57,17 @@ def refused(token: str, path: str, hosts: Sequence[str], origins: Sequence[str])
 
 LOOPBACK = "127.0.0.1"
 PORT = 9880
-"""Port of the page, if it is free and no other port is requested."""
+"""Default port of the page, which is used if it is free and no other port is requested."""
 SOCKET = "socket"
-"""Name of the page's WebSocket below the token."""
+"""Name after the token in the path of the page's WebSocket."""
 MAX_MESSAGE = 3 * MAX_FILE
-"""Maximum size of a message from the page, which may contain a file to follow as a JSON string [bytes]."""
+"""Maximum size of a message from the page, which may contain a trajectory file as a JSON string [bytes]."""
 LANGUAGES = "languages.json"
-"""File with the languages of the page: their codes, and their names in the languages themselves."""
+"""Name of the file with the languages of the page: the code of each language, and its name in the same language."""
 SESSIONS, RECORDING, REPORT = "sessions", "recording", "report"
-"""Names of the requests for recordings."""
+"""Names after the token in the paths of requests for recordings."""
 REQUEST_TIMEOUT_S = 5.0
-"""Time limit for receiving a request, which comes from this machine [s]."""
+"""Time limit for receiving a request from this machine [s]."""
 TYPES = {
     "html": "text/html",
     "css": "text/css",
@@ -75,7 +76,8 @@ TYPES = {
     "json": "application/json",
 }
 HEADERS = {
-    # No content from other origins, no frame of another page around this page (clickjacking), and no leak of the token.
+    # These headers forbid content from other origins, prevent other pages from showing this page in a frame
+    # (clickjacking), and prevent a leak of the token.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -86,21 +88,21 @@ HEADERS = {
 
 
 class Panel:
-    """Page of one robot, served while the context is active.
+    """Context manager that serves the operator's page of one robot.
 
     Parameters
     ----------
     robot
-        Robot to operate.
+        Robot that the page operates.
     port
-        Port on the loopback interface; None for 9880, or any free port if that one is in use.
+        Port on the loopback interface. None means port 9880, or any free port if 9880 is in use.
     token
         Secret part of the address; None for a random token.
 
     Raises
     ------
     ServiceError
-        The port is in use, or no service answers.
+        If the port is in use, or if no service answers.
     """
 
     def __init__(self, robot: AsyncRobot, port: int | None = None, token: str | None = None) -> None:
@@ -117,7 +119,7 @@ class Panel:
         self._files = dict(_files())
         self._recordings = Recordings(robot.name, self._feed.recordings)
         self.url = f"http://{LOOPBACK}:{listening.getsockname()[1]}/{self._token}/"
-        """Address to open; anyone who has it can move the robot."""
+        """Address of the page. Every program on this machine that knows the address can move the robot."""
         self._server: Server = serve(
             self._serve,
             sock=listening,
@@ -149,7 +151,7 @@ class Panel:
         Tab(opened, self._robot, self._loop, self._feed).serve()
 
     def _answer(self, opened: ServerConnection, request: Request) -> Response | None:
-        """Answer or refuse a request for a file; None opens the WebSocket."""
+        """Return the response to a request; None to open the WebSocket."""
         headers = request.headers
         path = request.path.partition("?")[0]
         if why := refused(self._token, path, headers.get_all("Host"), headers.get_all("Origin")):
@@ -187,8 +189,10 @@ def _response(status: HTTPStatus, body: bytes, suffix: str) -> Response:
 
 
 def _listen(port: int | None) -> socket.socket:
-    """Listen on a port of the loopback interface: the requested port, or else the default port, or any port if it is
-    taken.
+    """Return a socket that listens on a port of the loopback interface.
+
+    If `port` is None, the port is PORT, or any free port if PORT is in use. Raises ServiceError if the requested port
+    cannot be used.
     """
     requested = PORT if port is None else port
     if 0 <= requested <= 65535:

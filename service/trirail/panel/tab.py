@@ -1,4 +1,4 @@
-"""Open tab of the operator's page, which handles the page's messages and sends the data to be shown."""
+"""Server side of an open tab of the operator's page, which handles the tab's messages and sends the data to show."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ from trirail.wire.goals import Goal
 
 
 class NewestTask:
-    """Worker that runs only the most recently submitted task; `name` is the name of its thread."""
+    """Worker thread that runs the most recently submitted task, and skips older tasks that have not begun.
+
+    `name` is the name of the thread.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -34,7 +37,7 @@ class NewestTask:
         self._closed = False
 
     def submit(self, task: Callable[[], None]) -> None:
-        """Submit a task, which replaces a task that is still waiting."""
+        """Submit a task; it replaces a task that has not begun."""
         with self._changed:
             self._task = task
             self._changed.notify()
@@ -59,20 +62,20 @@ class NewestTask:
 
 
 MAX_STATES_IN_TRANSIT = 3
-"""Maximum number of states that have been sent and not yet drawn.
+"""Maximum number of states that have been sent but not yet drawn.
 
-A frozen tab or a slow network receives no more, so that no states queue up.
+If a tab is frozen or the network is slow, the tab receives no further states, so that states do not queue up.
 """
 MAX_ANSWERS = 200
-"""Maximum number of answers kept for a tab that does not read them; the oldest are dropped."""
+"""Maximum number of answers that are stored for a tab that does not read them; the oldest answers are dropped."""
 
 prepare(AnyPageMessage)
 
 
 class Tab:
-    """Handler of one WebSocket. When the socket closes, the tab releases its jog and its lease.
+    """Handler of the WebSocket of one tab. When the socket closes, the handler ends the tab's jog and lease.
 
-    Only the service decides whether the robot moves: a message that is late or lost does not renew a jog.
+    A late or lost message does not renew a jog, so the service then brakes the robot.
     """
 
     def __init__(self, socket: ServerConnection, robot: AsyncRobot, loop: LoopThread, feed: Feed) -> None:
@@ -88,11 +91,11 @@ class Tab:
         self._open = True
 
     def serve(self) -> None:
-        """Handle the page's messages until its connection ends."""
+        """Handle the tab's messages until the connection ends."""
         sender = threading.Thread(target=self._send, name="tab", daemon=True)
         sender.start()
         try:
-            with contextlib.suppress(ConnectionClosed):  # a tab that was killed or has sent too much counts as closed
+            with contextlib.suppress(ConnectionClosed):  # the tab was closed or killed, or has sent too much
                 for text in self._socket:
                     self._on_message(text)
         finally:
@@ -159,7 +162,7 @@ class Tab:
             self._feed.changed.notify_all()
 
     def _send(self) -> None:
-        """Send all pending messages once, and send states only as fast as the page draws them."""
+        """Send pending messages and states until the tab closes; send states only as fast as the page draws them."""
         sent: dict[str, bytes] = {}
         event, stamp, silent = 0, 0, False
         feed = self._feed

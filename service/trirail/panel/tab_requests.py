@@ -1,4 +1,4 @@
-"""Requests from a tab to the service. Each runs in its own task, so that STOP never waits."""
+"""Requests from a tab to the service. Each request has a separate task, so a stop never waits for other requests."""
 
 from __future__ import annotations
 
@@ -21,26 +21,32 @@ from trirail.wire.messages import CommandReply
 from trirail.wire.vocabulary import Command
 
 MAX_STATE_AGE_MS = 500
-"""Maximum age of the newest state on the page for a jog [ms]; if older, the page or its connection has stalled."""
-MAX_PENDING = 8
-"""Maximum number of unanswered commands of a tab.
+"""Maximum age of the newest state on the page at which the page can jog [ms].
 
-Commands that stop the robot have a separate limit of the same size.
+If the state is older, the page or its connection has stalled."""
+MAX_PENDING = 8
+"""Maximum number of unanswered requests of a tab.
+
+Commands that stop the robot do not count, and have a separate limit of the same size.
 """
 
 
 class MessageSender(Protocol):
-    """Function that sends messages to the page.
-
-    `to` is a word that the page translates, `name` the name of its object, if any.
-    """
+    """Function that sends messages to the page."""
 
     def __call__(self, tell: str, /, **content: Any) -> None:
-        """Send a message of kind `tell`."""
+        """Send a message of the kind `tell` with the fields `content`.
+
+        The field `to` contains a word that the page translates, such as the name of a command. The field `name`
+        contains the name of a pose or a file, if there is one.
+        """
 
 
 class TabRequests:
-    """Sender of one tab's requests and holder of its lease; `send` sends the replies to the page."""
+    """Sender of the requests of one tab, and holder of the tab's lease.
+
+    `send` is a function that sends the results of the requests to the page.
+    """
 
     def __init__(self, robot: AsyncRobot, loop: LoopThread, send: MessageSender) -> None:
         self._robot = robot
@@ -51,13 +57,16 @@ class TabRequests:
         self._open = True
 
     def close(self) -> None:
-        """Release the lease, even if an acquisition is still in progress."""
+        """Release the lease, even if the lease is still being acquired."""
         self._open = False
         with contextlib.suppress(ServiceError):  # the connection is closed, so the lease ends when it times out
             self._loop.call(self._release())
 
     def begin(self, request: ServiceRequest) -> None:
-        """Send a request in parallel with pending requests; drop a command that is already pending."""
+        """Send a request in parallel with pending requests.
+
+        Ignore a command that is already pending, and a goal that refers to an outdated state.
+        """
         match request:
             case SendCommand(name, content):
                 send = lambda: self._command(name, bytes(content) or None)  # noqa: E731
@@ -76,9 +85,13 @@ class TabRequests:
                 self._loop.start(self._answer(lambda: self._robot.forget(name), "forget", name))
 
     async def _answer(self, send_request: Callable[[], Awaitable[object]], kind: str, name: str = "") -> None:
-        """Send a request and report its result. Commands that stop the robot never wait and have a separate limit."""
+        """Send a request, and send its result to the page.
+
+        `kind` and `name` become the fields `to` and `name` of the result.
+        """
         stops = isinstance(kind, Command) and kind.stops
-        repeats = isinstance(kind, Command) and not stops and kind is not Command.SET_OUTPUT  # it is of one output
+        # Two commands set_output may concern different outputs.
+        repeats = isinstance(kind, Command) and not stops and kind is not Command.SET_OUTPUT
         if repeats and self._pending[kind]:
             return
         place = "stops" if stops else "others"
@@ -114,7 +127,7 @@ class TabRequests:
         return await self._robot.follow(points, stretch=request.stretch)
 
     async def _acquire(self, *, force: bool = False) -> None:
-        """Acquire the lease and hold it while this tab is open; keep-alives are sent only until the tab closes."""
+        """Acquire the lease, and renew it until this tab closes."""
         if self._lease is None or self._lease.lost is not None:
             lease = self._robot.lease(force=force)
             await lease.__aenter__()
@@ -129,7 +142,7 @@ class TabRequests:
 
 
 def refusal(error: TrirailError) -> dict[str, Any]:
-    """Return the message of an error, with the code and values that the page needs to translate it."""
+    """Return the fields of a message about an error: the text, and the code and values that the page translates."""
     fields: dict[str, Any] = {"message": str(error)}
     if isinstance(error, RefusedError):
         fields |= {"code": error.code, "slider": error.slider, "value": error.value, "limit": error.limit}

@@ -1,1 +1,1 @@
-"""Messages, packets and records between processes and over Zenoh, and the connections that carry them."""
+"""Messages over Zenoh, packets and records between the service's processes, and the connections that transport them."""

@@ -1,9 +1,10 @@
-"""Permissions on the network: the roles, and Zenoh's access control derived from them.
+"""Permissions on the network, as rules for Zenoh's access control that are derived from the users' roles.
 
-Zenoh applies one set of rules to each certificate's common name, and another set to every certificate. It drops a
-message that no rule allows, and does not inform the sender. Each direction has its own rule. The robot's publications
-may leave but not enter, so no other user can forge a state, event or reply; clients' queries may enter but not leave. A
-rule applies if its key expression includes that of the message: permission for `goal/ann` does not permit `goal/*`.
+Zenoh applies one set of rules to each common name in a certificate, and another set to every certificate. Zenoh drops a
+message that no rule allows, and does not inform the sender. A rule applies to one direction. The robot's publications
+may leave the service but not enter it, so no user can forge a state, event or reply. Queries of clients may enter the
+service but not leave it. A rule applies to a message if the rule's key expression includes the key expression of the
+message; permission for `goal/ann` therefore does not permit `goal/*`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from trirail.wire.vocabulary import Command, Role
 from trirail.wire.zenoh_session import key
 
 GOAL_ROLE = Role.OPERATOR
-"""Lowest role that may send and check goals. It may also report alignment looks, since an alignment sends goals."""
+"""Lowest role that may send and check goals, and report the looks of an alignment, since an alignment sends goals."""
 POSE_ROLE = Role.MAINTAINER
 """Lowest role that may teach and remove poses."""
 
@@ -26,7 +27,7 @@ _Rule = dict[str, Any]
 
 
 def least_role(*parts: str) -> Role:
-    """Return the lowest role that may use a resource, given as parts of its key, such as ("cmd", user, "enable")."""
+    """Return the lowest role that may query the key made of `parts`, such as ("cmd", user, "enable")."""
     if parts[0] in ("goal", "check", "alignment"):
         return GOAL_ROLE
     if parts[0] in ("teach", "forget"):
@@ -35,12 +36,13 @@ def least_role(*parts: str) -> Role:
 
 
 def access_control(robot: str, users: Mapping[str, Role], router: str | None = None) -> dict[str, Any]:
-    """Return section access_control of Zenoh's configuration for the service of a robot.
+    """Return the section access_control of Zenoh's configuration for the service of a robot.
 
-    Users can send only in their own name: the key contains it, and the rule applies to the certificate with that
-    common name. Every certificate may query its role, so that a user without permissions can find out why. Messages
-    through a router do not carry a user's certificate: the router may send in every name, and enforces the rules of
-    its users itself.
+    Users can send messages only under their own name, because the key of a message contains the user's name and the
+    rule for this key applies only to the certificate with the same common name. Every certificate may query a role, so
+    that a user without permissions can find out the reason. Messages through a router do not carry a user's
+    certificate. The service therefore lets the router send under every name, and the router enforces the rules of its
+    users.
     """
     asking, using = list(_certificate_rules(robot)), list(_viewer_rules(robot))
     rules, policies = asking + using, [_policy("every certificate", asking)]
@@ -57,7 +59,7 @@ def access_control(robot: str, users: Mapping[str, Role], router: str | None = N
         "default_permission": "deny",
         "rules": rules,
         "subjects": [
-            {"id": "every certificate", "link_protocols": ["tls"]},  # not a possible user: names have no spaces
+            {"id": "every certificate", "link_protocols": ["tls"]},  # cannot be a user, since names have no spaces
             *map(_subject, (*users, *([router] if router is not None else []))),
         ],
         "policies": policies,
@@ -67,17 +69,18 @@ def access_control(robot: str, users: Mapping[str, Role], router: str | None = N
 def router_access_control(
     behind: Mapping[str, Sequence[str]], users: Mapping[str, Role], router: str | None = None
 ) -> dict[str, Any]:
-    """Return section access_control for a router between robots and users.
+    """Return the section access_control of Zenoh's configuration for a router between robots and users.
 
     Parameters
     ----------
     behind
-        Robots that each connecting robot or router speaks for: the robot itself, or the robots behind that router.
-        Their rules mirror those of a robot for its router, limited to the keys of these robots.
+        Names of the robots that can be reached through each peer of the router, by the peer's common name. A peer is a
+        robot, which reaches only itself, or another router. The rules for a peer mirror the rules of a robot for its
+        router, but only for the keys of these robots.
     users
-        Roles of the users, which apply to every robot. The robot itself answers queries for a role.
+        Roles of the users, which apply to every robot. The robot, not the router, answers queries for a role.
     router
-        Common name of another router that this one connects to.
+        Common name of another router to which this router connects.
     """
     section = access_control("*", users, router)
     for name, robots in behind.items():
@@ -98,20 +101,20 @@ def _certificate_rules(robot: str) -> Iterator[_Rule]:
 
 
 def _router_rules(robot: str) -> Iterator[_Rule]:
-    """Yield the rules for a router alone: it may forward messages in the name of every user."""
+    """Yield the rules that apply only to a router, which may forward messages of every user."""
     yield from _user_rules(robot, "*", Role.MAINTAINER)
 
 
 def _mirrored(name: str, rule: _Rule) -> _Rule:
-    """Return a robot's rule for the other end of the connection, with the directions swapped."""
+    """Return the rule for the other end of the connection, with the opposite direction and `name` before its id."""
     (flow,) = rule["flows"]
     return rule | {"id": f"{name}: {rule['id']}", "flows": ["egress" if flow == "ingress" else "ingress"]}
 
 
 def _viewer_rules(robot: str) -> Iterator[_Rule]:
-    """Yield the rules for every user: a viewer's, except for keys with the user's name, and the robot's replies."""
+    """Yield the rules for every user: a viewer's permissions for keys without a user name, and the robot's replies."""
     published = [key(robot, name) for name in PUBLISHED]
-    # Keys of the advanced publisher: its history, its liveliness token, and the number of its last event.
+    # Keys of Zenoh's advanced publisher, with its history, its liveliness token and the number of its last event.
     past, alive = key(robot, "event", "@adv", "**"), key(robot, "alive")
     info_keys = [key(robot, "info"), key(robot, "poses")]
     taught = [key(robot, name, "*", "*") for name in ("teach", "forget")]
@@ -119,13 +122,13 @@ def _viewer_rules(robot: str) -> Iterator[_Rule]:
     asked = [*sent, key(robot, "cmd", "*", "*"), *taught, *info_keys]
     yield _rule("publish", "egress", ("put",), *published, past)
     yield _rule("subscribe", "ingress", ("declare_subscriber",), *published, past)
-    # A fleet client subscribes to all robots with one key expression; it receives only this robot's publications.
+    # A fleet client subscribes to all robots with one key expression. This service sends only its own publications.
     yield _rule("subscribe to all", "ingress", ("declare_subscriber",), *(key("*", name) for name in PUBLISHED))
     yield _rule("ask", "ingress", ("query",), *info_keys, past)
     yield _rule("listen", "egress", ("declare_queryable",), *asked, past)
     yield _rule("listen to puts", "egress", ("declare_subscriber",), key(robot, "goal", "*"))
     yield _rule("answer", "egress", ("reply",), *asked, past, *published)
-    # Clients query the liveliness of all robots with one key expression; they receive only this robot's.
+    # Clients query the liveliness of all robots with one key expression. This service sends only its own token.
     presence = ("liveliness_query", "declare_liveliness_subscriber")
     here = key(robot, "here", "*")
     yield _rule("look who is there", "ingress", presence, key("*", "alive"), here, past)

@@ -1,7 +1,7 @@
-"""Decoding and validation of everything that arrives from outside; code behind this boundary need not check it again.
+"""Decoding and validation of all data from the network, so that other code need not check the data again.
 
-Invalid input raises RefusedError with the expected form. The service decodes keys, goals and commands here; clients
-decode replies, states, events and records.
+Invalid input raises RefusedError with the expected form. The service uses this module to decode keys, goals and
+commands. Clients use it to decode replies, states and events.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from trirail.wire.vocabulary import Command
 JSON, MSGPACK, BINARY = "application/json", "application/msgpack", "application/octet-stream"
 _READ_AS = {
     "": JSON,
-    "zenoh/bytes": JSON,  # Zenoh's default if the sender gave no encoding
+    "zenoh/bytes": JSON,  # Zenoh's default if the sender specifies no encoding
     "zenoh/string": JSON,
     "text/plain": JSON,
     "text/json": JSON,
@@ -38,12 +38,13 @@ prepare(State, Event, Info, NamedPose, NamedPoses, RobotSummary, AlignmentLook)
 
 
 def names(key: str, prefix: str, wanted: tuple[str, ...]) -> list[str]:
-    """Return the parts of a key after its prefix, one for each name in `wanted`.
+    """Return the parts of a key after its prefix, one part for each name in `wanted`.
 
     Raises
     ------
     RefusedError
-        The key contains wildcards or has another number of parts, or a part is not a valid name of a user or a pose.
+        If the key contains wildcards, lacks the prefix or has the wrong number of parts, or if a part that names a user
+        or a pose is not a valid name.
     """
     form = "/".join((prefix, *(f"<{name}>" for name in wanted)))
     if "*" in key:
@@ -64,12 +65,12 @@ def check_size(size: int) -> None:
 
 
 def too_large(size: int) -> str:
-    """Return the refusal of a message with too many bytes."""
+    """Return the error message for a message that exceeds the maximum size."""
     return f"message: {size} bytes exceed the maximum of {MAX_MESSAGE} bytes"
 
 
 def encoding(name: str) -> str:
-    """Return the format of a payload, JSON or MSGPACK. Raises RefusedError for another encoding."""
+    """Return the format, JSON or MSGPACK, for the name of a Zenoh encoding. Raises RefusedError for other encodings."""
     read_as = _READ_AS.get(name.split(";", maxsplit=1)[0])
     if read_as is None:
         problem = f"encoding {quoted(name)} is not supported; use {JSON} (the default) or {MSGPACK}"
@@ -78,7 +79,11 @@ def encoding(name: str) -> str:
 
 
 def decode(payload: bytes, kind: Any, what: str, encoded: str = JSON) -> Any:
-    """Return a decoded message of a type or union; an empty payload is null. Raises RefusedError, prefixed `what`."""
+    """Decode a payload as a message of the type or union `kind`; an empty payload counts as null.
+
+    Raises RefusedError if the payload is too large or invalid; for an invalid payload, the error message begins with
+    `what`.
+    """
     check_size(len(payload))
     read_as = encoding(encoded)
     try:

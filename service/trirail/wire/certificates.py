@@ -1,7 +1,7 @@
-"""X.509 certificates (P-256) by which robot and users authenticate each other, and the authority that signs them.
+"""X.509 certificates (P-256) with which robots and users authenticate each other, and the authority that signs them.
 
-A user's certificate is valid for clients only, so it cannot impersonate the robot. A robot's certificate lists the
-addresses at which clients connect, and is valid for both sides, because a robot can also connect to a router.
+A user's certificate is valid for clients only, so a user cannot impersonate the robot. A robot's certificate lists the
+addresses at which clients connect. It is valid for servers and clients, because a robot can also connect to a router.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 AUTHORITY_DAYS = 3650
 """Validity of an authority's certificate [days]."""
 CLOCK_TOLERANCE = timedelta(minutes=10)
-"""Time before its creation from which a certificate is valid, because the clocks of two machines differ."""
+"""Time by which the validity of a certificate begins before its creation, because the clocks of machines differ."""
 
 
 class Pair(NamedTuple):
@@ -30,7 +30,7 @@ class Pair(NamedTuple):
 
 
 def authority(robot: str, now: datetime | None = None) -> Pair:
-    """Return a new authority: a self-signed certificate and its key."""
+    """Return a new authority, which consists of a self-signed certificate and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"{robot} authority")
     builder = (
@@ -51,20 +51,20 @@ def issue(
     serves: bool = False,
     now: datetime | None = None,
 ) -> Pair:
-    """Return a new private key and its certificate, signed by the given authority.
+    """Return a new private key and its certificate, which the authority `by` signs.
 
     Parameters
     ----------
     by
         Authority that signs the certificate.
     name
-        Common name.
+        Common name of the certificate.
     days
-        Validity.
+        Validity [days].
     addresses
         Host names and IP addresses at which clients connect to a robot.
     serves
-        Make a certificate for a robot or router; otherwise it is valid for clients only.
+        If True, the certificate is for a robot or router. If False, it is valid for clients only.
 
     """
     key = ec.generate_private_key(ec.SECP256R1())
@@ -72,7 +72,10 @@ def issue(
 
 
 def renew(by: Pair, certificate: bytes, days: float, now: datetime | None = None) -> bytes:
-    """Return a copy of a certificate for the same key, valid for `days` from now. Raises ValueError."""
+    """Return a copy of a certificate with the same key that is valid for `days` from now.
+
+    Raises ValueError if the certificate is not a valid PEM certificate with an elliptic-curve key.
+    """
     old = x509.load_pem_x509_certificate(certificate)
     key = old.public_key()
     if not isinstance(key, ec.EllipticCurvePublicKey):
@@ -81,13 +84,13 @@ def renew(by: Pair, certificate: bytes, days: float, now: datetime | None = None
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """Return the common name of a certificate; "" if it has none or several."""
+    """Return the common name of a certificate; "" if the certificate has no common name or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
 
 
 def serves(certificate: x509.Certificate) -> bool:
-    """Return whether clients accept the certificate from a robot or router; a user's is valid for clients only."""
+    """Return True if the certificate is for a robot or router, False if it is valid for clients only."""
     try:
         purposes = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     except x509.ExtensionNotFound:
@@ -96,7 +99,7 @@ def serves(certificate: x509.Certificate) -> bool:
 
 
 def addresses_of(certificate: x509.Certificate) -> list[str]:
-    """Return the host names and IP addresses of a robot's certificate."""
+    """Return the IP addresses and host names in a robot's certificate."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:

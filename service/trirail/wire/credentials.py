@@ -1,4 +1,4 @@
-"""The folder with which a robot or user authenticates on the network: ca.pem, cert.pem and key.pem."""
+"""Credentials of a robot, router or user on the network: a folder with the files ca.pem, cert.pem and key.pem."""
 
 from __future__ import annotations
 
@@ -15,40 +15,43 @@ from trirail.wire.vocabulary import Role
 
 AUTHORITY, CERTIFICATE, KEY, REVOKED = "ca.pem", "cert.pem", "key.pem", "revoked.txt"
 EXPIRY_NOTICE = timedelta(days=30)
-"""Time before the expiry of a certificate from which a warning is given."""
+"""Time before the expiry of a certificate at which warnings begin."""
 
 
 class Credentials(NamedTuple):
-    """Content of such a folder."""
+    """Content of a credentials folder."""
 
     folder: Path
     name: str
-    """Common name of the certificate: a user's or a robot's; "" if it has none."""
+    """Common name of the certificate, the name of a user, robot or router; "" if the certificate has none."""
     expires: datetime
     """Expiry of the certificate or of its authority, whichever is earlier."""
     addresses: tuple[str, ...]
     """Host names and IP addresses at which clients connect to a robot; empty for a user."""
     serves: bool = False
-    """Whether the certificate is a robot's or a router's; a user's is valid for clients only."""
+    """True if the certificate is for a robot or a router, False if it is for a user and valid for clients only."""
     contents: tuple[bytes, ...] = ()
-    """Contents of the three files, as checked."""
+    """Contents of the three files, read when the credentials were checked."""
     copies: tuple[Path, ...] = ()
-    """Files in this process's memory with these contents, used instead of those in the folder."""
+    """Files with these contents in this process's memory; if present, they replace the files in the folder."""
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
-        """Paths of the authority's certificate, this certificate and its private key."""
+        """Paths of the authority's certificate, of the certificate and of its private key."""
         authority, certificate, key = self.copies or (self.folder / name for name in (AUTHORITY, CERTIFICATE, KEY))
         return authority, certificate, key
 
     def in_memory(self) -> Self:
-        """Return the same credentials with files in this process's memory, independent of changes in the folder."""
+        """Return a copy with files in this process's memory, so that later changes in the folder have no effect."""
         return self._replace(copies=tuple(map(_memory_file, self.contents)))
 
     @classmethod
     def read(cls, folder: Path, now: datetime | None = None) -> Self:
-        """Return the checked credentials of a folder. Raises ServiceError, with file and remedy, for unusable ones."""
-        # Imported here, because clients without certificates need not wait for it.
+        """Read and check the credentials in a folder.
+
+        Raises ServiceError that names the file and a remedy if the credentials are unusable.
+        """
+        # Imported here, so that clients without certificates do not wait for the import.
         from cryptography import x509
         from cryptography.exceptions import InvalidSignature
         from cryptography.hazmat.primitives.serialization import load_pem_private_key
@@ -89,7 +92,10 @@ class Credentials(NamedTuple):
 
     @classmethod
     def read_server(cls, folder: Path) -> Self:
-        """Read the folder of a robot or router. Raises ServiceError like `read`, and for a user's folder."""
+        """Read and check the credentials of a robot or router.
+
+        Raises ServiceError if the credentials are unusable or are those of a user.
+        """
         credentials = cls.read(folder)
         if not credentials.serves:
             raise ServiceError(
@@ -99,7 +105,7 @@ class Credentials(NamedTuple):
         return credentials
 
     def warning(self, now: datetime | None = None) -> str:
-        """Return a warning that the certificate expires soon; "" if it does not."""
+        """Return a warning if the certificate expires within EXPIRY_NOTICE; otherwise ""."""
         left = self.expires - (now or datetime.now(UTC))
         if left > EXPIRY_NOTICE:
             return ""
@@ -107,20 +113,23 @@ class Credentials(NamedTuple):
 
 
 class Admission(NamedTuple):
-    """Credentials and roles of a service, read once at its start and used at each start of its gateway."""
+    """Credentials of a service and roles of its users, read once at the service's start and used by every gateway."""
 
     credentials: Credentials
     users: dict[str, Role]
-    """Role of each user that is not revoked."""
+    """Roles of the users, without users that have been revoked."""
 
     @classmethod
     def read(cls, folder: Path, users: Mapping[str, Role]) -> Self:
-        """Return the credentials and roles of a robot's folder. Raises ServiceError as its two parts do."""
+        """Read the credentials in a robot's folder, and remove the revoked users from `users`.
+
+        Raises ServiceError if the credentials are unusable, or if the list of revoked users cannot be read.
+        """
         return cls(Credentials.read_server(folder), with_role(users, folder))
 
 
 def check_private(key_file: Path) -> None:
-    """Raise ServiceError if a private key is readable by anyone but its owner; the group may read a key of root."""
+    """Raise ServiceError if users other than the owner can read a private key. The group may read a key of root."""
     status = key_file.stat()
     if status.st_mode & (0o037 if status.st_uid == 0 else 0o077):
         raise ServiceError(
@@ -130,25 +139,25 @@ def check_private(key_file: Path) -> None:
 
 
 def revoked(folder: Path) -> frozenset[str]:
-    """Return the users whose certificates are revoked, from the list in an authority's folder, one per line.
+    """Return the names of the revoked users from the file revoked.txt, one per line, in an authority's folder.
 
-    Raises ServiceError if the list exists but cannot be read.
+    The set is empty if the file does not exist. Raises ServiceError if the file exists but cannot be read.
     """
     file = folder / REVOKED
     return frozenset(_content(file).decode().split()) if file.exists() else frozenset()
 
 
 def with_role(users: Mapping[str, Role], folder: Path) -> dict[str, Role]:
-    """Return the roles of the users that are not revoked. Raises ServiceError like `revoked`."""
+    """Return the roles of the users that are not revoked. Raises the ServiceError of `revoked`."""
     without = revoked(folder)
     return {user: role for user, role in users.items() if user not in without}
 
 
 def credentials_for(robot: str, locator: str, folder: Path | str | None = None) -> Credentials | None:
-    """Return the credentials that a client needs at a locator; None if it needs none.
+    """Return the credentials that a client needs at a locator; None if the locator requires no credentials.
 
-    The default folder is ~/.config/trirail/<robot>. Raises ServiceError if the credentials are unusable, or if the
-    locator would not use them.
+    The default folder is ~/.config/trirail/<robot>. Raises ServiceError if the credentials are unusable, or if a folder
+    is given although the locator's protocol does not use credentials.
     """
     if reach(locator) is ReachableBy.CERTIFICATE:
         base = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")

@@ -1,4 +1,4 @@
-"""Diagnosis of endpoints that cannot be reached: Zenoh does not report the reason, and only retries."""
+"""Diagnosis of endpoints that cannot be reached, since Zenoh only retries and does not report the reason."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from trirail.wire.endpoints import ReachableBy, fault_of, reach, socket_file, tc
 from trirail.wire.text import quoted
 
 CONNECT_TIMEOUT_S = 2.0
-"""Time-out of the connection [s]."""
+"""Time-out for opening a connection [s]."""
 REJECTION_TIMEOUT_S = 0.3
-"""Time to wait after the handshake for the server to reject our certificate: TLS 1.3 completes ours earlier [s]."""
+"""Time to wait for the server's rejection of the client's certificate [s].
+
+In TLS 1.3, the client completes its handshake before the server has checked the client's certificate."""
 
 
 def connection_problem(endpoint: str, credentials: Credentials | None = None, name: str | None = None) -> str:
-    """Return the problem that TCP and TLS report for an endpoint; "" if they report none.
+    """Connect to an endpoint, and return the problem that TCP or TLS reports; "" if there is no problem.
 
-    `name` is the common name that the server's certificate must have; None accepts any.
+    `name` is the common name that the server's certificate must have; None accepts every name.
     """
     if fault := fault_of(endpoint):
         return fault
@@ -49,7 +51,7 @@ def connection_problem(endpoint: str, credentials: Credentials | None = None, na
 
 
 def _tls_problem(opened: socket.socket, host: str, credentials: Credentials, name: str | None) -> str:
-    from cryptography import x509  # here, because clients without certificates need not wait for it
+    from cryptography import x509  # imported here, so that clients without certificates do not wait for the import
 
     from trirail.wire.certificates import common_name
 

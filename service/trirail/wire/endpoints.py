@@ -1,4 +1,4 @@
-"""Validation of Zenoh endpoints, and their reach: this machine's users, those of a socket's file, or the network."""
+"""Validation and comparison of Zenoh endpoints, and classification of the users who can connect to an endpoint."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import StrEnum
 from pathlib import Path
 
 DEFAULT_LOCATOR = "tcp/127.0.0.1:7447"
-"""Endpoint of a service by default."""
+"""Endpoint at which a service listens by default."""
 ENDPOINT_SYNTAX = "an endpoint is protocol/address, such as tcp/127.0.0.1:7447"
 _WITH_PORT = frozenset({"tcp", "tls", "udp", "quic", "ws"})
 LAST_PORT = 65535
@@ -19,7 +19,7 @@ _Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class ReachableBy(StrEnum):
-    """Users that can open a session on an endpoint."""
+    """Group of users who can open a session at an endpoint."""
 
     FILE = "users with write access to the socket's file"
     MACHINE = "every user of this machine"
@@ -49,14 +49,17 @@ def fault_of(endpoint: str) -> str:
 
 
 def tcp_address(endpoint: str) -> tuple[str, int] | None:
-    """Return host and port of an endpoint with a TCP port; None for any other."""
+    """Return the host and port of an endpoint; None if the endpoint's protocol does not use TCP."""
     protocol, address = _parts(endpoint)
     host, _, port = address.rpartition(":")
     return (host.strip("[]"), int(port)) if protocol in {"tcp", "tls", "ws"} else None
 
 
 def is_host(text: str) -> bool:
-    """Whether a text is an IP address or a possible host name (RFC 1123, or with _), without port and protocol."""
+    """Return True if a text is an IP address or a valid host name, without protocol and port.
+
+    Host names are those of RFC 1123, but may also contain underscores.
+    """
     try:
         ipaddress.ip_address(text)
     except ValueError:
@@ -66,9 +69,9 @@ def is_host(text: str) -> bool:
 
 
 def leads_to(endpoint: str, reached: str) -> bool:
-    """Return whether a configured endpoint can be the connected one, whose host is an IP address.
+    """Return True if the configured endpoint can be the endpoint `reached`, which contains an IP address as its host.
 
-    A configured host name matches every address.
+    A host name in the configured endpoint matches every IP address.
     """
     (protocol, address), (as_protocol, as_address) = _parts(endpoint), _parts(reached)
     if protocol != as_protocol or protocol not in _WITH_PORT:
@@ -82,7 +85,10 @@ def leads_to(endpoint: str, reached: str) -> bool:
 
 
 def same_port(one: tuple[str, int], other: tuple[str, int]) -> bool:
-    """Whether two hosts and ports conflict, so that only one can listen; host names conflict only if equal."""
+    """Return True if two programs cannot listen on these two hosts and ports at the same time.
+
+    Host names, except localhost, conflict only if they are equal.
+    """
     if one[1] != other[1]:
         return False
     try:
@@ -93,12 +99,12 @@ def same_port(one: tuple[str, int], other: tuple[str, int]) -> bool:
 
 
 def _covers(every: _Address, other: _Address) -> bool:
-    """Whether `every` is the wildcard address and includes the other; that of IPv6 includes IPv4 addresses."""
+    """Return True if `every` is a wildcard address that includes `other`. The IPv6 wildcard includes IPv4 addresses."""
     return every.is_unspecified and every.version >= other.version
 
 
 def reach(endpoint: str) -> ReachableBy:
-    """Return the reach of an endpoint; the network if the reach is uncertain, as for a host name."""
+    """Return the users who can connect to an endpoint; NETWORK if this is uncertain, as for a host name."""
     protocol = endpoint.partition("/")[0]
     if protocol == "tls":
         return ReachableBy.CERTIFICATE
@@ -113,13 +119,13 @@ def endpoint_of(address: str, port: int) -> str:
 
 
 def socket_file(endpoint: str) -> Path | None:
-    """Return the file of a Unix-socket endpoint; None for any other."""
+    """Return the file of a Unix-socket endpoint; None if the endpoint has another protocol."""
     protocol, address = _parts(endpoint)
     return Path(address) if protocol == "unixsock-stream" else None
 
 
 def is_local(endpoint: str) -> bool:
-    """Whether an endpoint, protocol/address, stays on this machine."""
+    """Return True if only programs on this machine can connect to an endpoint."""
     protocol, address = _parts(endpoint)
     host = address.rpartition(":")[0].removeprefix("[").removesuffix("]")
     if protocol in {"unixsock-stream", "unixpipe"} or host == "localhost":
@@ -131,6 +137,6 @@ def is_local(endpoint: str) -> bool:
 
 
 def _parts(endpoint: str) -> tuple[str, str]:
-    """Return protocol and address of `protocol/address?metadata#settings`."""
+    """Return the protocol and the address of an endpoint of the form `protocol/address?metadata#settings`."""
     protocol, _, rest = endpoint.partition("/")
     return protocol, rest.partition("#")[0].partition("?")[0]

@@ -1,4 +1,4 @@
-"""Event codes: the content of an event for programs, and for pages in languages other than English."""
+"""Event codes, which tell programs the content of an event and let web pages translate the event's message."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any, NamedTuple, Self
 
 
 class EventCode(StrEnum):
-    """Content of an event's message; `params` names the values in it, in SI units and radians."""
+    """Content of an event's message, as a code."""
 
     meaning: str
-    """Meaning, in one line."""
+    """Meaning of the code, in one line."""
     params: tuple[str, ...]
-    """Names of the values in the message."""
+    """Names of the values in the message; the values are in SI units and radians."""
 
     # Goals and modes.
     GOAL_STARTED = "goal_started", "a goal has begun", "goal", "user"
@@ -111,7 +111,7 @@ class EventCode(StrEnum):
     OTHER = "other", "a code of a newer service that this client does not know"
 
     def __new__(cls, code: str, meaning: str = "", *params: str) -> Self:
-        """Create a member from its row; a call with a code alone looks the member up."""
+        """Create a member from its row. A call with only a code, such as EventCode("arrived"), looks the member up."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.meaning, member.params = meaning, params
@@ -125,11 +125,11 @@ class EventCode(StrEnum):
 
 Params = dict[str, float | str]
 MAX_PARAM = 200
-"""Maximum length of a parameter's text; an event with a long error must fit into a packet [characters]."""
+"""Maximum length of a text parameter [characters], so that an event with a long error message fits into a packet."""
 
 
 class EventText(NamedTuple):
-    """English text for people, with the code and parameters for programs."""
+    """English text for people, with an event code and its parameters for programs."""
 
     text: str
     code: EventCode
@@ -140,17 +140,17 @@ class EventText(NamedTuple):
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Fields in which a message carries the code and the parameters."""
+        """Values of the message fields `event_code` and `params`, by field name."""
         return {"event_code": self.code, "params": self.params}
 
 
 def coded(text: str, code: EventCode, /, **params: float | str) -> EventText:
-    """Return a text with its code; the parameters are those of the code."""
+    """Return a text with its event code; `params` are the values that the code's `params` name."""
     return EventText(text, code, {name: _plain(value) for name, value in params.items()})
 
 
 def _plain(value: float | str) -> float | str:
-    """Return a value that JSON can carry: no subclass of another library, and no number that is not finite."""
+    """Convert a value to a string or a finite float, which JSON can represent; infinity and NaN become strings."""
     if isinstance(value, str):
         return str(value)[:MAX_PARAM]
     return float(value) if math.isfinite(value) else str(value)

@@ -1,4 +1,4 @@
-"""Base class of all kinds of goals, and the fields that several kinds share."""
+"""Base class of all goal kinds, and the types of fields that several goal kinds share."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from trirail.wire.sizes import MAX_NAME
 from trirail.wire.text import ID_RULE, is_id, quoted
 
 Identifier = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
-# These bounds exceed every robot's range, and are far below magnitudes at which doubles lose precision.
+# These bounds exceed the range of every robot, but are far below the magnitudes at which doubles lose precision.
 Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
-"""x, y or a slider's position [m], phi [rad], or their velocities."""
+"""x, y or the position of a slider [m], phi [rad], or the velocity of one of these [m/s, rad/s]."""
 Acceleration = Annotated[float, Meta(ge=-1e6, le=1e6)]
 OwnLimit = Annotated[float, Meta(ge=1e-4, le=1e6)]
 Coordinates = tuple[Coordinate, Coordinate, Coordinate]
@@ -32,7 +32,10 @@ Tool = tuple[Coordinate, Coordinate] | FrameName
 
 
 def check_fields(message: Struct) -> None:
-    """Raise ValueError for an unprintable id or a number that is not finite, even if the message was never decoded."""
+    """Raise ValueError if the id is not printable or if a number is not finite.
+
+    Messages call this function when they are created, so that the checks also apply to messages that were not decoded.
+    """
     for name in message.__struct_fields__:
         value = getattr(message, name)
         if name == "id" and isinstance(value, str) and not is_id(value):
@@ -46,18 +49,18 @@ class OwnLimits(Struct, frozen=True, forbid_unknown_fields=True):
     """Limits of a single goal for x, y [m] and phi [rad]; they may not exceed the platform's limits."""
 
     velocity: OwnTriple | None = None
-    """[m/s, m/s, rad/s]."""
+    """Maximum velocity [m/s, m/s, rad/s]."""
     acceleration: OwnTriple | None = None
-    """[m/s², m/s², rad/s²]."""
+    """Maximum acceleration [m/s², m/s², rad/s²]."""
     jerk: OwnTriple | None = None
-    """[m/s³, m/s³, rad/s³]."""
+    """Maximum jerk [m/s³, m/s³, rad/s³]."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
-# Fields that several kinds share. The schemas, the command line and the table of service/talking.md use these
-# descriptions.
+# Types of fields that several goal kinds share. The schemas, the help of the command line and the table in
+# service/talking.md contain these descriptions.
 OwnId = Annotated[
     Identifier | None,
     Meta(description="your name for the goal, used once; made by the service if absent"),
@@ -96,19 +99,19 @@ def field_description(kind: type[Struct], name: str) -> str:
 
 
 class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
-    """Properties of any goal; a kind overrides their defaults with a field or a class constant."""
+    """Base class of goals. A goal kind overrides the default of a property with a field or a class constant."""
 
     follows: ClassVar[bool] = False
     """Whether the goal waits for a preceding goal that has a `blend`, instead of preempting it."""
     renewed: ClassVar[bool] = False
     """Whether the goal lasts only while goals with the same kind, id and user renew it, each within its `timeout`."""
     frequent: ClassVar[bool] = False
-    """Whether renewals are frequent. The newest renewal then replaces one that still waits, and a refused renewal does
-    not end the goal and is reported only once."""
+    """Whether renewals are frequent. The newest renewal then replaces an earlier renewal that still waits. A refused
+    renewal does not end the goal, and only the first refusal is reported."""
     waits_at_end: ClassVar[bool] = False
     """Whether the goal stays active at the end of its path for as long as it is renewed."""
     timed: ClassVar[bool] = False
-    """Whether the goal refers to a `time` [s]: wall-clock time when the goal arrives, loop time when it is planned."""
+    """Whether the goal refers to a `time` [s]. The client gives wall-clock time; the planner receives loop time."""
     greatest_rate: ClassVar[float] = math.inf
     """Maximum rate of the motion at any override; 1 for goals with their own timing."""
 
@@ -117,17 +120,17 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def id(self) -> str | None:
-        """Id that the client gave to the goal."""
+        """Id that the client chose for the goal; None if the client chose none."""
         return None
 
     @property
     def valid_for(self) -> float | None:
-        """Time within which the goal must start [s]."""
+        """Time within which the goal must start [s]; None if there is no such time."""
         return None
 
     @property
     def blend(self) -> float | None:
-        """Distance from the end at which the next goal may start [m]; None if the next goal preempts this one."""
+        """Distance from the end of the path at which the next goal may start [m]; None if the next goal preempts it."""
         return None
 
     @property
@@ -137,7 +140,7 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def stop_at(self) -> StopAt | None:
-        """Edge of an input at which the goal ends."""
+        """Edge of an input at which the goal ends; None if there is no such edge."""
         return None
 
     @property
@@ -157,7 +160,7 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
 
     @property
     def time(self) -> float | None:
-        """Time to which the goal refers [s]; None for the time of its arrival."""
+        """Time to which the goal refers [s]; None means the time of the goal's arrival."""
         return None
 
     @property
@@ -166,11 +169,11 @@ class GoalKind(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"
         return None
 
     def at(self, time: float) -> Self:
-        """Return a copy with another time [s]. Raises NotImplementedError if the kind is not timed."""
+        """Return a copy with another `time` [s]. Raises NotImplementedError if the goal kind is not timed."""
         raise NotImplementedError(f"{type(self).__name__} has no time to replace by {time} s")
 
     def check_beginning(self) -> None:
-        """Raise RefusedError if the message can renew a goal of this kind but not start one."""
+        """Raise RefusedError if this goal can renew a goal with the same id, but cannot start a new motion."""
 
 
 def import_all(package: ModuleType) -> None:

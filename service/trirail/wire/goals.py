@@ -1,4 +1,4 @@
-"""Goals as clients send them, of all kinds in trirail.wire.kinds, in SI units and radians."""
+"""Goals of all kinds that clients can send, from the modules in trirail.wire.kinds, in SI units and radians."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ import_all(kinds)
 KINDS: tuple[type[GoalKind], ...] = tuple(
     sorted(set(GoalKind.__subclasses__()) - {PackedTrajectory}, key=lambda kind: kind.__module__)
 )
-"""All kinds of goals; each has its own module in trirail.wire.kinds."""
+"""Classes of all goal kinds; each module in trirail.wire.kinds contains one class."""
 
 if TYPE_CHECKING:
     Goal = GoalKind
@@ -48,8 +48,8 @@ else:
     Goal = Union[KINDS]  # noqa: UP007 - from a tuple of types
     PathGoal = Union[tuple(kind for kind in KINDS if not kind.renewed)]  # noqa: UP007 - as above
     LoopGoal = Union[(*KINDS, PackedTrajectory)]
-"""Unions of goals. `Goal` is any goal that a client can send. `PathGoal` is a goal whose whole path is known when it
-arrives. `LoopGoal` is any goal as the gateway, loop, planner and recordings represent it."""
+"""Unions of goals. `Goal` is any goal that a client can send. `PathGoal` is a goal with a path that is completely
+known when the goal arrives. `LoopGoal` is any goal in the form that the gateway, loop, planner and recordings use."""
 
 
 def kind_name(goal: GoalKind) -> str:

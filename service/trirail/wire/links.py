@@ -1,6 +1,7 @@
-"""Connections between the loop and the other processes; the kernel bounds their buffers, and the loop never blocks.
+"""Connections between the loop and the other processes, on which the loop never blocks.
 
-AF_UNIX sockets of type SEQPACKET preserve packet boundaries and order.
+The connections are AF_UNIX sockets of type SEQPACKET, which preserve the boundaries and the order of packets. The
+kernel limits the sizes of their buffers.
 """
 
 from __future__ import annotations
@@ -15,28 +16,30 @@ from pathlib import Path
 from trirail.wire.sizes import MAX_PACKET, MAX_SHARED
 
 _BUFFER = 1 << 22
-"""Bytes that the kernel may buffer for a slow peer: seconds of records, if the process may set it."""
+"""Size of the kernel's buffer for a slow peer [bytes], enough for seconds of records.
+
+Without the right to exceed net.core.wmem_max, the process gets a smaller buffer."""
 _DESCRIPTOR = array("i").itemsize
 
 
 class LinkClosed(Exception):
-    """Raised when the peer has closed the connection."""
+    """Exception raised if the peer has closed the connection."""
 
 
 class TooLarge(Exception):
-    """Raised when a packet exceeds MAX_SHARED."""
+    """Exception raised if a packet exceeds MAX_SHARED."""
 
 
 class PacketLink:
-    """One side of a connection; sending and receiving never block.
+    """One side of a connection, which never blocks while it sends or receives.
 
-    A packet above MAX_PACKET is written to a file in memory and its descriptor is sent, because the kernel limits a
-    socket's buffer to net.core.wmem_max, usually 208 kB.
+    The kernel limits the buffer of a socket to net.core.wmem_max, usually 208 kB. A packet that is larger than
+    MAX_PACKET is therefore written to a file in memory, and the file's descriptor is sent.
     """
 
     def __init__(self, connected: socket.socket) -> None:
         connected.setblocking(False)
-        for option in (socket.SO_SNDBUF, 32):  # 32: SO_SNDBUFFORCE, beyond the system's limit, for root only
+        for option in (socket.SO_SNDBUF, 32):  # 32 is SO_SNDBUFFORCE, with which root may exceed the system's limit
             with contextlib.suppress(PermissionError):
                 connected.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
         self._socket = connected
@@ -48,9 +51,10 @@ class PacketLink:
         return self._socket.fileno()
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
-        """Send a packet; return False if the kernel's buffer is full because the peer is slow.
+        """Send a packet. Return False if the packet was not sent because the kernel has no space for it.
 
-        Raises LinkClosed if the peer has closed the connection, TooLarge above MAX_SHARED.
+        The usual reason is a slow peer. Raises LinkClosed if the peer has closed the connection, and TooLarge if the
+        packet exceeds MAX_SHARED.
         """
         shared = len(packet) > MAX_PACKET
         file = _share(packet) if shared else None
@@ -71,8 +75,12 @@ class PacketLink:
         return True
 
     def receive(self) -> bytes | None:
-        """Return the next packet, or None. Raises LinkClosed if the peer has closed the connection."""
-        if not self._arrivals.poll(0):  # a third of the time of a failing recvmsg, and true in most cycles of the loop
+        """Return the next packet; None if no packet has arrived.
+
+        Raises LinkClosed if the peer has closed the connection.
+        """
+        # In most cycles of the loop no packet has arrived. A poll takes a third of the time of a failing recvmsg.
+        if not self._arrivals.poll(0):
             return None
         try:
             packet, beside, *_ = self._socket.recvmsg(MAX_PACKET, _DESCRIPTOR_SPACE, socket.MSG_CMSG_CLOEXEC)
@@ -86,7 +94,7 @@ class PacketLink:
 
     @property
     def ended(self) -> bool:
-        """Whether the peer has closed the connection; packets that it sent before may still be waiting."""
+        """True if the peer has closed the connection. Earlier packets of the peer may still be waiting."""
         return any(events & (select.POLLHUP | select.POLLERR) for _, events in self._arrivals.poll(0))
 
     def close(self) -> None:
@@ -96,11 +104,11 @@ class PacketLink:
 
 _DESCRIPTOR_SPACE = socket.CMSG_SPACE(_DESCRIPTOR)
 _SHARED = b"\0"
-"""Byte sent with a descriptor, because an empty packet means the end of the connection."""
+"""Byte that is sent together with a descriptor, because an empty packet would mean the end of the connection."""
 
 
 def _share(packet: bytes | bytearray | memoryview) -> int | None:
-    """Return the descriptor of a file in memory that contains a packet; None if the system cannot create it."""
+    """Return the descriptor of a new file in memory that contains a packet; None if the file cannot be created."""
     if len(packet) > MAX_SHARED:
         raise TooLarge(f"packet: {len(packet)} bytes exceed the maximum between processes, {MAX_SHARED} bytes")
     with contextlib.suppress(OSError):
@@ -112,16 +120,16 @@ def _share(packet: bytes | bytearray | memoryview) -> int | None:
 
 
 def _read_shared(descriptor: bytes) -> bytes:
-    """Read the file whose descriptor was received, and close the file."""
+    """Return the content of the file that belongs to a received descriptor, and close the file."""
     (file,) = array("i", descriptor)
     try:
-        return os.pread(file, os.fstat(file).st_size, 0)  # its exact size: a larger buffer would be cleared first
+        return os.pread(file, os.fstat(file).st_size, 0)  # the exact size, since a larger buffer would be cleared first
     finally:
         os.close(file)
 
 
 def connect(path: Path) -> PacketLink:
-    """Return a connection to a port of the loop. Raises OSError if no process listens."""
+    """Return a connection to the loop's port at a path. Raises OSError if no process listens at this path."""
     connecting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         connecting.connect(str(path))
@@ -132,7 +140,7 @@ def connect(path: Path) -> PacketLink:
 
 
 def listen(path: Path) -> socket.socket:
-    """Return the socket of a port; peers may connect from now on, before the loop runs."""
+    """Return a listening socket for a port, to which peers can connect even before the loop runs."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listening.bind(str(path))
     listening.listen(1)
@@ -140,9 +148,9 @@ def listen(path: Path) -> socket.socket:
 
 
 class Port:
-    """The loop's side of connections with one kind of peer. It has at most one peer at a time.
+    """Port of the loop to which one peer at a time can connect, such as the gateway.
 
-    The port keeps listening, so that a restarted peer can reconnect.
+    The port continues to listen, so that a restarted peer can reconnect.
     """
 
     def __init__(self, listening: socket.socket) -> None:
@@ -151,29 +159,29 @@ class Port:
         self._link: PacketLink | None = None
         self._lost = False
         self.dropped = 0
-        """Number of packets dropped because the peer was too slow, or the packet too large."""
+        """Number of packets dropped because the peer was too slow or because they were too large."""
 
     @property
     def connected(self) -> bool:
-        """Whether a peer is connected."""
+        """True if a peer is connected."""
         return self._link is not None
 
     @property
     def no_peer_lost(self) -> bool:
-        """Whether `clear_lost` would return False."""
+        """True if no peer was lost since the last call of `clear_lost`."""
         return not self._lost
 
     @property
     def ended(self) -> bool:
-        """Whether the peer has closed the connection and no call has noticed it yet."""
+        """True if the peer has closed the connection, but no call has noticed the closed connection yet."""
         return self._link is not None and self._link.ended
 
     def fileno(self) -> int:
-        """Return the peer's descriptor; -1 without a peer."""
+        """Return the descriptor of the connection; -1 if no peer is connected."""
         return self._link.fileno() if self._link is not None else -1
 
     def accept(self) -> bool:
-        """Accept a waiting peer; return True if one has connected."""
+        """Accept a peer that wants to connect. Return True if a peer was accepted."""
         if self._link is not None:
             return False
         try:
@@ -184,12 +192,15 @@ class Port:
         return True
 
     def await_peer(self, seconds: float) -> bool:
-        """Wait for a peer, before the loop runs; return True if one has connected."""
+        """Wait at most `seconds` for a peer, before the loop runs. Return True if a peer has connected."""
         select.select([self._listening], [], [], seconds)
         return self.accept()
 
     def send(self, packet: bytes | bytearray | memoryview) -> bool:
-        """Send a packet if a peer is connected; drop and count a packet that the peer cannot accept."""
+        """Send a packet if a peer is connected. Return True if the packet was sent.
+
+        A packet that the connection cannot accept is dropped and counted.
+        """
         if self._link is None:
             return False
         try:
@@ -204,7 +215,7 @@ class Port:
         return sent
 
     def receive(self) -> bytes | None:
-        """Return the next packet; None without a packet or a peer."""
+        """Return the next packet; None if no packet has arrived or no peer is connected."""
         if self._link is None:
             return None
         try:
@@ -219,13 +230,13 @@ class Port:
         return lost
 
     def hang_up(self) -> None:
-        """Drop the peer, as if it had closed the connection."""
+        """Close the connection to the peer, which then counts as lost."""
         if self._link is not None:
             self._link.close()
             self._link = None
             self._lost = True
 
     def close(self) -> None:
-        """Drop the peer and stop listening."""
+        """Close the connection to the peer, and stop listening."""
         self.hang_up()
         self._listening.close()

@@ -1,4 +1,4 @@
-"""Progress of an alignment or calibration, which the client reports in one message per look, without pictures."""
+"""Messages in which a client reports each look of an alignment or calibration, without the pictures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trirail.wire.sizes import MAX_TEXT
 from trirail.wire.text import ID_RULE, is_id, quoted
 
 MAX_MARKS = 32
-"""Maximum number of marks in one look; with names of full length they take 6 kB."""
+"""Maximum number of marks in one look. With the longest names, this many marks take 6 kB."""
 Pixel = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Share = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Count = Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -32,17 +32,19 @@ LookEnd = Literal[
     "still",
     "moves",
 ]
-"""Reason for the end: a trirail.alignment.procedure.AlignmentEnd, a trirail.errors.AlignmentFault, or another one."""
+"""Reason why an alignment or calibration ended.
+
+Most values are those of trirail.alignment.procedure.AlignmentEnd and trirail.errors.AlignmentFault."""
 SUCCESSFUL_ENDS = (None, "reached", "calibrated", "checked")
-"""Ends that are not failures; None is the value of a look after which the alignment continues."""
+"""Values of AlignmentLook.end that are not failures; None means that the alignment continues."""
 
 
 class SeenMark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A mark that was found in a picture."""
+    """Mark that was found in a picture."""
 
     name: Identifier
     pixel: tuple[Pixel, Pixel]
-    """u, v in the mark's picture; the mean if several pictures were taken."""
+    """Position u, v in the picture [pixel]; the mean position if several pictures were taken."""
     to_go: tuple[Coordinate, Coordinate] | None = None
     """Vector from the mark to its target, x, y in the base frame [m]; None in a calibration."""
 
@@ -53,16 +55,16 @@ class SeenMark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tr
 
 
 class LookError(Struct, frozen=True, forbid_unknown_fields=True):
-    """Deviation of a part, measured by one look."""
+    """Deviation of a part from its target, as measured by one look."""
 
     worst: Coordinate
-    """Greatest distance that a mark travels in the motion that aligns the part [m]."""
+    """Greatest distance that any mark travels in the motion that aligns the part [m]."""
     shift: tuple[Coordinate, Coordinate]
-    """Remaining distance of the centre of the marks, x, y [m]."""
+    """Displacement of the marks' centre in the motion that aligns the part, x, y [m]."""
     turn: Coordinate
-    """Remaining rotation of the part [rad]."""
+    """Rotation of the part in the motion that aligns the part [rad]."""
     misfit: Coordinate
-    """Greatest distance of a mark from its target after the best motion [m]."""
+    """Greatest distance of a mark from its target that would remain after the best motion [m]."""
     distance: Share
     """Greatest relative error of the distance between two marks."""
 
@@ -71,13 +73,13 @@ class LookError(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AlignmentLook(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A look and its consequence: a correction, the end, or the next move of a calibration."""
+    """Look of an alignment and its consequence: a correction, the end, or the next move of a calibration."""
 
     id: Identifier
-    """Id of the alignment; the ids of its goals begin with it."""
+    """Id of the alignment. The ids of the alignment's goals begin with this id."""
     purpose: LookPurpose
     number: Count
-    """Number of the look, from 1. If the alignment ended without another look, the number of the last look."""
+    """Number of the look, starting at 1; the number of the last look if the alignment ended without another look."""
     marks: Annotated[tuple[SeenMark, ...], Meta(max_length=MAX_MARKS)] = ()
     error: LookError | None = None
     """Deviation of the part; None in a calibration."""
@@ -86,11 +88,11 @@ class AlignmentLook(Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     correction: Coordinates | None = None
     """Correction that follows the look, as a motion of the marks' centre: x, y [m], phi [rad]."""
     end: LookEnd | None = None
-    """Reason why the alignment ends with this look; None if it continues."""
+    """Reason why the alignment ends with this look; None if the alignment continues."""
     words: Annotated[str, Meta(max_length=MAX_TEXT)] = ""
-    """Message of the error, if the alignment ends with one."""
+    """Error message, if the alignment ends because of an error."""
     noise: Pixel | None = None
-    """Standard deviation of a mark's u or v, from the residuals, if a calibration ends successfully [pixel]."""
+    """Standard deviation of u or v of a mark, from the residuals of a successful calibration [pixel]."""
     seconds: Duration = 0.0
     """Time since the first look, on the client's clock [s]."""
 
@@ -112,7 +114,7 @@ def in_words(look: AlignmentLook) -> str:
 
 
 def alignment_event_text(look: AlignmentLook, words: str) -> EventText:
-    """Return the text of a look with its event code."""
+    """Return the text `words` of a look with the look's event code and parameters."""
     if look.end is None:
         return coded(words, EventCode.ALIGNMENT_LOOK, id=look.id, purpose=look.purpose, number=look.number)
     return coded(words, EventCode.ALIGNMENT_ENDED, id=look.id, purpose=look.purpose, end=look.end, seconds=look.seconds)

@@ -1,4 +1,4 @@
-"""Marks of a goal: places on its path at which outputs switch, and the table of switches, in SI units and radians."""
+"""Marks, which are places on a goal's path at which outputs switch, and records of the switches, in SI units."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Length = Annotated[float, Meta(ge=0.0, le=1e3)]
 Duration = Annotated[float, Meta(ge=0.0, le=86_400.0)]
 OutputName = Annotated[str, Meta(pattern=rf"^[A-Za-z][A-Za-z0-9_-]{{0,{MAX_NAME - 1}}}$")]
 PLACE_FIELDS = ("after_start", "after_start_s", "before_target", "before_target_s", "at_path_fraction", "at", "start")
-"""Fields that give the place of a mark; a mark has exactly one of them."""
+"""Fields that specify the place of a mark; each mark has exactly one of these fields."""
 
 
 class Crossing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Value of one coordinate at which a path is crossed for the first time."""
+    """Place at which a path first crosses a value of one coordinate."""
 
     x: Annotated[float, Meta(ge=-1e3, le=1e3)] | None = None
     """Coordinate of the tool in the base frame [m]."""
@@ -35,7 +35,7 @@ class Crossing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tr
 
     @property
     def coordinate(self) -> tuple[int, float]:
-        """Index of the coordinate, 0 to 2 for x, y, phi, and its value [m] or [rad]."""
+        """Index of the coordinate, 0 to 2 for x, y, phi, and the value of the coordinate [m] or [rad]."""
         values = self.x, self.y, self.phi
         return next((number, value) for number, value in enumerate(values) if value is not None)
 
@@ -43,33 +43,34 @@ class Crossing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tr
 class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Place on a goal's path at which an output switches, or a section of the path on which it switches repeatedly.
 
-    Lengths are along the path of the goal's tool. Times are along the path at full speed.
+    Path lengths are measured along the path of the goal's tool. Times are those of a motion at full speed.
     """
 
     output: OutputName
     """Name of an output of the configuration."""
     value: bool = True
-    """Value to which the output switches; for a repetition, the value during its pulses."""
+    """Value to which the output switches; with an `increment`, the value of the output during the pulses."""
     after_start: Length | None = None
-    """Path length from the start of the path [m]."""
+    """Path length from the start of the path to the mark [m]."""
     after_start_s: Duration | None = None
-    """Time along the path from its start [s]."""
+    """Time from the start of the path to the mark [s]."""
     before_target: Length | None = None
-    """Path length that remains to the end of the path [m]."""
+    """Path length from the mark to the end of the path [m]."""
     before_target_s: Duration | None = None
-    """Time along the path that remains to its end [s]."""
+    """Time from the mark to the end of the path [s]."""
     at_path_fraction: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
-    """Fraction of the path's length, 0 to 1."""
+    """Place of the mark as a fraction of the path's length, 0 to 1."""
     at: Crossing | None = None
-    """Value of one coordinate; the output switches when the path first crosses it."""
+    """Value of one coordinate; the output switches where the path first crosses this value."""
     start: Length | None = None
-    """Path length at which a repetition starts [m]."""
+    """Path length from the start of the path to the start of a section [m]."""
     end: Length | None = None
-    """Path length at which a repetition ends [m]; the default is the end of the path."""
+    """Path length from the start of the path to the end of a section [m]; the default is the end of the path."""
     increment: Annotated[float, Meta(ge=1e-7, le=1e3)] | None = None
-    """Path length from pulse to pulse [m]; without it, the output keeps `value` from `start` to `end`."""
+    """Path length from pulse to pulse in a section [m]. Without an increment, the output has the `value` from `start`
+    to `end`."""
     pulse_width: Annotated[float, Meta(ge=1e-4, le=3600.0)] | None = None
-    """Duration after which a pulse ends [s], rounded to whole cycles; without it, the value stays."""
+    """Duration of a pulse [s], rounded to whole cycles. Without a pulse width, the output does not switch back."""
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
@@ -91,16 +92,16 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
 
     @property
     def closes(self) -> bool:
-        """Whether the output returns to its previous value, at the end of a pulse or of a section."""
+        """True if the output returns to its previous value, at the end of a pulse or of a section."""
         return self.pulse_width is not None or self.start is not None
 
 
 MarkLike = Mark | Mapping[str, Any]
-"""A mark, or a mapping of its fields."""
+"""A mark, or a mapping from the names of a mark's fields to values."""
 
 
 def marks_of(marks: Sequence[MarkLike]) -> tuple[Mark, ...]:
-    """Return marks that may be given as mappings. Raises ValueError for invalid ones."""
+    """Convert mappings to marks; marks are returned unchanged. Raises ValueError if a mapping is invalid."""
     return tuple(mark if isinstance(mark, Mark) else converted(dict(mark), Mark) for mark in marks)
 
 
@@ -111,20 +112,20 @@ Marks = Annotated[
 
 
 class StopAt(Struct, frozen=True, forbid_unknown_fields=True):
-    """Edge of an input at which a goal ends: the robot makes a controlled stop, and the goal is done."""
+    """Edge of an input at which the robot makes a controlled stop; the goal is then done."""
 
     input: OutputName
     """Name of an input of the configuration."""
     edge: Literal["rising", "falling"] = "rising"
-    """Direction of the change."""
+    """Direction of the edge."""
 
 
 StopAtLike = StopAt | Mapping[str, Any]
-"""An edge, or a mapping of its fields."""
+"""A StopAt, or a mapping from the names of its fields to values."""
 
 
 def stop_at_of(edge: StopAtLike | None) -> StopAt | None:
-    """Return an edge that may be given as a mapping. Raises ValueError for an invalid one."""
+    """Convert a mapping to a StopAt; return None or a StopAt unchanged. Raises ValueError if the mapping is invalid."""
     return edge if edge is None or isinstance(edge, StopAt) else converted(dict(edge), StopAt)
 
 
@@ -138,24 +139,24 @@ prepare(Mark, StopAt)
 
 
 class PlacedMark(Struct, frozen=True, omit_defaults=True):
-    """Mark of an accepted goal, with the place at which it will switch first."""
+    """Mark of an accepted goal, with the place at which the output will first switch."""
 
     mark: int
     """Index of the mark in the goal."""
     output: str
     value: bool
     pose: Triple
-    """Commanded pose of the platform at that place: x, y [m], phi [rad]."""
+    """Commanded pose of the platform at this place: x, y [m], phi [rad]."""
     path: float
-    """Path length of the tool from the start [m]."""
+    """Path length of the tool from the start of the path to this place [m]."""
     time: float
-    """Time along the path from its start, at full speed [s]."""
+    """Time from the start of the path to this place at full speed [s]."""
     number: int = 1
-    """Number of switches to `value`."""
+    """Number of times that the output will switch to `value`."""
 
 
 class Switch(Struct, frozen=True, omit_defaults=True):
-    """An output that has switched on the path of a goal."""
+    """Record of an output that has switched on the path of a goal."""
 
     goal: str
     """Id of the goal."""
@@ -168,17 +169,18 @@ class Switch(Struct, frozen=True, omit_defaults=True):
     t: float
     """Nominal time since the start of the loop [s], as in records."""
     time: float
-    """Wall-clock time when the cycle was due [s since 1970]; drives switch one period later, at the next SYNC."""
+    """Wall-clock time at which the cycle was due [s since 1970]. The drives switch at the next SYNC, one period
+    later."""
     commanded: Triple
-    """Commanded pose in that cycle: x, y [m], phi [rad]."""
+    """Commanded pose in this cycle: x, y [m], phi [rad]."""
     measured: Triple
-    """Pose measured in that cycle: x, y [m], phi [rad]."""
+    """Measured pose in this cycle: x, y [m], phi [rad]."""
     closed: bool = False
-    """Whether the output returned because its goal had ended or stopped, and not at a mark."""
+    """True if the output switched back because the goal ended or stopped, False if it switched at a mark."""
 
 
 def switch_rows(switches: tuple[Switch, ...]) -> list[dict[str, Any]]:
-    """Return a table of switches with one number per column, for CSV, Parquet and data frames."""
+    """Return a table with one row for each switch and one value in each column, for CSV, Parquet and data frames."""
     rows = []
     for switch in switches:
         row: dict[str, Any] = {

@@ -1,6 +1,7 @@
-"""Trajectories as the service's processes exchange them: one row of numbers per point.
+"""Trajectories in the form in which the service's processes exchange them, with one row of numbers for each point.
 
-The loop must not decode thousands of points: 5,000 of them take 15 ms as structs, and 0.1 ms as bytes.
+The loop must not spend time on decoding thousands of points. Decoding 5,000 points takes 15 ms if they are structs, and
+0.1 ms if they are bytes.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from trirail.wire.marks import Mark, StopAt
 from trirail.wire.sizes import MAX_PART
 
 COLUMNS = 10
-"""Columns t, x, y, phi, and their velocity and acceleration, NaN if a point has none."""
+"""Number of columns: t, x, y, phi, and the velocity and acceleration of x, y and phi, which are NaN if missing."""
 ROW = COLUMNS * array("d").itemsize
 Row = tuple[float, Triple, Triple | None, Triple | None]
 _NONE = (math.nan,) * 3
 
 
 class PackedTrajectory(GoalKind, frozen=True, tag="packed trajectory"):
-    """A trajectory goal with packed points; fields of the same name are as in TrajectoryGoal."""
+    """Trajectory goal with packed points. The other fields are those of TrajectoryGoal."""
 
     rows: bytes
-    """Points as float64 in this machine's byte order, COLUMNS numbers per point."""
+    """Points as float64 in this machine's byte order, with COLUMNS numbers for each point."""
     id: str | None = None
     stretch: bool = False
     settle: bool = True
@@ -43,19 +44,19 @@ class PackedTrajectory(GoalKind, frozen=True, tag="packed trajectory"):
 
     @property
     def lengthy(self) -> bool:
-        """Whether it has more points than fit into one message."""
+        """True if the goal has more points than one message may contain."""
         return len(self.rows) > MAX_PART * ROW
 
     @property
     def points(self) -> Iterator[Row]:
-        """Yield the points: time, pose, velocity and acceleration."""
+        """Yield time, pose, velocity and acceleration of each point."""
         values = array("d", self.rows).tolist()
         for at in range(0, len(values), COLUMNS):
             t, x, y, phi, *derivatives = values[at : at + COLUMNS]
             yield t, (x, y, phi), _triple(derivatives[:3]), _triple(derivatives[3:])
 
     def unpacked(self) -> TrajectoryGoal:
-        """Return the equivalent goal as a client sends it."""
+        """Return the equivalent goal in the form in which a client sends it."""
         points = tuple(TrajectoryPoint(t, *pose, *derivatives) for t, pose, *derivatives in self.points)
         return TrajectoryGoal(
             points, self.id, self.stretch, self.settle, self.valid_for, marks=self.marks, stop_at=self.stop_at
@@ -63,7 +64,7 @@ class PackedTrajectory(GoalKind, frozen=True, tag="packed trajectory"):
 
 
 def packed(goal: TrajectoryGoal) -> PackedTrajectory:
-    """Return a trajectory with its points packed."""
+    """Return a copy of a trajectory goal with packed points."""
     rows = array("d")
     for p in goal.points:
         rows.extend((p.t, p.x, p.y, p.phi, *(p.velocity or _NONE), *(p.acceleration or _NONE)))
@@ -73,9 +74,9 @@ def packed(goal: TrajectoryGoal) -> PackedTrajectory:
 
 
 def joined(parts: Sequence[PackedTrajectory]) -> PackedTrajectory:
-    """Return a trajectory from its parts in order, with the options of the first part.
+    """Join the parts of a trajectory, given in order; the result has the options of the first part.
 
-    Raises ValueError if the times do not increase from part to part.
+    Raises ValueError if the times do not increase from part to part, or if the trajectory lasts too long.
     """
     goal = structs.replace(parts[0], rows=b"".join(part.rows for part in parts))
     check_times(array("d", goal.rows)[::COLUMNS])

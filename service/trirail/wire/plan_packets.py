@@ -1,7 +1,7 @@
-"""Requests of the loop to the planner and the planner's answers, which contain all inputs and results of a plan.
+"""Requests of the loop to the planner, and the planner's answers.
 
-Numbers of the motion have the same bytes as in memory, so that a plan is bit-identical wherever it is computed, sent,
-or read from a recording.
+Requests contain all inputs of a plan, and answers all results. The numbers of a motion are sent with the same bytes
+as in memory, so that a plan is bit-identical in both processes and in a recording.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from trirail.wire.messages import GoalReply
 
 
 class PackedPath(Struct, frozen=True, array_like=True):
-    """A path over time: float64 in this machine's byte order, in the layout of trirail.motion.paths."""
+    """Path over time in the layout of trirail.motion.paths, as float64 in this machine's byte order."""
 
     knots: bytes
     pieces: bytes
@@ -25,20 +25,20 @@ class PackedPath(Struct, frozen=True, array_like=True):
 
 
 class PackedRun(Struct, frozen=True, array_like=True):
-    """A path and its time law."""
+    """Path and its time law."""
 
     path: PackedPath
     law: PackedPath
     target: float
-    """Final rate of the law."""
+    """Rate at the end of the time law."""
     time: float = 0.0
-    """Time since the start of the law [s]."""
+    """Time since the start of the time law [s]."""
     seams: tuple[float, ...] = ()
     """Times along the path at which one goal ends and the next begins [s]."""
 
 
 class PlanRequest(Struct, frozen=True):
-    """Request from the loop to the planner: a goal and the motion from which it starts."""
+    """Request from the loop to the planner to plan a goal."""
 
     number: int
     """Number with which the loop matches the answer to the request."""
@@ -49,53 +49,57 @@ class PlanRequest(Struct, frozen=True):
     cycle: int
     """Present cycle of the schedule."""
     lead: int
-    """Number of cycles until the new motion starts; ignored at rest."""
+    """Number of cycles until the new motion starts; ignored if the robot is at rest."""
     rate: float
-    """Rate of the goal's motion."""
+    """Rate of time along the path of the goal."""
     commanded: tuple[Triple, Triple, Triple]
     """Commanded pose, velocity and acceleration of the platform."""
     runs: tuple[PackedRun, ...]
-    """The present motion and those queued after it."""
+    """Present motion and the motions queued after it."""
     goal: LoopGoal
-    """Goal as resolved by trirail.motion.goal_planner: tools as points, poses in the base frame, times of the loop."""
+    """Goal after trirail.motion.goal_planner has replaced names by values.
+
+    Tools are points, poses are in the base frame, and times are loop times."""
     blend: float | None = None
-    """Distance from the end of the last run at which this goal may follow it [m]; None if it preempts the motion."""
+    """Distance from the end of the last run at which the goal's path may begin [m]; None if it preempts the motion."""
 
 
-class PreemptingMotion(Struct, frozen=True, tag="Planned"):  # as recordings have it
-    """Answer from the planner to the loop: a motion that preempts the present one."""
+class PreemptingMotion(Struct, frozen=True, tag="Planned"):  # recordings contain this tag
+    """Answer from the planner to the loop with a motion that preempts the present motion."""
 
     number: int
     version: int
     first: int | None
-    """Cycle in whose commanded state the motion starts; None at rest, where the motion may start at any time."""
+    """Cycle with the commanded state from which the motion starts; None at rest, when it may start at any time."""
     run: PackedRun
     reply: GoalReply
-    """Reply to the goal's sender, without the goal's id, which the loop adds; its duration is None at override zero."""
+    """Reply to the sender of the goal. The loop adds the goal's id. The duration is None at override zero."""
     stop: PackedPath | None = None
-    """Time law of the preceding stop; None if the present motion keeps its law."""
+    """Time law with which the present motion first stops; None if the present motion keeps its time law."""
     bound: str | None = None
     """Limit that stops a jog, or that the target of a track exceeds."""
     switches: bytes = b""
-    """Planned switches of outputs, of trirail.motion.marks.SWITCH; their times count from the start of the path."""
+    """Planned switches of outputs in the layout of trirail.motion.marks.SWITCH.
+
+    The times of the switches count from the start of the path."""
 
 
-class PathExtension(Struct, frozen=True, tag="Extended"):  # as recordings have it
-    """Answer from the planner to the loop: a path that follows the last queued one."""
+class PathExtension(Struct, frozen=True, tag="Extended"):  # recordings contain this tag
+    """Answer from the planner to the loop with a path that follows the last queued path."""
 
     number: int
     version: int
     s: float
-    """Time along the last path at which the new one starts [s]."""
+    """Time along the last queued path at which the new path starts [s]."""
     path: PackedPath
     reply: GoalReply
-    """Reply as in PreemptingMotion; the loop adds the duration as well."""
+    """Reply to the sender of the goal. The loop adds the goal's id and the duration."""
     switches: bytes = b""
     """Planned switches as in PreemptingMotion."""
 
 
 class NotPlanned(Struct, frozen=True, tag=True):
-    """Answer from the planner to the loop: the goal is refused because it has no valid motion."""
+    """Answer from the planner to the loop that the goal is refused, because there is no valid motion."""
 
     number: int
     version: int
@@ -114,7 +118,10 @@ PlanAnswer = PreemptingMotion | PathExtension | NotPlanned
 
 
 class Overtaken(BaseException):
-    """Raised when a newer request cancels the planning. Not an Exception, because those become answers."""
+    """Exception that ends the planning of a goal when a newer request arrives.
+
+    The class is not derived from Exception, because the planner converts each Exception to an answer.
+    """
 
 
 prepare(PlanRequest, PlanAnswer)

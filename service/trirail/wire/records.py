@@ -1,7 +1,7 @@
-"""Records: the setpoints, feedback and timing of one cycle each.
+"""Records, each with the setpoints, feedback and timing of one cycle.
 
-Records have a fixed binary layout: compiled code writes them, they are sent in batches as they are in memory, and are
-read as NumPy arrays.
+Records have a fixed binary layout. Compiled code writes the records, the processes send them in batches with the same
+bytes as in memory, and readers view them as NumPy arrays.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from trirail.wire.vocabulary import MODES
 
 
 class Part(IntEnum):
-    """Timed parts of a cycle, in order."""
+    """Parts of a cycle, in order, for each of which the time is measured."""
 
     SYNC = 0
     READ = 1
@@ -29,7 +29,7 @@ class Part(IntEnum):
     WRITE = 5
     RECORD = 6
     DECIDE = 7
-    """Decisions and messages in the remaining time after the setpoints and the record."""
+    """Decisions and messages in the remaining time of the cycle, after the setpoints and the record are written."""
 
 
 PART_NAMES = tuple(part.name.lower() for part in Part)
@@ -37,33 +37,33 @@ PART_NAMES = tuple(part.name.lower() for part in Part)
 
 
 FIELDS: tuple[tuple[str, str, int], ...] = (
-    ("cycle", "q", 1),  # SYNCs sent since the start; multiplied by the period, the nominal time
-    ("deadline_ns", "q", 1),  # when this cycle was due, monotonic clock
-    ("lateness_ns", "q", 1),  # delay of its start
-    ("overruns", "q", 1),  # ticks missed since the start
-    ("parts_ns", "i", len(Part)),  # time spent in each part; "record" and "decide" are those of the previous cycle
+    ("cycle", "q", 1),  # number of SYNCs sent since the start; times the period, this is the nominal time
+    ("deadline_ns", "q", 1),  # time at which this cycle was due, on the monotonic clock
+    ("lateness_ns", "q", 1),  # delay of the start of this cycle
+    ("overruns", "q", 1),  # number of ticks missed since the start
+    ("parts_ns", "i", len(Part)),  # time spent in each part; for "record" and "decide", in the previous cycle
     ("mode", "B", 1),  # index into trirail.wire.vocabulary.MODES
     ("drive_state", "B", 3),  # trirail_drivers.interface.PowerState of A, B, C
-    ("age", "B", 3),  # age of the positions of A, B, C in SYNCs; 255 for more
+    ("age", "B", 3),  # age of the positions of A, B, C in SYNCs, at most 255
     ("follows", "B", 3),  # whether A, B, C follow setpoints; false during homing
     ("homed", "B", 3),  # whether the absolute positions of A, B, C are known
     ("homing", "B", 1),  # whether the drives are being homed
-    ("settled", "B", 1),  # whether the robot is in position, by [limits.in_position]
-    ("pose", "d", 3),  # measured: forward kinematics of the measured sliders; x, y [m], phi [rad]
+    ("settled", "B", 1),  # whether the robot is in position according to [limits.in_position]
+    ("pose", "d", 3),  # measured pose x, y [m], phi [rad], from the forward kinematics of the measured sliders
     ("commanded_pose", "d", 3),
     ("commanded_pose_velocity", "d", 3),
     ("commanded_pose_acceleration", "d", 3),
-    ("position", "d", 3),  # measured sliders: lambda_10 of A, B, C plus backlash compensation [m]
-    ("backlash", "d", 3),  # backlash compensation: position minus this is lambda_10 [m]
-    ("velocity", "d", 3),  # measured sliders [m/s]
+    ("position", "d", 3),  # measured positions of the sliders A, B, C: lambda_10 plus backlash compensation [m]
+    ("backlash", "d", 3),  # backlash compensation of A, B, C [m]; position minus backlash is lambda_10
+    ("velocity", "d", 3),  # measured velocities of the sliders [m/s]
     ("commanded_position", "d", 3),  # setpoints written in this cycle, with backlash compensation [m]
     ("commanded_velocity", "d", 3),  # v_10 [m/s]
     ("commanded_acceleration", "d", 3),  # gamma_10 [m/s²]
-    ("passive_position", "d", 3),  # commanded, of the cross slides [m]
+    ("passive_position", "d", 3),  # commanded positions of the cross slides [m]
     ("following_error", "d", 3),  # setpoint due at this SYNC minus measured position [m]
-    ("progress", "d", 1),  # of the running goal, 0 to 1
-    ("remaining", "d", 1),  # of the running goal [s]
-    ("outputs", "I", 3),  # wanted output words of the drives A, B, C, from this cycle's setpoints on
+    ("progress", "d", 1),  # progress of the goal, 0 to 1
+    ("remaining", "d", 1),  # remaining time of the goal [s]
+    ("outputs", "I", 3),  # requested output words of the drives A, B, C, starting with this cycle's setpoints
     ("inputs", "I", 3),  # input words of the drives A, B, C
 )
 
@@ -72,17 +72,17 @@ DTYPE: np.dtype[Any] = np.dtype(
     [(name, _NUMPY[code], (n,) if n > 1 else ()) for name, code, n in FIELDS],
     align=True,  # aligned fields, which compiled code reads and writes faster
 )
-"""Layout of a record in the loop's memory, between the processes and on the wire."""
+"""Layout of a record in the loop's memory, in packets between the processes, and on the network."""
 SIZE = DTYPE.itemsize
 """Size of a record [bytes]."""
 MAX_PART_NS = 2**31 - 1
-"""Longest recorded duration of a part; a longer one is recorded as this [ns]."""
+"""Greatest value with which the duration of a part is recorded [ns]."""
 HEADER = struct.Struct(f"<4q{len(Part)}iB")
-"""First fields of a record, up to `mode`, which the loop writes; the control writes the others."""
+"""Layout of the first fields of a record, up to `mode`. The loop writes these, and the control the other fields."""
 
 
 def last_cycle(batch: bytes) -> int:
-    """Return the cycle of the last record of a batch."""
+    """Return the cycle of the last record in a batch."""
     return int.from_bytes(batch[-SIZE:][:8], "little")
 
 
@@ -92,7 +92,11 @@ def unpack(batch: bytes | memoryview) -> NDArray[np.void]:
 
 
 def checked(payload: bytes) -> bytes:
-    """Return a batch after checking it: at least one complete record, of consecutive cycles. Raises RefusedError."""
+    """Check a batch of records; return the batch.
+
+    Raises RefusedError if the batch does not consist of one or more complete records of consecutive cycles, or if it
+    contains an unknown mode or drive state.
+    """
     if not payload or len(payload) % SIZE:
         raise RefusedError(
             RefusalCode.MALFORMED, f"records: {len(payload)} bytes are not a multiple of {SIZE}, the size of a record"

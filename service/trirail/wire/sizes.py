@@ -1,34 +1,41 @@
 """Maximum sizes of messages from outside and of packets between the processes."""
 
 MAX_PART = 400
-"""Points of a trajectory in one message. With velocities and accelerations they take 50 kB as msgpack, and 98 kB or
-more as JSON."""
+"""Maximum number of points of a trajectory in one message.
+
+With velocities and accelerations, this many points take 50 kB as msgpack, and 98 kB or more as JSON."""
 MAX_POINTS = 5_000
-"""Points of a trajectory in all its messages: as JSON with all digits they fill MAX_UNREAD_OF_ONE, and the planner
-needs 20 µs for each."""
+"""Maximum number of points of a trajectory in all of its messages.
+
+As JSON with all digits, this many points fill MAX_UNREAD_OF_ONE. The planner needs 20 µs for each point."""
 MAX_FILE = 1_572_864
-"""Size of a file of points that the operator's page sends to its server; MAX_POINTS fit as JSON with all digits
-[bytes]."""
+"""Maximum size of a trajectory file that the operator's web page sends to its server [bytes].
+
+MAX_POINTS points as JSON with all digits fit into the file."""
 MAX_PACKET = 65_536
-"""Size of a packet between the processes; a larger one is passed as a file in memory [bytes]."""
+"""Maximum size of a packet between the processes [bytes]; a larger packet is passed as a file in memory."""
 MAX_SHARED = 4_194_304
-"""Size of such a file; it holds a goal of MAX_POINTS and two present motions of the same length [bytes]."""
+"""Maximum size of a packet that is passed as a file in memory [bytes].
+
+A goal of MAX_POINTS points and two present motions of the same length fit into the packet."""
 MAX_MESSAGE = 262_144
-"""Size of a goal or command; the largest goal fits as indented JSON with all digits. A larger message is refused before
-it is decoded [bytes]."""
+"""Maximum size of a goal or command [bytes]; a larger message is refused before it is decoded.
+
+The largest goal fits as indented JSON with all digits."""
 MAX_TRANSPORT = 4_194_304
-"""Size of a message that the transport reassembles from fragments, for each client and priority; it bounds the
-transport's memory. A message up to this size is refused if it is too large. A larger message is dropped, and its sender
-waits until its time-out [bytes]."""
+"""Maximum size of a message that Zenoh's transport reassembles from fragments, for each client and priority [bytes].
+
+This size limits the transport's memory. A message between MAX_MESSAGE and MAX_TRANSPORT is refused with a reply. A
+larger message is dropped, and its sender waits until its time-out."""
 MAX_BESIDE = 4096
-"""Size of a query's key, parameters and attachment together, without its payload [bytes]."""
+"""Maximum size of the key, the parameters and the attachment of a query together, without the payload [bytes]."""
 MAX_UNREAD = 12_000_000
-"""Memory of all unanswered messages in the gateway; further messages are refused [bytes]."""
+"""Maximum memory for all unanswered messages in the gateway [bytes]; further messages are refused."""
 MAX_UNREAD_OF_ONE = MAX_UNREAD // 4
-"""Memory of one user's unanswered messages; further messages are refused [bytes]."""
+"""Maximum memory for the unanswered messages of one user [bytes]; further messages are refused."""
 MAX_REFUSED = 8_388_608
-"""Memory of messages whose refusal has not been sent yet: two of the largest [bytes]."""
+"""Maximum memory for refused messages until their refusals have been sent, the size of two largest messages [bytes]."""
 MAX_NAME = 64
-"""Length of a robot's or user's name, or of a goal's id [characters]."""
+"""Maximum length of the name of a robot or user, or of the id of a goal [characters]."""
 MAX_TEXT = 512
-"""Length of the text that a reply or an event quotes from a refused message [characters]."""
+"""Maximum length of the text that a reply or an event quotes from a refused message [characters]."""

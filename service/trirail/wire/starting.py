@@ -1,7 +1,7 @@
-"""Announcement of a starting service, which clients on its machine can see before it listens.
+"""Announcement that a service is starting, which clients on the same machine can see before the service listens.
 
-The announcement is an abstract AF_UNIX name (unix(7)). Such a name is not in a file system, is visible to every user,
-and disappears with its process.
+The announcement is an abstract AF_UNIX name (unix(7)). An abstract name is not in a file system, is visible to every
+user, and disappears when its process ends.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from trirail.wire.endpoints import fault_of, is_local, socket_file, tcp_address
 
 
 class Starting:
-    """Announces a service that will listen on some endpoints, until it is up or its process ends."""
+    """Announcement that a service is starting, until `up` is called or the process ends.
+
+    `endpoints` are the endpoints on which the service will listen.
+    """
 
     def __init__(self, endpoints: Iterable[str]) -> None:
         self._opened = [socket.socket(socket.AF_UNIX) for _ in endpoints]
@@ -25,7 +28,7 @@ class Starting:
                 opened.listen(1)
 
     def up(self) -> None:
-        """Withdraw the announcement, also if a child process has inherited the sockets."""
+        """Withdraw the announcement, even if a child process has inherited the sockets."""
         for opened in self._opened:
             with suppress(OSError):
                 opened.shutdown(socket.SHUT_RDWR)
@@ -34,14 +37,14 @@ class Starting:
 
 
 def is_starting(endpoint: str) -> bool:
-    """Whether a service that will listen on an endpoint is starting on this machine."""
+    """Return True if a service that will listen on an endpoint is starting on this machine."""
     if fault_of(endpoint) or not is_local(endpoint):
         return False
     with socket.socket(socket.AF_UNIX) as opened:
         opened.setblocking(False)
         try:
             opened.connect(_name(endpoint))
-        except BlockingIOError:  # the backlog is full of other clients: the name exists
+        except BlockingIOError:  # the name exists, but the queue of connecting clients is full
             return True
         except OSError:
             return False
@@ -49,7 +52,11 @@ def is_starting(endpoint: str) -> bool:
 
 
 def _name(endpoint: str) -> bytes:
-    """Return the abstract name for an endpoint, from port or file alone, because a wildcard address includes others."""
+    """Return the abstract name for an endpoint.
+
+    The name depends only on the port or the file, since a service that listens on a wildcard address is also reached at
+    other addresses.
+    """
     address, file = tcp_address(endpoint), socket_file(endpoint)
     where = f"port {address[1]}" if address is not None else f"file {file}" if file is not None else endpoint
     return b"\0trirail-starting-" + hashlib.sha256(where.encode()).hexdigest().encode()

@@ -1,7 +1,7 @@
-"""The stop port: a TCP or Unix socket beside each Zenoh endpoint, with one line of JSON in each direction.
+"""Protocol of the stop port, a TCP or Unix socket in addition to each Zenoh endpoint.
 
-Other clients cannot delay a stop here by occupying the Zenoh endpoint, because this port uses neither its handshakes
-nor its sessions.
+Request and answer are one line of JSON each. The stop port uses neither the handshakes nor the sessions of Zenoh, so
+clients that occupy the Zenoh endpoint cannot delay a stop.
 """
 
 from __future__ import annotations
@@ -19,28 +19,30 @@ from trirail.wire.messages import CommandReply, ErrorReply
 from trirail.wire.vocabulary import Command
 
 STOPS = frozenset(name for name in Command if name.stops and name.ignores_lease)
-"""Commands that the stop port accepts: those that stop the robot and ignore the lease."""
+"""Commands that the stop port accepts, which are all commands that stop the robot and ignore the lease."""
 MAX_LINE = 4096
 """Maximum size of a request or an answer [bytes]."""
 PORT_OFFSET = 1000
-"""Difference to the endpoint's port, subtracted if the sum is too large; the next port may belong to another robot."""
+"""Number that is added to the endpoint's port; it is subtracted if the sum exceeds the last port.
+
+The offset is not 1, because the next port may belong to another robot."""
 SUFFIX = ".stop"
-"""Suffix of the socket's file, appended to that of Zenoh's."""
+"""Suffix that is appended to the name of the Zenoh endpoint's Unix socket."""
 
 
 class StopRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """A stop; the client also sends a copy over Zenoh."""
+    """Request to stop. The client also sends a copy over Zenoh."""
 
     key: str
     """Key of the query: trirail/<robot>/cmd/<user>/<name>."""
     id: str = ""
-    """Id that all copies share: the stop is executed once, and each copy gets a reply."""
+    """Id that all copies of a stop share. The stop is carried out once, and each copy gets a reply."""
     content: str = ""
-    """Payload of the query, as JSON."""
+    """Content of the command as JSON, as in the payload of the query."""
 
 
 class StopAnswer(Struct, frozen=True, omit_defaults=True):
-    """Answer to a stop, with one of the two fields."""
+    """Answer to a stop, either with a reply or with an error."""
 
     reply: CommandReply | None = None
     error: ErrorReply | None = None
@@ -55,16 +57,17 @@ class StopAddress(NamedTuple):
     where: tuple[str, int] | str
     """Host and port, or the file of a Unix socket."""
     secured: bool
-    """Whether both sides show certificates."""
+    """Whether both sides must authenticate with certificates."""
 
     def __str__(self) -> str:
         return self.where if isinstance(self.where, str) else f"{self.where[0]}:{self.where[1]}"
 
 
 def stop_address(endpoint: str) -> StopAddress | None:
-    """Return the stop port of an endpoint: its port plus PORT_OFFSET, or its socket's file with SUFFIX.
+    """Return the address of the stop port that belongs to a Zenoh endpoint.
 
-    None for protocols other than tcp, tls and unixsock-stream.
+    The address is the endpoint's port plus PORT_OFFSET, or the file of the endpoint's socket with SUFFIX. Return None
+    if the protocol is not tcp, tls or unixsock-stream.
     """
     if (file := socket_file(endpoint)) is not None:
         return StopAddress(f"{file}{SUFFIX}", secured=False)
@@ -77,7 +80,7 @@ def stop_address(endpoint: str) -> StopAddress | None:
 
 
 def command_of(request: StopRequest, robot: str) -> tuple[str, Command]:
-    """Return user and command of a request. Raises RefusedError if it is not a stop for this robot."""
+    """Return the user and the command of a request. Raises RefusedError if the request is not a stop for this robot."""
     user, name = boundary.names(request.key, f"trirail/{robot}/cmd", ("user", "command"))
     if name not in STOPS:
         raise RefusedError(
@@ -88,10 +91,10 @@ def command_of(request: StopRequest, robot: str) -> tuple[str, Command]:
 
 
 def encode(message: StopRequest | StopAnswer) -> bytes:
-    """Return the line of a message."""
+    """Return a message as a line of JSON."""
     return msgspec.json.encode(message) + b"\n"
 
 
 def answer_with(content: CommandReply | ErrorReply) -> bytes:
-    """Return the line of an answer with a reply or an error."""
+    """Return an answer with a reply or an error as a line of JSON."""
     return encode(StopAnswer(error=content) if isinstance(content, ErrorReply) else StopAnswer(reply=content))

@@ -1,4 +1,4 @@
-"""Rules for names and ids from outside, and safe display of foreign text."""
+"""Rules for names and ids that arrive from outside, and safe display of text that arrives from outside."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from trirail.errors import RefusalCode, RefusedError
 from trirail.wire.sizes import MAX_NAME, MAX_TEXT
 
 _HIDDEN = frozenset({"Cc", "Cf", "Cs", "Co", "Zl", "Zp"})
-"""Unicode categories of characters that control a terminal, reorder or end a line, or are invisible."""
+"""Unicode categories of characters that control a terminal, reorder or end a line, or cannot be seen."""
 _NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{MAX_NAME}}}")
 _QUANTITY = re.compile(r"-?[0-9]+([eE]-?[0-9]+)?(m|cm|mm|um|nm|in|rad|mrad|urad|deg|arcmin|arcsec|s|ms|us|min)?")
-"""Names that the command line would read as a number or a quantity."""
+"""Pattern of names that the command line would read as a number or a quantity."""
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
-"""Decimal numbers without underscores and digits of other scripts, which Python's float would accept."""
+"""Pattern of decimal numbers. Python's float would also accept underscores and digits of other scripts."""
 
 NAME_RULE = f"letters, digits, - and _, at most {MAX_NAME}"
 QUANTITY_RULE = "reads as a number or a quantity; choose a name such as p5mm"
@@ -29,45 +29,45 @@ _WITH_COMMA = re.compile(r"\s*[-+]?[0-9]+,[0-9]+(?![0-9,.])")
 
 
 def number(text: str) -> float:
-    """Return the number in a text, ignoring blanks around it. Raises ValueError if it is not a finite number."""
+    """Convert a text to a number, ignoring blanks at both ends. Raises ValueError if it is not a finite number."""
     if re.fullmatch(NUMBER, text.strip()) is None or not math.isfinite(value := float(text)):
         raise ValueError(f"{quoted(text.strip())!r} is not a number{comma_hint(text)}")
     return value
 
 
 def comma_hint(text: str) -> str:
-    """Return a hint to write a decimal comma as a point; "" without one."""
+    """Return a hint to write a decimal point if the text begins with a number with a decimal comma; otherwise ""."""
     match = _WITH_COMMA.match(text)
     return f": write {text[: match.end()].strip().replace(',', '.')} with a decimal point" if match is not None else ""
 
 
 def is_name(text: str) -> bool:
-    """Whether a text is a valid name of a robot or user in a key."""
+    """Return True if a text is a valid name of a robot, user or pose in a key."""
     return _NAME.fullmatch(text) is not None
 
 
 def is_quantity(name: str) -> bool:
-    """Whether a name reads as a number or a quantity, such as 10 or 5mm."""
+    """Return True if the command line would read a name as a number or a quantity, such as 10 or 5mm."""
     return _QUANTITY.fullmatch(name) is not None
 
 
 def is_id(text: str) -> bool:
-    """Whether a text is a valid id of a goal."""
+    """Return True if a text is a valid id of a goal."""
     return 0 < len(text) <= MAX_NAME and not any(map(_is_hidden, text))
 
 
 def printable(text: str) -> str:
-    """Return text with control and invisible characters as escapes, such as \\x1b, \\u202e and \\n."""
+    """Return a text with escapes, such as \\x1b, \\u202e and \\n, in place of control and invisible characters."""
     return "".join(_escaped(character) if _is_hidden(character) else character for character in text)
 
 
 def json_printable(text: str) -> str:
-    """Return JSON with the same characters as JSON escapes, for JSON that may be printed on a terminal."""
+    """Return JSON with JSON escapes in place of control and invisible characters, for output on a terminal."""
     return "".join(json.dumps(character)[1:-1] if _is_hidden(character) else character for character in text)
 
 
 def quoted(text: str) -> str:
-    """Return foreign text for a line: printable, and cut to MAX_TEXT characters."""
+    """Return a text from outside for a quotation in one line: printable, and cut to MAX_TEXT characters."""
     line = printable(text[: MAX_TEXT + 1])
     return line if len(line) <= MAX_TEXT else line[: MAX_TEXT - 1] + "…"
 
@@ -86,14 +86,20 @@ def _escaped(character: str) -> str:
 
 
 def check_name(name: str, whose: str) -> str:
-    """Return a name of a robot or user after checking it. Raises RefusedError."""
+    """Check the name of a robot, user or pose; return the name. Raises RefusedError if the name is invalid.
+
+    `whose` is the kind of name in the error message, such as "robot".
+    """
     if not isinstance(name, str) or not is_name(name):
         raise RefusedError(RefusalCode.BAD_NAME, f"{whose} {quoted(str(name))!r} is not a valid name; use {NAME_RULE}")
     return name
 
 
 def check_new_pose(name: str) -> str:
-    """Return a name for a pose after checking it: goto must not read it as a quantity. Raises RefusedError."""
+    """Check the name of a new pose; return the name.
+
+    Raises RefusedError if the name is invalid, or if the command `trirail goto` would read it as a quantity.
+    """
     check_name(name, "pose")
     if is_quantity(name):
         raise RefusedError(RefusalCode.BAD_NAME, f"pose {name!r} {QUANTITY_RULE}")

@@ -1,4 +1,4 @@
-"""TLS of the stop port: both sides authenticate with a certificate, and each trusts only its own authority."""
+"""TLS contexts of the stop port; both sides authenticate with certificates, and trust only their own authority."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from trirail.wire.credentials import Credentials
 
 
 def server(credentials: Credentials) -> ssl.SSLContext:
-    """Return the context of a server, which requires a client certificate."""
+    """Return the context of a server, which requires certificates from clients."""
     authority, certificate, key = credentials.files
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(authority))
     context.verify_mode = ssl.CERT_REQUIRED
@@ -27,7 +27,7 @@ def client(credentials: Credentials) -> ssl.SSLContext:
 
 
 def peer(connection: ssl.SSLSocket) -> str:
-    """Return the common name of the peer's certificate; "" without one, or if it has none or several."""
+    """Return the common name of the peer's certificate; "" if it has none or several, or without a certificate."""
     subject: Any = (connection.getpeercert() or {}).get("subject", ())
     names = [value for part in subject for key, value in part if key == "commonName"]
     return names[0] if len(names) == 1 else ""

@@ -1,6 +1,6 @@
-"""Parsing of quantities such as 5mm, -0.2in, 350um, 1.5deg, 5arcsec and 20mm/s. Bare numbers are in SI units.
+"""Parsing of quantities such as 5mm, -0.2in, 350um, 1.5deg, 5arcsec and 20mm/s. Numbers without a unit are in SI units.
 
-Units are decimal numbers, so that 5mm is the same number as 0.005.
+The values of the units are decimal numbers, so that 5mm is exactly the same float as 0.005.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class Dimension(NamedTuple):
     """Physical dimension of a quantity."""
 
     name: str
-    """Name with its article, for people."""
+    """Name with its article, for error messages."""
     units: Mapping[str, Decimal]
-    """Units by symbol, in SI; a bare number has the first one."""
+    """Values of the units in SI, by symbol. A number without a unit has the first unit."""
     examples: str
 
 
@@ -83,13 +83,14 @@ DIMENSIONS: Final = (
     PERCENTAGE,
 )
 SIZES: Final = {unit: size for dimension in DIMENSIONS for unit, size in dimension.units.items()}
-"""Value of every unit in SI."""
+"""Values of all units in SI, by symbol."""
 
 
 def quantity(text: str, dimension: Dimension, bare: str | None = None) -> float:
-    """Return a quantity in SI, a percentage in %; a bare number has the unit `bare`, or SI.
+    """Convert a text to a quantity in SI units, or to a percentage in %.
 
-    The result is rounded once, so that 5mm is the float 0.005. Raises ValueError with the expected form.
+    A number without a unit has the unit `bare`; the default is the SI unit. The result is rounded only once, so that
+    5mm is the float 0.005. Raises ValueError with the expected form if the text is invalid.
     """
     match = _WRITTEN.fullmatch(text)
     unit = (match[2] or bare or next(iter(dimension.units))) if match else ""

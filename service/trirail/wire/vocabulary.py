@@ -1,4 +1,4 @@
-"""Names that processes and clients share: modes, causes of faults, roles and commands."""
+"""Names of modes, causes of faults, roles and commands, which the service's processes and the clients share."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ class Mode(StrEnum):
 
 
 MODES = tuple(Mode)
-"""Modes in the order of their numbers in records."""
+"""Modes; a record contains the index of a mode in this tuple."""
 
 
 class FaultCause(StrEnum):
-    """Cause of a fault that the service detects; DriveFault has the causes that drives report."""
+    """Cause of a fault that the service detects. DriveFault contains the causes that drives report."""
 
     FOLLOWING_ERROR = "following_error"
     """The following error of a slider exceeds [limits.slider] following_error."""
     LIMIT = "limit"
-    """The last check before the drives refused a setpoint."""
+    """The last gate, which checks every setpoint before it is written to the drives, refused a setpoint."""
     ENABLE = "enable"
     """The drives were not enabled in time."""
     PLACE = "place"
-    """The slider positions do not correspond to any pose, or correspond to one at which the robot may not be."""
+    """The slider positions do not correspond to any pose, or correspond to a pose at which the robot must not be."""
     QUICK_STOP = "quick_stop"
     """A user sent quick_stop."""
     LOOP = "loop"
@@ -47,18 +47,18 @@ class FaultCause(StrEnum):
 
 
 LeasePolicy = Literal["optional", "required"]
-"""Whether the robot can be moved without the lease."""
+"""Rule for a free lease: if "required", no user can move the robot; if "optional", every user can move the robot."""
 
 
 class Role(StrEnum):
-    """Role of a user; each role has the permissions of those before it."""
+    """Role of a user. Each role has all permissions of the roles before it."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
     MAINTAINER = "maintainer"
 
     def includes(self, other: Role) -> bool:
-        """Return whether this role has all permissions of another role."""
+        """Return True if this role has all permissions of another role."""
         roles = tuple(Role)
         return roles.index(self) >= roles.index(other)
 
@@ -69,11 +69,11 @@ class CommandContent(Struct, frozen=True, forbid_unknown_fields=True):
     words: ClassVar[str] = "no content"
     """Description of the expected content, for people."""
     optional: ClassVar[bool] = True
-    """Whether the content may be absent; all fields then have their default values."""
+    """Whether the command may be sent without content, so that all fields have their default values."""
 
 
 LOWEST_OVERRIDE = 1.0
-"""Lowest override other than 0 [%]; at 0 the robot does not move."""
+"""Lowest override other than 0 [%]. At override 0, the robot does not move."""
 
 
 class Override(CommandContent, frozen=True):
@@ -83,7 +83,7 @@ class Override(CommandContent, frozen=True):
     optional = False
 
     percent: Annotated[float, Meta(ge=0.0, le=200.0)]
-    """Speed override: 0, or 1 to 200 % of full speed. The limits still apply, and at 0 the robot does not move."""
+    """Speed override, 0 or 1 to 200 [%]. At 0, the robot does not move. All limits apply at every override."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -94,31 +94,32 @@ class Override(CommandContent, frozen=True):
 
 
 class Stop(CommandContent, frozen=True):
-    """Optional content of the command stop; it restricts the command to one goal, running or queued."""
+    """Optional content of the command stop, which restricts the command to one goal, running or queued."""
 
     words = 'nothing, or {"goal": id}'
 
     goal: Identifier | None = None
-    """Id of the goal to stop; without it, the robot and all goals stop."""
+    """Id of the goal to stop. Without an id, the robot and all goals stop."""
 
 
 SHORTEST_LEASE, LONGEST_LEASE = 0.1, 10.0
-"""Range of a lease's time-out [s]."""
+"""Minimum and maximum of a lease's time-out [s]."""
 LeaseTimeout = Annotated[float, Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)]
 
 
 class AcquireLease(CommandContent, frozen=True):
-    """Optional content of the command acquire. Sending it again within its timeout renews the lease."""
+    """Optional content of the command acquire. To renew the lease, send the command again within `timeout`."""
 
     words = 'nothing, or {"id": id, "timeout": seconds, "force": true}'
 
     id: Identifier | None = None
-    """Id of the lease. It must be new for every lease and the same in all renewals, so that a late renewal cannot
-    revive a lease that has ended. Without it, each message is a new request."""
+    """Id of the lease. Use a new id for every lease, and the same id in all renewals of a lease, so that a late renewal
+    cannot revive a lease that has ended. Without an id, each message is a new request."""
     timeout: LeaseTimeout = 1.0
     """Time without a renewal after which the lease ends and the robot makes a controlled stop [s]."""
     force: bool = False
-    """Whether to take the lease over from its holder; this requires the role in [control] `takeover`."""
+    """Whether to take the lease over from its holder. A takeover requires the role of the key `takeover` in [control].
+    """
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -130,7 +131,7 @@ class ReleaseLease(CommandContent, frozen=True):
     words = 'nothing, or {"id": id}'
 
     id: Identifier | None = None
-    """Id of the lease, as in its acquire; the default is the user's present lease."""
+    """Id of the lease, as in the command acquire. The default is the user's present lease."""
 
 
 class SetOutput(CommandContent, frozen=True):
@@ -142,10 +143,11 @@ class SetOutput(CommandContent, frozen=True):
     output: OutputName
     """Name of an output of the configuration."""
     value: bool
+    """New value of the output."""
 
 
 class NoContent(CommandContent, frozen=True):
-    """Empty content of the other commands."""
+    """Empty content, for commands without content."""
 
 
 class _CommandRow(NamedTuple):
@@ -160,10 +162,10 @@ class _CommandRow(NamedTuple):
 
 
 class Command(StrEnum):
-    """Commands with their names on the wire, help texts and properties.
+    """Table of all commands, with their names on the wire, help texts and properties.
 
-    trirail.control.commands.EFFECTS contains the effects. Gateway, access rules, schemas, clients and command line are
-    derived from this table.
+    The gateway, the access rules, the schemas, the clients and the command line are derived from this table. The
+    effects of the commands are in trirail.control.commands.EFFECTS.
     """
 
     help: str
@@ -173,7 +175,8 @@ class Command(StrEnum):
     content: type[CommandContent]
     """Type of the command's content."""
     stops: bool
-    """Whether the command stops the robot: it overtakes all waiting messages, and goals sent before it do not start."""
+    """Whether the command stops the robot. Such a command overtakes all waiting messages, and goals that were sent
+    before the command do not start."""
     ignores_lease: bool
     """Whether every user may send the command while another user holds the lease."""
 
@@ -226,7 +229,7 @@ class Command(StrEnum):
         stops: bool = False,
         ignores_lease: bool = False,
     ) -> Self:
-        """Create a member from its row; a call with a name alone, such as Command("stop"), looks the member up."""
+        """Create a member from its row. A call with only a name, such as Command("stop"), looks the member up."""
         member = str.__new__(cls, name)
         member._value_ = name
         member.help, member.role, member.content = help, role, content
@@ -235,5 +238,5 @@ class Command(StrEnum):
 
     @property
     def accepts(self) -> Any:
-        """Type as which the command's content is decoded."""
+        """Type with which the content of the command is decoded."""
         return self.content | None if self.content.optional else self.content

@@ -1,4 +1,4 @@
-"""Zenoh sessions of service and clients: no discovery, bounded queues, and only the configured addresses."""
+"""Zenoh sessions of services and clients, without discovery, with limited queues, and only at configured addresses."""
 
 from __future__ import annotations
 
@@ -17,25 +17,27 @@ from trirail.wire.sizes import MAX_TRANSPORT
 from trirail.wire.starting import is_starting
 
 SESSIONS = 512
-"""Maximum number of clients connected to a service; a router counts as one."""
+"""Maximum number of clients connected to a service; a router counts as one client."""
 SEND_TIMEOUT_S = 2.0
-"""Time after which a client is disconnected if it does not accept a message that must not be dropped, such as a reply
-or a past event [s]."""
+"""Time for which the service waits for a client to accept a message before it disconnects the client [s].
+
+This applies to messages that must not be dropped, such as replies and past events."""
 BATCH_SIZE = 8192
-"""Size of a service's send and receive buffers [bytes]; a larger message is sent in fragments. Zenoh uses the smaller
-size of the two sides."""
+"""Size of a service's send and receive buffers [bytes]; a larger message is sent in fragments.
+
+Zenoh uses the smaller of the sizes that the two sides of a connection propose."""
 
 _COMMON_SETTINGS = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
-    "transport/shared_memory/enabled": False,  # the maximum size below would not apply to it
+    "transport/shared_memory/enabled": False,  # the maximum size below would not apply to shared memory
     "transport/link/rx/max_message_size": MAX_TRANSPORT,
 }
 
 
 def key(robot: str, *parts: str) -> str:
-    """Return the key expression of a robot's resource."""
+    """Return the key expression made of a robot's name and `parts`."""
     return "/".join(("trirail", robot, *parts))
 
 
@@ -45,10 +47,11 @@ def open_service(
     access_control: Mapping[str, Any] | None = None,
     connect: Sequence[str] = (),
 ) -> zenoh.Session:
-    """Return the service's session: a peer that listens on the given locators only.
+    """Open the session of a service, a Zenoh peer that listens only on the locators `listen`.
 
-    With credentials, every client needs a certificate of the same authority; `access_control` is that section of
-    Zenoh's configuration. The session connects to the routers of `connect`, and reconnects when a connection is lost.
+    With credentials, every client needs a certificate of the same authority. `access_control` is the section of this
+    name in Zenoh's configuration. The session connects to the routers at the locators `connect`, and reconnects when a
+    connection is lost. Raises ServiceError if the session cannot be opened.
     """
     settings = {"mode": "peer", **serving(listen, credentials, access_control, connect)}
     return _open(
@@ -65,10 +68,11 @@ def router(
     connect: Sequence[str],
     thinned: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Return the configuration of a router, for Zenoh's own program zenohd.
+    """Return the configuration of a router for Zenoh's program zenohd.
 
-    `thinned` has the maximum rate per client of some keys [Hz]. Zenoh drops the messages in between, including the
-    newest, so use it for states only. Zenoh keeps one timer per rule, hence one rule per key.
+    `thinned` maps key expressions to the maximum rate [Hz] at which the router sends their messages to each client.
+    Zenoh drops the messages in between, even if the dropped message is the newest, so use `thinned` only for states.
+    Each key expression gets a separate rule, since Zenoh has one timer for each rule.
     """
     settings = _COMMON_SETTINGS | {
         "mode": "router",
@@ -100,23 +104,24 @@ def serving(
     connect: Sequence[str],
     sessions: int = SESSIONS,
 ) -> dict[str, Any]:
-    """Return the settings of a service or router, by their paths in Zenoh's configuration."""
+    """Return the settings that services and routers share, by their paths in Zenoh's configuration."""
     return {
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        # Start without a router that is absent, and keep trying: 0 instead of -1 would try only once.
+        # Start even if a router is absent, and try to connect repeatedly. With 0 instead of -1, Zenoh would try once.
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
-        # A waiting message occupies the whole buffer in which it arrived: with the default of 65,535 bytes, 2,600 small
-        # messages of one user held 180 MB.
+        # A waiting message occupies the whole buffer in which it arrived. With the default size of 65,535 bytes, 2,600
+        # small messages of one user occupied 180 MB.
         "transport/link/tx/batch_size": BATCH_SIZE,
         "transport/link/rx/buffer_size": BATCH_SIZE,
-        # Connections that never open a session must not keep others out: hence many, and a short time-out.
+        # Connections that never open a session must not block other clients. Many connections may therefore wait for a
+        # session at the same time, with a short time-out.
         "transport/unicast/accept_pending": 1000,
         "transport/unicast/accept_timeout": 3000,
         "transport/unicast/max_sessions": sessions,
-        "timestamping/enabled": True,  # advanced publishers order their history by it
+        "timestamping/enabled": True,  # advanced publishers sort their history by timestamp
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(SEND_TIMEOUT_S * 1e6),
         "transport/link/tx/queue/size/data_high": 16,
@@ -127,7 +132,7 @@ def serving(
 
 
 def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.Session:
-    """Return a client's session to a service or router, with credentials if it requires them."""
+    """Open a client's session to a service or router. Raises ServiceError if the session cannot be opened."""
     return _open(
         {
             "mode": "client",
@@ -144,7 +149,7 @@ def open_client(locator: str, credentials: Credentials | None = None) -> zenoh.S
 
 
 def _connection_advice(locator: str, credentials: Credentials | None) -> str:
-    """Return why no session opens at a locator, and the next step, because Zenoh does not report the reason."""
+    """Return the reason why no session opens at a locator, which Zenoh does not report, and the next step."""
     if is_starting(locator):
         return " yet: the service is starting; try again when it reports that it is up"
     refused = "" if credentials is None else ", or rejects these certificates"
@@ -158,20 +163,26 @@ def _connection_advice(locator: str, credentials: Credentials | None) -> str:
 
 
 def linked(opened: zenoh.Session, endpoints: Sequence[str], router: str | None) -> set[str]:
-    """Return the endpoints with a connection; with `router`, only those whose certificate has that common name."""
+    """Return the endpoints to which a session is connected.
+
+    With `router`, only connections to a certificate with this common name count.
+    """
     links = opened.info.links()
     reached = [str(link.dst) for link in links if router is None or link.auth_identifier == router]
     return {endpoint for endpoint in endpoints if any(leads_to(endpoint, other) for other in reached)}
 
 
 def close(opened: zenoh.Session) -> None:
-    """Close a session; a session that hangs stays open until the process ends."""
+    """Close a session. If Zenoh fails to close the session, it stays open until the process ends."""
     with contextlib.suppress(zenoh.ZError):
         opened.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it so
 
 
 def _tls(credentials: Credentials | None) -> dict[str, Any]:
-    """Return settings for mutual authentication by one authority; connections end when a certificate expires."""
+    """Return the settings for mutual authentication with certificates of one authority.
+
+    A connection ends when one of its certificates expires.
+    """
     if credentials is None:
         return {}
     authority, certificate, key_file = map(str, credentials.files)
@@ -190,7 +201,7 @@ def _tls(credentials: Credentials | None) -> dict[str, Any]:
 
 
 def _open(settings: dict[str, Any], failure: str, explain: Callable[[], str]) -> zenoh.Session:
-    zenoh.init_log_from_env_or("off")  # the error below contains the message that zenoh would print
+    zenoh.init_log_from_env_or("off")  # the error below contains the message that Zenoh would log
     config = zenoh.Config()
     try:
         for name, value in (_COMMON_SETTINGS | settings).items():

@@ -1,1 +1,1 @@
-"""Kinds of goals; each has a module with its fields, checks and properties, and all modules are imported."""
+"""Goal kinds, with one module for the fields, checks and properties of each; trirail.wire.goals imports all modules."""

@@ -1,4 +1,4 @@
-"""Moves to a named pose."""
+"""Goal kind for moves to a named pose."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from trirail.wire.marks import Marks, StopAtEdge
 
 
 class NamedGoal(GoalKind, frozen=True, tag="named"):
-    """Move the platform to the pose that has this name when the message arrives; otherwise like a pose goal."""
+    """Move the platform to a named pose, like a pose goal. The service looks the name up when the message arrives."""
 
     name: PoseName
     """Name of a pose in the reply on …/poses."""

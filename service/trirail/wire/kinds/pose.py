@@ -1,4 +1,4 @@
-"""Moves to a pose."""
+"""Goal kind for moves to a pose."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PoseGoal(GoalKind, frozen=True, tag="pose"):
     x: Coordinate
     """x of the platform's centre, or of its `tool`, in `frame` [m]."""
     y: Coordinate
-    """y of that point in `frame` [m]."""
+    """y of the same point in `frame` [m]."""
     phi: Coordinate
     """Angle of the platform in `frame`, counterclockwise [rad]."""
     id: OwnId = None
@@ -40,6 +40,6 @@ class PoseGoal(GoalKind, frozen=True, tag="pose"):
 
 
 def pose_in_place_of(goal: GoalKind, x: float, y: float, phi: float, tool: Tool | None = None) -> PoseGoal:
-    """Return the pose goal that is equivalent to a goal of another kind, with the fields that both kinds have."""
+    """Return a pose goal to a pose, with the id, speed, limits, marks and other common fields of `goal`."""
     same = {name: getattr(goal, name) for name in ("id", "speed", "valid_for", "limits", "blend", "marks", "stop_at")}
     return PoseGoal(x, y, phi, tool=tool, **same)

@@ -1,4 +1,4 @@
-"""Moves to slider positions."""
+"""Goal kind for moves to slider positions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class SlidersGoal(GoalKind, frozen=True, tag="sliders"):
     """Move the sliders to positions, on a straight line in slider space if the start allows this."""
 
     position: Coordinates
-    """lambda_10 of the sliders A, B, C [m]."""
+    """Target positions lambda_10 of the sliders A, B, C [m]."""
     id: OwnId = None
     speed: Speed = 1.0
     valid_for: ValidFor = None

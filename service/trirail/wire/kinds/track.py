@@ -1,4 +1,4 @@
-"""Tracking of a moving target."""
+"""Goal kind for following a moving target."""
 
 from __future__ import annotations
 
@@ -11,38 +11,39 @@ from trirail.wire.goal_kind import Clock, Coordinate, Coordinates, GoalKind, Own
 
 
 class TrackGoal(GoalKind, frozen=True, tag="track"):
-    """Follow a moving target that the client renews 10 to 200 times a second.
+    """Follow a moving target; the client sends the target's pose 10 to 200 times a second.
 
-    The goal ends when `timeout` passes without a renewal of its id; the robot then brakes on its path. Between two
-    messages the service extrapolates the target with its velocity. The platform follows a target that is too fast at
-    its own limits, and waits at the border of the workspace for a target that is out of reach.
+    The goal ends when `timeout` passes without a renewal with the same id. The robot then brakes on its path. Between
+    two messages, the service extrapolates the target's pose with the target's velocity. If the target is too fast, the
+    platform follows it as fast as the platform's limits allow. If the target is out of reach, the platform waits at the
+    border of the workspace.
     """
 
     renewed = frequent = waits_at_end = timed = True
     greatest_rate = 1.0
 
     x: Coordinate
-    """x of the target for the platform's centre at `time`, in the base frame [m]."""
+    """Target x of the platform's centre at `time`, in the base frame [m]."""
     y: Coordinate
-    """y of that target [m]."""
+    """Target y of the platform's centre at `time`, in the base frame [m]."""
     phi: Coordinate
-    """Angle of the target for the platform at `time`, counterclockwise [rad]."""
+    """Target angle of the platform at `time`, counterclockwise [rad]."""
     velocity: Coordinates = (0.0, 0.0, 0.0)
-    """Velocity of x, y and phi at `time` [m/s, m/s, rad/s]."""
+    """Velocity of the target's x, y and phi at `time` [m/s, m/s, rad/s]."""
     time: Clock | None = None
-    """Time to which the target's pose applies, on the wall clock of the service's machine [s since 1970]. It may be at
-    most half a second in the past or future, and defaults to the time of arrival. The clocks of two machines must agree
-    to about a millisecond."""
+    """Time at which the target has this pose, on the wall clock of the service's machine [s since 1970]. The time may
+    be at most half a second in the past or future, and defaults to the time of arrival. The clocks of the client's and
+    the service's machine must agree to about a millisecond."""
     id: OwnId = None
     timeout: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.25
-    """Real time without a renewal after which the track brakes, at every override [s]."""
+    """Time without a renewal after which the robot brakes [s]. It is real time, independent of the override."""
     valid_for: ValidFor = None
 
     @property
     def target(self) -> Triple:
-        """Pose of the target."""
+        """Pose of the target: x, y [m], phi [rad]."""
         return self.x, self.y, self.phi
 
     def at(self, time: float) -> Self:
-        """Return a copy with another time [s]."""
+        """Return a copy with another `time` [s]."""
         return structs.replace(self, time=time)

@@ -1,4 +1,4 @@
-"""Trajectories of timed points."""
+"""Goal kind for trajectories of timed points."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from trirail.wire.marks import Marks, StopAtEdge
 from trirail.wire.sizes import MAX_PART, MAX_POINTS
 
 SHORTEST_PIECE = 1e-4
-"""Minimum time between two points of a trajectory [s]; below it the derivatives lose precision."""
+"""Minimum time between two points of a trajectory [s]; with shorter times, the derivatives lose precision."""
 MAX_DURATION_S = 86_400.0
 """Maximum duration of a trajectory [s]."""
 Time = Annotated[float, Meta(ge=-1e10, le=1e10)]
-"""Time of any clock [s]."""
+"""Time on a clock of the client's choice [s]."""
 
 Stretch = Annotated[
     bool,
@@ -37,7 +37,8 @@ class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     """Pose of the platform at a time, with optional velocity and acceleration."""
 
     t: Time
-    """Time relative to the first point's `t`, which is arbitrary, such as zero or seconds since 1970 [s]."""
+    """Time of the point [s]. Only differences matter, so the first point may have any time, such as 0 or the time since
+    1970."""
     x: Coordinate
     """x of the platform's centre in the base frame [m]."""
     y: Coordinate
@@ -48,14 +49,15 @@ class TrajectoryPoint(Struct, frozen=True, forbid_unknown_fields=True):
     """Velocity of x, y and phi [m/s, m/s, rad/s]. The default is the mean velocity between the neighbouring points, and
     zero at both ends."""
     acceleration: tuple[Acceleration, Acceleration, Acceleration] | None = None
-    """Acceleration of x, y and phi [m/s², m/s², rad/s²]; its default is computed like that of the velocity."""
+    """Acceleration of x, y and phi [m/s², m/s², rad/s²]. The default is the mean acceleration between the neighbouring
+    points, and zero at both ends."""
 
     def __post_init__(self) -> None:
         check_fields(self)
 
 
 class TrajectoryPart(Struct, frozen=True, forbid_unknown_fields=True):
-    """Number of a message in a trajectory that is sent in parts."""
+    """Position of a message in the sequence of messages that together contain a trajectory."""
 
     number: Annotated[int, Meta(ge=1, le=MAX_POINTS // 2)]
     """Number of this part, from 1."""
@@ -68,19 +70,19 @@ class TrajectoryPart(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TrajectoryGoal(GoalKind, frozen=True, tag="trajectory"):
-    """Follow timed points from the robot's pose; quintic polynomials join the points."""
+    """Follow a trajectory of timed points that begins at the robot's pose. Quintic polynomials join the points."""
 
     points: Annotated[tuple[TrajectoryPoint, ...], Meta(min_length=2, max_length=MAX_PART)]
-    """Points in order of time; the first is the robot's pose, and the robot is at rest at the last."""
+    """Points in order of time. The first point is the robot's pose. The robot is at rest at the last point."""
     id: OwnId = None
     stretch: Stretch = False
     settle: bool = True
-    """Whether the goal is done only when the robot is measured to be in position, as other goals are. Otherwise it is
-    done at the end of its path."""
+    """If true, the goal is done when the robot's measured position has settled at the target, as for other goals. If
+    false, the goal is done at the end of its path."""
     valid_for: ValidFor = None
     part: TrajectoryPart | None = None
-    """Number of this message if the points are sent in parts, each with the same `id` and options. The reply to each
-    part is the reply to the whole goal."""
+    """Number of this message, if the points are sent in several messages with the same `id` and options. The reply to
+    each message is the reply to the whole goal."""
     marks: Marks = ()
     stop_at: StopAtEdge = None
 
@@ -92,12 +94,12 @@ class TrajectoryGoal(GoalKind, frozen=True, tag="trajectory"):
 
     @property
     def lengthy(self) -> bool:
-        """Whether the goal has more points than fit into one message."""
+        """True if the goal has more points than one message may contain."""
         return len(self.points) > MAX_PART
 
 
 def check_times(times: Sequence[float]) -> None:
-    """Raise ValueError if the times of the points [s] do not increase, or if the trajectory is too long."""
+    """Raise ValueError if the times of the points [s] do not increase by SHORTEST_PIECE, or last too long."""
     duration = times[-1] - times[0] if times else 0.0
     if duration > MAX_DURATION_S:
         raise ValueError(
@@ -111,7 +113,7 @@ def check_times(times: Sequence[float]) -> None:
 
 
 def parts(goal: TrajectoryGoal) -> list[TrajectoryGoal]:
-    """Split a trajectory into messages of similar size; return the goal alone if it fits into one message."""
+    """Split a trajectory into goals of similar size that fit into one message each."""
     points = goal.points
     number = -(-len(points) // MAX_PART)
     if number < 2:
