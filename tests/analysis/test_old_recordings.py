@@ -21,7 +21,9 @@ def test_a_recording_of_an_earlier_version_is_replayed_to_the_last_bit(packed: P
     path = tmp_path / "session.rrd"
     path.write_bytes(lzma.decompress(packed.read_bytes()))
     recording = read(path)
-    comparison = replay_session(recording, provenance.configuration(recording.texts), simulated=False)
+    config = provenance.configuration(recording.texts)
+    assert config is not None
+    comparison = replay_session(recording, config, simulated=False)
     assert (comparison.differing, comparison.plans_differing, comparison.lacking) == (0, 0, 0)
     assert comparison.cycles > 200
     assert comparison.requests >= 10
