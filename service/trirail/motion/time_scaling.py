@@ -60,7 +60,7 @@ class TimeScaling:
         return None
 
     def last_new_time(self, run: Run, law: Path, rate: float) -> float:
-        """Return the time until which a law must be sampled [s]. Afterwards, the rate is constant or the path is over."""
+        """Return the time until which a law must be sampled [s]. Later, the rate is constant or the path is over."""
         return min(arrival_time(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
 
     def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
