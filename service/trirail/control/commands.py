@@ -177,7 +177,7 @@ class Commands:
         self._change_mode(request)
 
     def _override(self, request: CommandRequest) -> None:
-        """Set the speed override for the current motion and all later ones."""
+        """Set the speed override for the current motion and all later motions."""
         rate = self._planner.override = request.content.percent / 100.0
         self._planner.update_rate()
         words = f"override {rate:.0%} by {request.user}"
@@ -185,7 +185,7 @@ class Commands:
         self._ledger.notices.append(Notice("service", "info", text.text, user=request.user, **text.fields))
 
     def _set_output(self, request: CommandRequest) -> None:
-        """Set an output. It switches together with the next setpoints."""
+        """Set an output. The output switches together with the next setpoints."""
         name, value = request.content.output, request.content.value
         self._outputs.set(name, value, self._modes.state.mode)
         words = f"output {name} {'on' if value else 'off'} by {request.user}"

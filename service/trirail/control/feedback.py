@@ -53,7 +53,7 @@ class MeasuredState:
         self.jumping = np.zeros(3, np.bool)
         """Whether the position of each slider has changed faster than the slider can move."""
         self.settling = Settling(windows, period)
-        """Monitor of whether the robot is in position."""
+        """Monitor that decides whether the robot is in position."""
         self.backlash = backlash(take_up, period)
         """State of the backlash compensation, (2,) of dtype trirail.control.backlash.BACKLASH."""
         self.legs = legs

@@ -95,7 +95,7 @@ class Settling:
         return self.now(None) if cycle - self._since >= self._timeout else None
 
     def now(self, settle: float | None) -> SettlingResult:
-        """Return a result with the current residuals and overshoot."""
+        """Return a result with the current residuals and overshoot, and with the given settling time [s]."""
         sliders, pose, overshoot = map(
             tuple, (*self.monitored["residual"][0].tolist(), *self.monitored["overshoot"].tolist())
         )

@@ -46,7 +46,7 @@ class LeaseArbiter:
 
     @property
     def user(self) -> str | None:
-        """Holder of the lease; None if there is none."""
+        """Name of the user who holds the lease; None if no user holds the lease."""
         return self._held.user if self._held is not None else None
 
     @property
@@ -55,7 +55,7 @@ class LeaseArbiter:
         return self._held.alive_until if self._held is not None else math.inf
 
     def check(self, user: str) -> None:
-        """Raise RefusedError if the user must not move the robot now."""
+        """Raise RefusedError if the user is not allowed to move the robot now."""
         if self._held is None:
             if self._required:
                 raise RefusedError(

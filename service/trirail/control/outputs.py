@@ -190,7 +190,7 @@ class Outputs:
             row["axis"], row["bit"], row["delay"] = NAMES.index(output.drive), 1 << output.bit, output.delay
         self.make_safe()
         self._goals: dict[str, int] = {}
-        """Numbers of the goals in the tables, by goal id; 0 means no goal."""
+        """Number that represents each goal in the tables, under the id of the goal. The number 0 represents no goal."""
         self._number = 0
         self._over: set[str] = set()
         """Goals that have ended, but with switches that have not been reported yet."""

@@ -108,7 +108,7 @@ class PlanRequests:
 
     @property
     def awaits_answer(self) -> bool:
-        """Whether the planner has yet to answer the current request."""
+        """Whether a request has been sent to the planner and has not been answered."""
         return self._goal is not None and self._request is not None and self._answer is None
 
     @property

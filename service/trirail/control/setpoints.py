@@ -71,7 +71,7 @@ class Setpoints:
         return (a, b, c), (u, v, w)
 
     def start(self) -> None:
-        """Start with setpoints equal to the measured slider positions."""
+        """Set the first setpoints to the measured slider positions."""
         self.sliders[0, 0] = self._measured.position
 
     def allow(self, mode: Mode) -> None:

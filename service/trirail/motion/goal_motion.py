@@ -39,7 +39,7 @@ class GoalMotion(Generic[G]):
         return goal
 
     def check(self, goal: G) -> None:
-        """Raise RefusedError if the goal cannot be reached from any start."""
+        """Raise RefusedError if the goal is impossible, independently of the start of the motion."""
 
     def plan(self, goal: G, start: MotionState, rate: float, begins: float) -> Plan:
         """Return a path to the goal.

@@ -46,7 +46,7 @@ def resolve_goal(goal: Goal, frames: NamedFrames, source: PoseSource) -> Goal:
 
 
 class PlannedMotion(NamedTuple):
-    """Motion that ends at a goal, as the result of planning."""
+    """Result of planning: a motion to a goal, with information for its execution."""
 
     run: Run
     reply: GoalReply
