@@ -1,1 +1,1 @@
-"""Alignment of a part with camera marks: detection of marks, calibration of cameras by stage moves, and corrections."""
+"""Alignment of a part by cameras: detection of marks, calibration of cameras by moves of the stage, and corrections."""

@@ -1,4 +1,4 @@
-"""Arguments of an alignment, checked before the first motion."""
+"""Checks of the arguments of alignments and calibrations, which take place before the first motion."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from trirail.errors import RefusalCode, RefusedError
 
 
 def parse_pixel(value: object) -> Pair | None:
-    """Return two finite numbers as Python floats, None for any other value."""
+    """Return two finite numbers as a pair of Python floats; None for any other value."""
     pair = parse_numbers(value, 2)
     return None if pair is None else (pair[0], pair[1])
 
 
 def parse_numbers(value: object, count: int) -> tuple[float, ...] | None:
-    """Return `count` finite numbers as Python floats, None for any other value."""
+    """Return `count` finite numbers as a tuple of Python floats; None for any other value."""
     if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
         return None
     numbers = [_parse_number(each) for each in value]
@@ -26,7 +26,7 @@ def parse_numbers(value: object, count: int) -> tuple[float, ...] | None:
 
 
 def check_count(value: object, name: str, minimum: int) -> None:
-    """Raise RefusedError unless `value` is a whole number of at least `minimum`."""
+    """Raise RefusedError unless `value` is an integer of at least `minimum`."""
     number = None if isinstance(value, float) else _parse_number(value)
     if number is None or number < minimum:
         _refuse(value, name, f"a whole number of at least {minimum}")
@@ -40,14 +40,14 @@ def check_above_zero(value: object, name: str) -> None:
 
 
 def check_wait(value: object) -> None:
-    """Raise RefusedError unless `value` is a waiting time [s]."""
+    """Raise RefusedError unless `value` is a finite waiting time of 0 s or more."""
     number = _parse_number(value)
     if number is None or not 0.0 <= number < math.inf:
         _refuse(value, "wait", "a finite number of seconds, 0 or more")
 
 
 def check_pose_offset(value: object, name: str) -> None:
-    """Raise RefusedError unless `value` is x, y [m] and phi [rad]."""
+    """Raise RefusedError unless `value` consists of three finite numbers, x, y [m] and phi [rad]."""
     if parse_numbers(value, 3) is None:
         _refuse(value, name, "three finite numbers, x, y [m] and phi [rad]")
 
@@ -59,7 +59,7 @@ def check_approach(value: object) -> None:
 
 
 def check_moves(value: object) -> None:
-    """Raise RefusedError unless `value` lists moves, x, y [m] and phi [rad] each."""
+    """Raise RefusedError unless `value` is a list of moves, each of which consists of x, y [m] and phi [rad]."""
     if not isinstance(value, Iterable) or isinstance(value, str | bytes | Mapping):
         _refuse(value, "moves", "a list of x, y [m] and phi [rad]")
     for each in value:
@@ -67,7 +67,7 @@ def check_moves(value: object) -> None:
 
 
 def check_views(value: object) -> None:
-    """Raise RefusedError unless `value` maps mark names to view names, or is None for one view per mark."""
+    """Raise RefusedError unless `value` is None or maps names of marks to names of views."""
     if value is not None and not (
         isinstance(value, Mapping) and all(isinstance(name, str) for pair in value.items() for name in pair)
     ):
@@ -75,7 +75,7 @@ def check_views(value: object) -> None:
 
 
 def check_lens(lens: object, centre: object) -> None:
-    """Raise RefusedError unless `lens` is one of LENSES and `centre` a pixel."""
+    """Raise RefusedError unless `lens` is one of LENSES and `centre` is a pixel (u, v)."""
     if lens not in LENSES:
         _refuse(lens, "lens", f"one of {', '.join(LENSES)}")
     if parse_pixel(centre) is None:
@@ -83,7 +83,7 @@ def check_lens(lens: object, centre: object) -> None:
 
 
 def check_targets(value: object) -> None:
-    """Raise RefusedError unless `value` maps mark names to target pixels."""
+    """Raise RefusedError unless `value` maps names of marks to target pixels."""
     if not isinstance(value, Mapping):
         _refuse(value, "targets", "{mark: (u, v)} in pixels")
     for name, pixel in value.items():
@@ -92,7 +92,7 @@ def check_targets(value: object) -> None:
 
 
 def _parse_number(value: object) -> float | None:
-    """Return a number of any library as a Python float; None for booleans, strings and other objects."""
+    """Convert a number of any library to a Python float. Return None for booleans, strings and other objects."""
     if isinstance(value, bool | str | bytes) or not any(hasattr(type(value), n) for n in ("__index__", "__float__")):
         return None
     try:

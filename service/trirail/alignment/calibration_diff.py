@@ -1,7 +1,8 @@
-"""Differences between two calibrations of the same cameras, with any part, which show whether a camera was moved.
+"""Comparison of two calibrations of the same cameras, to detect whether a camera was moved. The parts may differ.
 
-A single look cannot tell a shifted camera from a shifted part, because both show the marks in other places. A rotation
-of the stage can: it moves a mark about the stage's centre by an amount that depends on the real position of the mark.
+A single look cannot distinguish a shifted camera from a shifted part, because the marks appear at other pixels in both
+cases. A calibration can, because it rotates the stage: the displacement of a mark in a rotation depends on the real
+distance of the mark from the centre of the stage.
 """
 
 from __future__ import annotations
@@ -16,27 +17,27 @@ from trirail.alignment.images import Pair, locate_pixels, project_points
 from trirail.alignment.rigid_motion import Floats
 
 SIGNIFICANT_DEVIATIONS = 5.0
-"""Standard deviations above which a difference counts as a change."""
+"""Number of standard deviations above which a difference is significant."""
 
 
 class ViewChange(msgspec.Struct, frozen=True):
-    """Change of a view between a saved calibration and the current one."""
+    """Change of a view between a saved calibration and the current calibration."""
 
     view: str
     shift: Pair
-    """Displacement of the marks according to the saved calibration, x, y [m]."""
+    """Error of marks located with the saved calibration, averaged over the marks, x, y [m]."""
     shift_deviation: Pair
     """Standard deviations of `shift` [m]."""
     turn: float
-    """Rotation of the picture, positive from u to v [rad]."""
+    """Rotation of the picture, positive in the direction from u to v [rad]."""
     scale: float
     """Relative change of the scale."""
     deviation: float
-    """Standard deviation of `turn` and of `scale`."""
+    """Standard deviation of `turn` [rad], which is also the standard deviation of `scale`."""
 
     @property
     def is_shifted(self) -> bool:
-        """True if the view has been shifted significantly."""
+        """True if the shift of the view is significant."""
         return any(
             abs(shift) > SIGNIFICANT_DEVIATIONS * deviation
             for shift, deviation in zip(self.shift, self.shift_deviation, strict=True)
@@ -44,12 +45,12 @@ class ViewChange(msgspec.Struct, frozen=True):
 
     @property
     def is_changed(self) -> bool:
-        """True if the view has been shifted, turned or scaled significantly."""
+        """True if the shift, the rotation or the change of scale of the view is significant."""
         return self.is_shifted or max(abs(self.turn), abs(self.scale)) > SIGNIFICANT_DEVIATIONS * self.deviation
 
 
 def compare_views(saved: CameraCalibration, current: CameraCalibration) -> list[ViewChange]:
-    """Return the changes of the views that have marks in both calibrations."""
+    """Return the changes of all views that show marks in both calibrations."""
     return [
         _compare_view(saved, current, view)
         for view in sorted(saved.views.keys() & current.views.keys())
@@ -63,7 +64,8 @@ def _compare_view(saved: CameraCalibration, current: CameraCalibration, view: st
     at = np.array([to_base_frame(mark.place, current.poses[0]) for mark in current.marks.values() if mark.view == view])
     shift = (locate_pixels(before, project_points(after, at)) - at).mean(axis=0)
     deviation = np.hypot(_place_deviations(saved, view), _place_deviations(current, view))
-    # Apart from mirror and skew, both maps are complex numbers: their ratio is the turn and the scale.
+    # Apart from mirroring and skew, each map corresponds to a complex number. The argument of the ratio of both numbers
+    # is the rotation, and the absolute value is the scale.
     ratio = np.array(after.matrix) @ np.linalg.inv(np.array(before.matrix))
     rotation = complex(ratio[0, 0] + ratio[1, 1], ratio[1, 0] - ratio[0, 1]) / 2.0
     map_deviation = math.hypot(*(_map_deviation(each, view) for each in (saved, current)))
@@ -78,12 +80,12 @@ def _compare_view(saved: CameraCalibration, current: CameraCalibration, view: st
 
 
 def _place_deviations(calibration: CameraCalibration, view: str) -> Floats:
-    """Return the greatest standard deviations of the mark positions in a view, (2,) [m]."""
+    """Return the greatest standard deviations of the positions of the marks in a view, in x and y, (2,) [m]."""
     return np.asarray(np.max([mark.deviation for mark in calibration.marks.values() if mark.view == view], axis=0))
 
 
 def _map_deviation(calibration: CameraCalibration, view: str) -> float:
-    """Return the standard deviation of a view's turn, which is that of its relative scale."""
-    # Entries 2 to 5 of the unknowns are M by rows.
+    """Return the standard deviation of the rotation of a view [rad], which equals that of the relative scale."""
+    # Entries 2 to 5 of the unknowns are the elements of M, row by row.
     variances = np.diag(np.array(calibration.covariances[view]))[2:6]
     return float(np.sqrt(variances.sum() / 2.0)) / calibration.views[view].scale / math.sqrt(2.0)

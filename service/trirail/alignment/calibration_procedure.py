@@ -1,4 +1,7 @@
-"""Calibration procedures: generators, as in procedure, that request looks and motions and return a calibration."""
+"""Procedures for the calibration of cameras. They are generators that request looks and motions of a driver.
+
+trirail.alignment.procedure describes the protocol between procedures and drivers.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +21,17 @@ DEFAULT_MOVES: tuple[Triple, ...] = tuple(
     (x * 1e-3, y * 1e-3, math.radians(turn))
     for x, y, turn in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 )
-"""Moves of a calibration relative to its start pose: 1 mm along each axis and 1°, each in both directions."""
+"""Moves of a calibration relative to the start pose: 1 mm along x and y, and 1° of rotation, each in both
+directions."""
 ZERO_OFFSET: Triple = (0.0, 0.0, 0.0)
 PLATFORM_CENTRE: Pair = (0.0, 0.0)
 
 
 def calibration_moves(lens: Lens, by: float, turn: float) -> tuple[Triple, ...]:
-    """Return moves that determine a lens: ±by along x and y [m], ±turn [rad], and into the corners unless affine."""
+    """Return moves with which a lens can be calibrated: ±by along x and y [m], and ±turn [rad].
+
+    For lenses that are not affine, the moves also include the four corners at (±by, ±by).
+    """
     straight = ((by, 0.0), (-by, 0.0), (0.0, by), (0.0, -by))
     corners = () if lens == "affine" else ((by, by), (-by, by), (-by, -by), (by, -by))
     translations = tuple((x, y, 0.0) for x, y in (*straight, *corners))
@@ -39,10 +46,10 @@ def calibrate_by_moves(
     looks: int = 1,
     approach: Triple | None = None,
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
-    """Look at the current pose and after each move from there, return to the start, and calibrate.
+    """Look at the current pose and at poses around it, return to the start pose, and compute the calibration.
 
-    With an `approach`, the platform first reaches its current pose from that side. The other parameters are those of
-    camera_calibration.calibrate.
+    Each of the `moves` is relative to the start pose. If `approach` is given, every motion, including a first motion to
+    the current pose, arrives from this offset. The other parameters are those of camera_calibration.calibrate.
 
     Raises
     ------
@@ -61,7 +68,7 @@ def calibrate_by_moves(
     first = yield from observe_mean(looks)
     observations = [first]
     yield LookReport("calibration", first)
-    # Checked after the first look, which shows the names of the marks, and before any move.
+    # The names of the marks are known after the first look. Check them before any move.
     if views is not None and (unknown := sorted(set(first.marks) - set(views))):
         text = f"marks without a view: {', '.join(unknown)}; name one for each, views names {', '.join(views)}"
         yield LookReport("calibration", end=AlignmentFault.MISSING, words=text)
@@ -84,7 +91,7 @@ def calibrate_by_moves(
 def repeat_calibration(
     saved: CameraCalibration, looks: int = 1
 ) -> Generator[AlignmentRequest, Observation, CameraCalibration]:
-    """Calibrate the same views with the same moves, relative to the current pose."""
+    """Repeat a saved calibration: calibrate the same views with the same moves, relative to the current pose."""
     x, y, phi = saved.poses[0]
     moves = [(each[0] - x, each[1] - y, each[2] - phi) for each in saved.poses[1:]]
     views = {name: mark.view for name, mark in saved.marks.items()}

@@ -1,8 +1,9 @@
-"""Calibration of cameras from moves of the stage: the map of each view, and the positions of the marks on the table.
+"""Calibration of cameras by moves of the stage: the map of each view, and the positions of the marks on the platform.
 
-A mark at q on the platform is at w = t + R(phi) q in the base frame if the platform is at (t, phi). The unknowns of a
-view are its map and the positions q of its marks. Rotations of the stage determine q, and translations determine the
-map. Gauss-Newton starts from the solution that is linear in b, M and M q for small phi.
+If the platform is at the pose (t, phi), a mark at q on the platform is at w = t + R(phi) q in the base frame. The
+unknowns of a view are its map and the positions q of its marks. Rotations of the stage determine q, and translations
+determine the map. For small phi, the problem is linear in b, M and M q. The solution of the linear problem is the
+initial value of a Gauss-Newton iteration.
 """
 
 from __future__ import annotations
@@ -19,20 +20,21 @@ from trirail.alignment.rigid_motion import Floats, rotation_matrix
 from trirail.errors import AlignmentError, AlignmentFault
 
 Marks = Mapping[str, Pair]
-"""Pixels (u, v) of marks by name; a mark that was not found is missing."""
+"""Pixels (u, v) of marks under their names. Marks that were not found are missing."""
 MAX_ITERATIONS = 30
 STEP_TOLERANCE = 1e-12
 MIN_TRAVEL_PX = 3.0
-"""Travel over all moves below which the marks count as unmoved [pixel]."""
+"""Travel of the marks over all moves below which the marks count as unmoved [pixel]."""
 MAX_RESIDUAL_SHARE = 0.1
-"""Residual of a view, as a share of its marks' travel, above which its pictures do not match the moves. One picture
-that is late by a move leaves 0.3 or more of that move; the distortion of a lens leaves a hundredth."""
+"""Residual of a view, as a fraction of the travel of its marks, above which the pictures do not match the moves. If one
+picture is late by one move, the residual is at least 0.3 of this move. Distortion by a lens causes a residual of
+0.01."""
 MAX_CONDITION = 1e6
-"""Condition of the scaled Jacobian above which the moves do not determine all unknowns."""
+"""Condition number of the scaled Jacobian above which the moves do not determine all unknowns."""
 
 
 class CalibrationSample(NamedTuple):
-    """Pixels of the marks with the platform at a pose."""
+    """Pixels of the marks at one pose of the platform."""
 
     pose: tuple[float, float, float]
     """Measured pose x, y [m], phi [rad]."""
@@ -40,38 +42,38 @@ class CalibrationSample(NamedTuple):
 
 
 class MarkFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Fitted position of a mark on the calibrated part."""
+    """Position of a mark on the part that was used for calibration, as determined by the fit."""
 
     view: str
     """Name of the view that shows the mark."""
     place: Pair
-    """Position in the platform's frame, measured from the stage's centre [m]."""
+    """Position in the platform's frame, relative to the centre of the stage [m]."""
     deviation: Pair
     """Standard deviations of `place` [m]."""
 
 
 class CameraCalibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Result of a calibration, in the form in which it is saved to a file."""
+    """Result of a calibration of cameras. Calibration files have the same fields."""
 
     views: dict[str, CameraView]
     marks: dict[str, MarkFit]
     noise: float
-    """Standard deviation of a mark's u or v, computed from the residuals [pixel]."""
+    """Standard deviation of the u or v of a mark in a look, computed from the residuals [pixel]."""
     residuals: tuple[dict[str, Pair], ...]
-    """Observed minus computed pixels of each look and mark."""
+    """Observed minus computed pixels of the marks in each look."""
     poses: tuple[tuple[float, float, float], ...]
     """Pose of the platform at each look: x, y [m], phi [rad]."""
     covariances: dict[str, tuple[tuple[float, ...], ...]]
-    """Covariance of each view's unknowns: b [pixel], M by rows [pixel/m], the lens's bend, its marks' places [m]."""
+    """Covariance of the unknowns of each view: b [pixel], M by rows [pixel/m], distortion of the lens, and positions of
+    the marks [m]."""
     confirmed: bool = False
-    """True once a correction with this calibration has had the predicted effect. Until then, corrections are
-    limited."""
+    """True if a correction with this calibration has had the predicted effect. Otherwise, corrections are limited."""
     looks: int = 1
-    """Pictures averaged in each look; `noise` is the noise of the average."""
+    """Number of pictures that were averaged in each look. `noise` is the noise of the average."""
 
     @property
     def reach(self) -> float:
-        """Greatest distance of a mark from its position at the first look [m]."""
+        """Greatest distance that a mark was moved from its position at the first look [m]."""
         return max(
             float(np.linalg.norm(to_base_frame(mark.place, pose) - to_base_frame(mark.place, self.poses[0])))
             for mark in self.marks.values()
@@ -80,7 +82,7 @@ class CameraCalibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 def to_base_frame(place: Pair, pose: Sequence[float]) -> Floats:
-    """Return the position in the base frame, (2,) [m], of a point of the platform at a pose."""
+    """Return the position in the base frame, (2,) [m], of the point `place` of a platform at a pose."""
     return np.asarray(pose[:2] + rotation_matrix(pose[2]) @ place)
 
 
@@ -91,26 +93,26 @@ def calibrate(
     centre: Pair = (0.0, 0.0),
     looks: int = 1,
 ) -> CameraCalibration:
-    """Return the calibration determined by samples at several poses.
+    """Compute the calibration from the marks that were observed at several poses.
 
     Parameters
     ----------
     samples
         Pixels of the marks at the poses.
     views
-        Name of the view of each mark. Marks with the same view share one fixed camera. If None, every mark has a view
-        of its own, as with two cameras, or with one that is moved to each mark.
+        Name of the view of each mark. Marks with the same view are seen by the same fixed camera. If None, every mark
+        has a separate view. This is the case for two cameras, or for a camera that is moved from mark to mark.
     lens
         Kind of the lens of all views.
     centre
         Pixel on the axis of a radial lens.
     looks
-        Pictures averaged in each sample.
+        Number of pictures that were averaged in each sample.
 
     Raises
     ------
     AlignmentError
-        Too few samples, marks that do not move or do not follow the moves, or moves that leave unknowns undetermined.
+        There are too few samples, the marks do not follow the moves, or the moves do not determine all unknowns.
     """
     names = sorted({name for sample in samples for name in sample.marks})
     view_of = dict(views) if views is not None else {name: name for name in names}
@@ -152,9 +154,9 @@ def calibrate(
 
 
 class _ViewFit:
-    """Least-squares fit of the unknowns of one view: b, M by rows, bend, and the place of each mark.
+    """Least-squares fit of the unknowns of one view: b, M by rows, distortion, and the position of each mark.
 
-    The point o is the position of the first mark at its first look.
+    The point o of the map is the position of the first mark at its first look.
     """
 
     def __init__(self, samples: Sequence[CalibrationSample], names: Sequence[str], lens: CameraView, view: str) -> None:
@@ -252,7 +254,7 @@ class _ViewFit:
         return np.concatenate([solution[2], matrix.ravel(), np.zeros(self.first_place - 6), places.ravel()])
 
     def _scales(self) -> Floats:
-        """Return a unit for each unknown in which all unknowns are about equally well determined."""
+        """Return a unit for each unknown. In these units, all unknowns have similar accuracy."""
         span = max(float(np.ptp(self._seen, axis=0).max()), 1.0)
         travel = max(float(np.ptp(self._t, axis=0).max()), 1e-9)
         turn = max(float(np.ptp(self._phi)), 1e-9)
@@ -262,7 +264,7 @@ class _ViewFit:
 
     def _project(self, x: Points) -> Points:
         """Return the computed pixels, (n, 2). The unknowns may be complex."""
-        # One expression for all poses: the Jacobian calls this once per unknown and iteration.
+        # All poses are computed at the same time for speed: the Jacobian calls this once per unknown and iteration.
         places = x[self.first_place :].reshape(-1, 2)
         q = places[self._mark_index]
         c, s = np.cos(self._phi), np.sin(self._phi)
@@ -271,7 +273,7 @@ class _ViewFit:
         return project_with(at, self._origin(places[0]), x[:2], x[2:6].reshape(2, 2), bend, self._lens)
 
     def _jacobian(self, x: Floats) -> Floats:
-        """Return the derivatives of the computed pixels, using a complex step, which has no cancellation."""
+        """Return the derivatives of the computed pixels by complex steps, which are not affected by cancellation."""
         step = 1e-20
         columns = [self._project(x + 1j * step * axis).imag.ravel() / step for axis in np.eye(len(x))]
         return np.stack(columns, axis=1)

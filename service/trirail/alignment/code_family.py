@@ -1,4 +1,4 @@
-"""Families of coded marks, by the names of OpenCV's dictionaries; without numpy, for the command line."""
+"""Names of the families of coded marks, as in OpenCV. This module does not import numpy, to keep the CLI fast."""
 
 from __future__ import annotations
 

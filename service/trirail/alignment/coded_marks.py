@@ -1,8 +1,8 @@
-"""Marks that show their own name: ArUco and AprilTag codes. OpenCV finds them, and a fit of their shape locates them.
+"""Detection of coded marks (ArUco and AprilTag), which contain a number and cannot be mistaken for each other.
 
-Two round marks can be mistaken for each other, but two codes cannot. OpenCV's detector (Garrido-Jurado et al. 2014,
-Automatic generation and detection of highly reliable fiducial markers under occlusion) reads the number and gives the
-corners. trirail.alignment.finding then fits all edges of the code to obtain its position.
+The detector of OpenCV (Garrido-Jurado et al. 2014, Automatic generation and detection of highly reliable fiducial
+markers under occlusion) reads the number of a code and returns its corners. For an accurate position,
+trirail.alignment.finding then fits all edges of the code.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.shapes import MarkShape
 
 MAX_SKEW = 0.1
-"""Greatest relative difference between a code's sides in a picture. Marks on the table are seen nearly from above."""
+"""Greatest relative difference between the sides of a code in a picture. Codes on the table are seen nearly from above,
+and their sides are nearly equal."""
 
 
 class CodedMark(NamedTuple):
@@ -29,26 +30,27 @@ class CodedMark(NamedTuple):
 
     number: int
     mark: DetectedMark
-    """Position of the middle of the code. `turn` is the direction of its upper side; sizes are relative to OpenCV's
-    side."""
+    """Position of the middle of the code. `turn` is the direction of the upper side. `size` is relative to the side
+    that OpenCV found."""
     side: float
-    """Side of the code with its border [pixel]."""
+    """Length of the side of the code, including its border [pixel]."""
 
 
 def code_shape(family: CodeFamily, number: int, side: float) -> MarkShape:
-    """Return the shape of a code with its border, as printed with the second axis downwards; `side` in any unit.
+    """Return the shape of a code with its border. The second axis points downwards on the printed code.
 
-    Raises ImportError without OpenCV.
+    `side` may have any unit. Raises ImportError if OpenCV is not installed.
     """
     return MarkShape("code", side, cells=_cells(family, number))
 
 
 def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMark]:
-    """Return the codes of a family in a grey picture, (rows, columns). Each number occurs once.
+    """Return the codes of a family in a grey picture, (rows, columns). Each number occurs at most once.
 
-    A code that appears twice is ambiguous and is left out. The picture may be a mirror image of the table. It is
-    therefore read in both orientations, and the one that shows more codes is used, because some codes are their own
-    mirror images. Raises ImportError without OpenCV.
+    Numbers that appear twice are ambiguous and are left out. The picture may be a mirror image of the table. Codes are
+    therefore searched in the picture and in its mirror image, and the orientation with more codes is used. It is not
+    enough that a code is found, because some codes are their own mirror images. Raises ImportError if OpenCV is not
+    installed.
     """
     grey = np.ascontiguousarray(picture, np.uint8)
     detections, reflected = _detect(grey, family), _detect(grey[:, ::-1], family)
@@ -65,7 +67,7 @@ def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMa
         shape = code_shape(family, number, side)
         along = corners[1] + corners[2] - corners[0] - corners[3]
         turn = math.atan2(along[1], along[0])
-        if is_mirrored:  # as printed, its second axis would be to the left of the first
+        if is_mirrored:  # in the picture, the second axis of the code is on the other side of the first axis
             shape = shape._replace(cells=shape.cells[::-1])
         u, v = corners.mean(axis=0).tolist()
         mark = fit_at(np.asarray(grey, float), shape, (u, v), turn)
@@ -75,7 +77,7 @@ def find_codes(picture: NDArray[np.generic], family: CodeFamily) -> list[CodedMa
 
 
 def _detect(grey: NDArray[np.uint8], family: CodeFamily) -> list[tuple[int, Floats]]:
-    """Return numbers and corners, (4, 2) [pixel] from the upper left one clockwise as printed."""
+    """Return number and corners (4, 2) [pixel] of each code, clockwise on the print from the upper left corner."""
     corners, numbers, _ = _detector(family).detectMarkers(np.ascontiguousarray(grey))
     if numbers is None:
         return []
@@ -86,7 +88,7 @@ def _detect(grey: NDArray[np.uint8], family: CodeFamily) -> list[tuple[int, Floa
 
 
 def _mirrored(corners: Floats, columns: int) -> Floats:
-    """Convert corners in the mirrored picture to the original picture."""
+    """Convert corners in the mirror image of a picture to corners in the original picture."""
     return np.column_stack([columns - 1.0 - corners[:, 0], corners[:, 1]])
 
 
@@ -95,7 +97,8 @@ def _detector(family: CodeFamily) -> Any:
     cv2 = importlib.import_module("cv2")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    # A corrected bit may turn the mirror image of one code into another. A wrong name is worse than a missed code.
+    # By error correction, the mirror image of a code could be read as another code. A wrong number is worse than a
+    # missed code.
     parameters.errorCorrectionRate = 0.0
     return cv2.aruco.ArucoDetector(_dictionary(family), parameters)
 

@@ -1,9 +1,9 @@
 """Detection of marks in pictures with subpixel accuracy: a search by correlation, then a fit of the mark's shape.
 
-The model of the picture around a mark is b(R'(p - p0) / s) c(p) + g(p). Gauss-Newton fits place p0, turn, size s and
-the blur of the edges together with contrast c and ground g, both of which have a linear gradient; so uneven light,
-rotation and focus do not bias the place. The search uses normalised correlation (Lewis 1995, Fast Normalized
-Cross-Correlation).
+The model of the picture around a mark is b(R'(p - p0) / s) c(p) + g(p), where b is the brightness of the shape. A
+Gauss-Newton iteration fits the position p0, the rotation R, the size s and the blur of the edges, together with the
+contrast c and the ground g, which both have a linear gradient. Uneven light, rotation and focus therefore do not bias
+the position. The search uses normalised correlation (Lewis 1995, Fast Normalized Cross-Correlation).
 """
 
 from __future__ import annotations
@@ -18,40 +18,40 @@ from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.shapes import MarkShape, brightness
 
 MIN_CORRELATION = 0.5
-"""Correlation above which a place is a candidate for the mark."""
+"""Least correlation of the picture with the shape at the position of a mark."""
 MIN_EXPLAINED_SHARE = 0.8
-"""Share of the picture's variation that the fitted mark must explain."""
+"""Least fraction of the variation of the picture that the fitted mark must explain."""
 MIN_CONTRAST_SHARE = 0.02
-"""Least contrast of a mark, as a share of the picture's range of brightness."""
+"""Least contrast of a mark, as a fraction of the range of brightness in the picture."""
 MAX_FIT_SHIFT = 0.5
-"""Greatest distance between the fitted and the searched place, in nominal sizes."""
+"""Greatest distance between the position from the search and the fitted position, in nominal sizes."""
 SIZE_RANGE = (0.7, 1.4)
-"""Accepted sizes, in nominal sizes."""
+"""Permitted range of the fitted size, in nominal sizes."""
 WINDOW_MARGIN = 0.3
-"""Width of the fitted surroundings of a mark, in nominal sizes."""
+"""Width of the surroundings of a mark that are included in the fit, in nominal sizes."""
 INITIAL_BLUR_PX = 1.2
 MAX_ITERATIONS = 25
 
 
 class DetectedMark(NamedTuple):
-    """Place and properties of a mark in a picture."""
+    """Position and properties of a mark in a picture."""
 
     u: float
-    """Column, 0 in the middle of the first pixel."""
+    """Column; 0 is the middle of the first pixel."""
     v: float
-    """Row, 0 in the middle of the first pixel."""
+    """Row; 0 is the middle of the first pixel."""
     turn: float
-    """Angle of the mark in the picture, from u to v [rad]; 0 for a disc."""
+    """Angle of the mark in the picture, positive from u to v [rad]; 0 for a disc."""
     size: float
-    """Size, in nominal sizes."""
+    """Fitted size divided by the nominal size."""
     contrast: float
-    """Brightness of the mark minus that of the ground; negative for a dark mark."""
+    """Brightness of the mark minus brightness of the ground; negative for a dark mark."""
     fit: float
-    """Share of the picture's variation that the model explains, up to 1."""
+    """Fraction of the variation of the picture that the model explains; 1 is a perfect fit."""
 
 
 def find(picture: NDArray[np.generic], shape: MarkShape, turn: float = 0.0) -> DetectedMark | None:
-    """Return the mark that is most similar to a shape; None if there is none.
+    """Return the mark that is most similar to a shape; None if there is no similar mark.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def find(picture: NDArray[np.generic], shape: MarkShape, turn: float = 0.0) -> D
     shape
         Shape of the mark, in pixels.
     turn
-        Approximate angle [rad]. A cross is found within about 15° of it, a corner within 20°.
+        Approximate angle of the mark [rad]. The error may be about 15° for a cross, and 20° for a corner.
     """
     grey = np.asarray(picture, float)
     if grey.ndim != 2 or min(grey.shape) < shape.size * (1.0 + 2.0 * WINDOW_MARGIN):
@@ -70,12 +70,13 @@ def find(picture: NDArray[np.generic], shape: MarkShape, turn: float = 0.0) -> D
 
 
 def _window_offset(shape: MarkShape, turn: float) -> tuple[float, float]:
-    """Return the offset u, v of the window's middle from the shape's origin [pixel]."""
+    """Return the offset u, v from the origin of the shape to the middle of the window for the fit [pixel]."""
     if shape.kind != "corner":
         return 0.0, 0.0
     half = shape.size / 2.0
     c, s = math.cos(turn), math.sin(turn)
-    # Centred at the tip, the window would be three quarters ground, which carries no information: it moves inwards.
+    # If the window were centred at the tip of a corner, three quarters of it would show ground without information. The
+    # window is therefore shifted into the corner.
     return 0.3 * half * (c - s), 0.3 * half * (s + c)
 
 
@@ -88,7 +89,7 @@ def _render(shape: MarkShape, u: Floats, v: Floats, x: Floats) -> Floats:
 
 
 def _search(grey: Floats, shape: MarkShape, turn: float) -> tuple[float, float] | None:
-    """Return the pixel u, v with the greatest correlation with the shape; None if the correlation is too small."""
+    """Return the pixel u, v at which the correlation with the shape is greatest; None if it is too small everywhere."""
     side = 2 * math.ceil(shape.size * (0.5 + WINDOW_MARGIN)) + 1
     half = side // 2
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
@@ -98,14 +99,14 @@ def _search(grey: Floats, shape: MarkShape, turn: float) -> tuple[float, float] 
     rows, columns = grey.shape
     if side > min(rows, columns):
         return None
-    # Zero padding to the full size keeps the circular convolution of the FFT from wrapping around.
+    # Zero padding to the full size is necessary, because the convolution by FFT is circular.
     full = (rows + side - 1, columns + side - 1)
     flat = grey - grey.mean()
     product = np.fft.irfft2(np.fft.rfft2(flat, full) * np.fft.rfft2(template[::-1, ::-1], full), full)
     valid = product[side - 1 : rows, side - 1 : columns]
     sums, squares = _window_sums(flat, side), _window_sums(flat * flat, side)
     spread = np.sqrt(np.maximum(squares - sums * sums / side**2, 0.0) * (template**2).sum())
-    # The floor keeps the rounding errors of nearly uniform windows from correlating with anything.
+    # The floor prevents high correlations that are due to rounding errors in nearly uniform windows.
     floor = 1e-3 * spread.max() + 1e-9
     correlation = np.abs(valid) / np.maximum(spread, floor)
     best = np.unravel_index(int(correlation.argmax()), correlation.shape)
@@ -115,13 +116,13 @@ def _search(grey: Floats, shape: MarkShape, turn: float) -> tuple[float, float] 
 
 
 def _window_sums(values: Floats, side: int) -> Floats:
-    """Return the sums over all square windows of `side` pixels."""
+    """Return the sum over each square window with a side of `side` pixels."""
     total = np.pad(values.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     return np.asarray(total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side])
 
 
 def fit_at(grey: Floats, shape: MarkShape, start: tuple[float, float], turn: float) -> DetectedMark | None:
-    """Return the mark fitted from a start pixel u, v; None if the fit does not resemble the mark."""
+    """Fit a mark, starting from a pixel u, v and an angle [rad]. Return None if the result does not match the shape."""
     half = shape.size * (0.5 + WINDOW_MARGIN)
     mu, mv = _window_offset(shape, turn)
     rows, columns = grey.shape
@@ -132,10 +133,10 @@ def fit_at(grey: Floats, shape: MarkShape, start: tuple[float, float], turn: flo
     plane = np.stack([np.ones(u.size), (u - start[0]).ravel() / half, (v - start[1]).ravel() / half], axis=1)
     x = np.array([start[0], start[1], 1.0, INITIAL_BLUR_PX, turn])
     steps = np.array([1e-3, 1e-3, 1e-4, 1e-3, 1e-4])
-    free = 4 if shape.kind == "disc" else 5  # a disc has no turn
+    free = 4 if shape.kind == "disc" else 5  # the angle of a disc is not defined
     max_change = np.array([2.0, 2.0, 0.1, 0.5, 0.1])
     for _ in range(MAX_ITERATIONS):
-        # Contrast and ground enter linearly: they are solved exactly for each estimate of the other parameters.
+        # The model is linear in contrast and ground. They are solved exactly for each estimate of the other parameters.
         design = np.hstack([_render(shape, u, v, x).reshape(-1, 1) * plane, plane])
         linear = np.linalg.lstsq(design, window, rcond=None)[0]
         contrast = plane @ linear[:3]

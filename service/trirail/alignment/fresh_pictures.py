@@ -1,9 +1,9 @@
-"""Capture of pictures that show the current pose. Pictures are checked, averaged, and separated from stale ones.
+"""Capture of pictures of the current pose. Pictures are checked and averaged, and stale pictures are recognised.
 
 Between two looks, the platform moves by a measured amount, and the calibration predicts the displacement of each mark.
-A picture that shows the marks elsewhere was either taken before the motion, because the camera buffers pictures, or the
-calibration no longer matches the camera. A single look cannot distinguish these cases. A further picture can, because a
-late camera catches up.
+If a picture shows the marks at other positions, there are two possible causes. The picture was taken before the motion,
+because the camera buffers pictures, or the calibration no longer matches the camera. A single picture cannot
+distinguish these causes. Further pictures can, because a late camera eventually shows the current pose.
 """
 
 from __future__ import annotations
@@ -22,28 +22,29 @@ from trirail.alignment.rigid_motion import Floats, rotation_matrix
 from trirail.errors import AlignmentError, AlignmentFault
 
 MAX_STALE_PICTURES = 5
-"""Number of pictures contradicting the motion after which the capture ends. Video drivers buffer 1 to 4 pictures."""
+"""Number of pictures that contradict the motion after which the capture ends. Video drivers buffer 1 to 4 pictures."""
 NOISE_DEVIATIONS = 4.0
-"""Root mean square errors of a place in the plane beyond which noise does not explain a difference: 1 in 10^7."""
+"""Greatest difference of positions in the plane that is attributed to noise, in root-mean-square errors of a position.
+Noise exceeds this difference in one of 10^7 cases."""
 MAX_MISS_SHARE = 0.2
-"""Share of a motion by which a mark may miss its predicted position. A camera turned by 5°, an error of 5 % in
-scale, or an error of 5 mm in the centre of rotation causes a miss of up to a tenth."""
+"""Greatest distance of a mark from its predicted position, as a fraction of the motion. A camera rotated by 5°, an
+error of the scale by 5 %, or an error of the centre of rotation by 5 mm cause a fraction of up to 0.1."""
 MIN_TRAVEL_SHARE = 0.5
-"""Share of its predicted travel below which a mark counts as unmoved."""
+"""Fraction of the predicted travel below which a mark counts as unmoved."""
 
 
 class PictureFit(NamedTuple):
-    """Agreement of pictures with the preceding motion."""
+    """Pictures after a motion, and their agreement with the motion."""
 
     pictures: Sequence[Observation]
     explained: bool
-    """True if the motion explains the pictures."""
+    """True if the pictures show the marks where the motion should have moved them."""
     still: bool = False
-    """True if the pictures show the marks unmoved, or contradict each other."""
+    """True if the pictures show the marks unmoved, or if the pictures contradict each other."""
 
 
 def capture(count: int) -> Generator[AlignmentRequest, Observation, list[Observation]]:
-    """Return `count` pictures. Raises AlignmentError if one has no valid pixels."""
+    """Request and return `count` pictures. Raises AlignmentError if a picture has invalid pixels."""
     pictures = []
     for _ in range(count):
         pictures.append(validate_picture((yield LOOK)))  # noqa: PERF401 - a comprehension cannot yield
@@ -51,7 +52,7 @@ def capture(count: int) -> Generator[AlignmentRequest, Observation, list[Observa
 
 
 def validate_picture(picture: Observation) -> Observation:
-    """Return a picture with plain floats. Raises AlignmentError unless its marks are {name: (u, v)}."""
+    """Convert the pixels of a picture to Python floats. Raises AlignmentError unless its marks are {name: (u, v)}."""
     marks: object = picture.marks
     if not isinstance(marks, Mapping):
         raise AlignmentError(
@@ -69,7 +70,7 @@ def validate_picture(picture: Observation) -> Observation:
 
 
 def average(pictures: Sequence[Observation]) -> Observation:
-    """Return the mean of pictures. The mean of a mark is taken over the pictures that show it."""
+    """Return the mean of pictures. Each mark is averaged over the pictures that show the mark."""
     seen: dict[str, list[Pair]] = {}
     for each in pictures:
         for name, pixel in each.marks.items():
@@ -86,7 +87,7 @@ def average(pictures: Sequence[Observation]) -> Observation:
 def capture_after_motion(
     calibration: CameraCalibration, before: Observation, count: int, tolerance: float
 ) -> Generator[AlignmentRequest, Observation, PictureFit]:
-    """Return `count` pictures that agree with the motion since `before`, or the last of MAX_STALE_PICTURES that do not.
+    """Capture pictures until `count` of them agree with the motion since `before`, or MAX_STALE_PICTURES contradict it.
 
     Parameters
     ----------
@@ -95,9 +96,9 @@ def capture_after_motion(
     before
         Look before the motion.
     count
-        Pictures per look.
+        Number of pictures per look.
     tolerance
-        Miss of a predicted place that is always accepted [m].
+        Distance of a mark from its predicted position that is always accepted [m].
     """
     fresh: list[Observation] = []
     stale: list[Observation] = []
@@ -107,8 +108,8 @@ def capture_after_motion(
         (fresh if miss <= MAX_MISS_SHARE * travel + tolerance else stale).append(picture)
     if len(fresh) == count:
         return PictureFit(fresh, explained=True)
-    # Several pictures that agree with each other, but not with the motion, contradict the calibration: explained and
-    # still are both False. A camera that is late shows the marks unmoved, or moves them between the pictures.
+    # If the pictures agree with each other, but not with the motion, the calibration is wrong: `explained` and `still`
+    # are False. If the camera is late, the marks are unmoved, or they move from picture to picture.
     newest = stale[-1]
     recent = stale[-min(count, MAX_STALE_PICTURES - 1) :]
     are_equal = all(_compare(calibration, newest, each, 1)[0] <= tolerance for each in recent)
@@ -120,30 +121,37 @@ def capture_after_motion(
 def is_consistent(
     calibration: CameraCalibration, look: Observation, picture: Observation, count: int, tolerance: float
 ) -> bool:
-    """Return True if a picture agrees with a look, the mean of `count` pictures, within a tolerance [m] and noise."""
+    """Return True if a picture agrees with a look within a tolerance [m] and the noise.
+
+    `look` is the mean of `count` pictures.
+    """
     return _compare(calibration, look, picture, count)[0] <= tolerance
 
 
 def observe_mean(count: int) -> Generator[AlignmentRequest, Observation, Observation]:
-    """Return the mean of `count` pictures. The mean of a mark is taken over the pictures that show it."""
+    """Request `count` pictures and return their mean; see `average`."""
     return average((yield from capture(count)))
 
 
 def single_picture_noise(calibration: CameraCalibration) -> float:
-    """Return the standard deviation of a mark's u or v in a single picture [pixel]."""
+    """Return the standard deviation of the u or v of a mark in a single picture [pixel]."""
     return calibration.noise * math.sqrt(calibration.looks)
 
 
 def _compare(
     calibration: CameraCalibration, before: Observation, picture: Observation, count: int
 ) -> tuple[float, float]:
-    """Return the greatest miss of a mark beyond the noise, and the longest predicted travel of one [m]."""
+    """Compare a picture with the prediction from a look and the measured motion.
+
+    Returns the greatest distance of a mark from its predicted position, minus the noise, and the longest predicted
+    travel of a mark [m].
+    """
     miss = travel = 0.0
     for name in sorted(set(before.marks) & set(picture.marks) & set(calibration.marks)):
         view = calibration.views[calibration.marks[name].view]
         start, observed = locate_pixels(view, np.array([before.marks[name], picture.marks[name]]))
         predicted = _move_with_platform(start, before.pose, picture.pose)
-        # Variances in units of one coordinate: 1 for the picture, 1/count for the mean before it; both coordinates.
+        # Variance of the difference: 1 for the picture plus 1/count for the look, in each of two coordinates.
         noise = single_picture_noise(calibration) / view.scale * math.sqrt(2.0 * (1.0 + 1.0 / count))
         miss = max(miss, float(np.linalg.norm(observed - predicted)) - NOISE_DEVIATIONS * noise)
         travel = max(travel, float(np.linalg.norm(predicted - start)))
@@ -151,5 +159,8 @@ def _compare(
 
 
 def _move_with_platform(point: Floats, before: Sequence[float], now: Sequence[float]) -> Floats:
-    """Return a point of the base frame, (2,) [m], after a motion of the platform that carries it between two poses."""
+    """Return the position of a point of the platform, (2,) [m], after the platform has moved between two poses.
+
+    `point` is the position in the base frame before the motion.
+    """
     return np.asarray(now[:2] + rotation_matrix(now[2] - before[2]) @ (point - before[:2]))

@@ -1,7 +1,8 @@
-"""Calibration of a stage with its own cameras: procedure, result, and the parameters that remain undetermined.
+"""Calibration of the geometry of a stage with the cameras that are used for alignment.
 
-The procedure is a generator like those of trirail.alignment.procedure. It looks at a few poses near the current one,
-estimates cameras and marks, plans more poses over the whole travel, looks there, and fits everything together.
+The procedure is a generator like those in trirail.alignment.procedure. It first looks at a few poses near the current
+pose, and estimates the cameras and the positions of the marks. It then plans poses over the whole travel, looks at
+these poses, and fits geometry, encoder scales, cameras and marks to all looks.
 """
 
 from __future__ import annotations
@@ -33,77 +34,84 @@ from trirail.kinematics.robot import inverse
 
 DEFAULT_POSES, MIN_POSES = 30, 12
 GRID = 7
-"""Number of values of x, y and phi from which poses are chosen."""
+"""Number of values of x, of y and of phi in the grid from which poses are chosen."""
 TRAVEL_SHARE = 0.97
-"""Share of the travel that is used, because the configured geometry may be slightly wrong."""
+"""Fraction of the travel that is used. The margin is necessary because the configured geometry may be slightly
+wrong."""
 HELD_OUT = 5
-"""One of this many planned looks is left out of a fit, to check its predictions."""
+"""One of this number of planned looks is excluded from a test fit, to check the predictions of the fit."""
 MIN_FIRST_LOOKS = 5
-"""Number of the seven first looks in which a mark must be visible to be used."""
+"""Least number of the first seven looks in which a mark must be visible. Other marks are not used."""
 MAX_LEFT_OUT = 2
-"""Greatest number of looks of the first moves that may be wrong."""
+"""Greatest number of the first looks that may be wrong."""
 MAX_START_RESIDUAL_PX, MAX_START_SHARE = 1.0, 0.01
-"""Residual up to which the first looks count as correct: in pixels, and as a share of a mark's travel."""
+"""Greatest residual of correct first looks: in pixels, and as a fraction of the travel of a mark. The higher limit
+applies."""
 SYSTEMATIC = 1.5
-"""Ratio of residual to picture noise above which the looks have systematic errors."""
+"""Ratio of residuals to picture noise above which the looks have systematic errors."""
 MIN_NAMED_SHARE = 0.3
-"""Least share of a parameter in an undetermined combination, in units of its doubt, to name it."""
+"""Least weight of a parameter in an undetermined combination at which the parameter is named. The parameters are
+divided by StageModel.doubts."""
 
 
 class HeldOutResidual(NamedTuple):
-    """Root mean square distance of marks from their computed positions, in looks that the fit did not use."""
+    """Root mean square distance of marks from their computed positions, in looks that were excluded from the fit."""
 
     looks: int
+    """Number of excluded looks."""
     before: float
-    """Distance with the configured geometry, and with cameras and marks fitted to it [pixel]."""
+    """Distance with the configured geometry, to which only cameras and marks were fitted [pixel]."""
     after: float
     """Distance with the calibrated geometry [pixel]."""
     before_m: float
-    """Distance with the configured geometry, on the table [m]."""
+    """Distance `before`, converted to a distance on the table [m]."""
     after_m: float
+    """Distance `after`, converted to a distance on the table [m]."""
 
 
 class Outlier(NamedTuple):
-    """Mark that was seen where it cannot have been. The fit does not use it."""
+    """Observation of a mark at a position that does not fit the other observations. The fit does not use it."""
 
     look: int
     """Number of the look, counted from 1."""
     mark: str
     distance: float
-    """Distance from its computed pixel [pixel]."""
+    """Distance of the observed pixel from the computed pixel [pixel]."""
     swapped_with: str | None
-    """Mark at whose computed pixel this mark was seen."""
+    """Name of another mark that should have been seen at this pixel; None if there is no such mark."""
 
 
 class GeometryCalibration(NamedTuple):
-    """Differences of a stage from its configuration, and its cameras."""
+    """Result of a calibration: corrections to the configured geometry, and the cameras."""
 
     geometry: Geometry
     scales: Triple
-    """Real travel of each slider per metre of its encoder, minus 1. Divide counts_per_metre by 1 plus this value."""
+    """Real travel of each slider per metre of encoder reading, minus 1. Divide counts_per_metre by 1 plus this
+    value."""
     parameters: dict[str, float]
-    """Corrections to the configured values, by names such as "A rail_angle" [m, rad, share]."""
+    """Corrections to the configured values [m, rad, 1], with names such as "A rail_angle"."""
     deviations: dict[str, float]
-    """Standard deviations of these corrections; infinite for undetermined parameters."""
+    """Standard deviations of the corrections in `parameters`; infinite for undetermined parameters."""
     undetermined: tuple[str, ...]
-    """Names of the parameters that the looks do not determine, or determine only in combination with others.
-    Undetermined combinations keep their configured values."""
+    """Names of the parameters that the looks do not determine, or determine only in combination with other parameters.
+    Undetermined combinations of parameters keep their configured values."""
     residual: HeldOutResidual
     noise: float
-    """Standard deviation of a mark's u or v, computed from the residuals [pixel]."""
+    """Standard deviation of the u or v of a mark, computed from the residuals [pixel]."""
     picture_noise: float
-    """Standard deviation from the pictures alone, at rest [pixel]. If `noise` is greater, no geometry explains the
-    rest."""
+    """Standard deviation of the u or v of a mark while the stage is at rest [pixel]. If `noise` is greater, the stage
+    has errors that no geometry explains."""
     cameras: CameraCalibration
-    """Cameras and marks in the frame of the new geometry."""
+    """Cameras and marks in the frames of the calibrated geometry."""
     outliers: tuple[Outlier, ...]
     looks: tuple[StageLook, ...]
     map: ResidualMap | None
-    """Map of the errors that remain after the fit; None if they are not systematic, or if there are too few looks."""
+    """Map of the errors that remain after the fit; None if the errors are not systematic, or there are too few
+    looks."""
 
     @property
     def is_systematic(self) -> bool:
-        """True if the errors of the marks exceed their noise, because of errors that no geometry explains."""
+        """True if the residuals clearly exceed the picture noise, which shows errors that no geometry explains."""
         return self.noise > SYSTEMATIC * self.picture_noise
 
 
@@ -111,21 +119,22 @@ class GeometryTask(NamedTuple):
     """Arguments of a calibration of the geometry."""
 
     start: Geometry
-    """Geometry of the configuration, without a correction map."""
+    """Configured geometry, without a correction map."""
     room: Room
     """Limits of platform and sliders."""
     field: Pair
-    """Columns and rows of the pictures."""
+    """Numbers of columns and rows of the pictures."""
     views: Mapping[str, str] | None = None
-    """View of each mark; if None each mark has a camera of its own."""
+    """Name of the view of each mark; if None, each mark has a separate view."""
     lens: Lens = "radial"
     poses: int = DEFAULT_POSES
     looks: int = 4
-    """Pictures averaged at each pose."""
+    """Number of pictures that are averaged at each pose."""
     approach: Triple | None = None
+    """Offset from which every motion arrives, as in StageMotion."""
 
     def check(self) -> None:
-        """Raise RefusedError, with the value and the allowed range, for the first invalid argument."""
+        """Raise RefusedError for the first invalid argument, with the value and the permitted range."""
         arguments.check_count(self.poses, "poses", MIN_POSES)
         arguments.check_count(self.looks, "looks", 1)
         arguments.check_views(self.views)
@@ -138,14 +147,14 @@ class GeometryTask(NamedTuple):
 
 
 def calibrate_geometry(task: GeometryTask) -> Generator[AlignmentRequest, Observation, GeometryCalibration]:
-    """Look at planned poses, return to the first one, and return the calibration.
+    """Look at planned poses, move back to the first pose, and return the calibration.
 
     Raises
     ------
     RefusedError
         An argument is invalid.
     AlignmentError
-        The looks do not determine cameras and marks, or no such stage explains them.
+        The looks do not determine cameras and marks, or no geometry explains the looks.
     """
     task.check()
     if task.approach is not None:
@@ -171,7 +180,7 @@ def calibrate_geometry(task: GeometryTask) -> Generator[AlignmentRequest, Observ
 
 
 class _Scatter:
-    """Scatter of the marks at rest, between the pictures of a look."""
+    """Estimator of the noise of marks, from the differences between the pictures of each look."""
 
     def __init__(self) -> None:
         self._squares: list[float] = []
@@ -187,7 +196,7 @@ class _Scatter:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a look's u or v, the mean of its pictures [pixel]; 0 if each is of one picture."""
+        """Standard deviation of the u or v of a mark in a look [pixel]; 0 if each look consists of one picture."""
         return math.sqrt(float(np.median(self._squares)) / self._pictures) if self._squares else 0.0
 
 
@@ -207,7 +216,10 @@ def _stage_look(start: Geometry, seen: Observation) -> StageLook:
 
 
 def start_model(task: GeometryTask, looks: Sequence[StageLook]) -> tuple[StageModel, Floats, float]:
-    """Return the model, its unknowns and the noise [pixel] by the looks at the first moves. Raises AlignmentError."""
+    """Return a model, first estimates of its unknowns, and the noise [pixel], from the first looks.
+
+    Raises AlignmentError if the looks do not determine cameras and marks.
+    """
     counts = Counter(name for look in looks for name in look.marks)
     names = sorted(name for name, count in counts.items() if count >= min(MIN_FIRST_LOOKS, len(looks)))
     if not names:
@@ -231,7 +243,10 @@ def start_model(task: GeometryTask, looks: Sequence[StageLook]) -> tuple[StageMo
 
 
 def _first_calibration(samples: Sequence[CalibrationSample], views: Mapping[str, str]) -> CameraCalibration:
-    """Return the calibration from as many of the samples as match each other. Raises AlignmentError."""
+    """Return the calibration from the largest number of samples that match each other.
+
+    Up to MAX_LEFT_OUT samples are excluded. Raises AlignmentError if more samples are wrong.
+    """
     failure: AlignmentError | None = None
     for left_out in range(MAX_LEFT_OUT + 1):
         fits: list[CameraCalibration] = []
@@ -252,24 +267,27 @@ def _first_calibration(samples: Sequence[CalibrationSample], views: Mapping[str,
 
 
 def _allowed_residual(samples: Sequence[CalibrationSample]) -> float:
-    """Return the residual up to which the first looks count as correct [pixel]."""
+    """Return the greatest residual of correct first looks [pixel]."""
     spreads = []
     for name in {name for sample in samples for name in sample.marks}:
         seen = np.array([sample.marks[name] for sample in samples if name in sample.marks])
-        # Use the median, so that a single misplaced mark does not raise the limit.
+        # The median is used because a single wrong pixel must not raise the limit.
         spreads.append(float(np.median(np.linalg.norm(seen - np.median(seen, axis=0), axis=1))))
     return max(MAX_START_RESIDUAL_PX, MAX_START_SHARE * max(spreads))
 
 
 def _travel(task: GeometryTask) -> Floats:
-    """Return poses all over the travel, (N, 3) [m, rad], within reach also with the approach."""
+    """Return poses on a grid over the whole travel, (N, 3) [m, rad].
+
+    The intermediate poses of the approach are also within the limits.
+    """
     room = task.room
     axes = []
     for low, high in zip(room.low, room.high, strict=True):
         middle, half = (low + high) / 2.0, TRAVEL_SHARE * (high - low) / 2.0
         axes.append(np.linspace(middle - half, middle + half, GRID))
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    # A slider may go a little beyond both ends on the way between two poses: by 0.2 mm for 5° at 60 mm.
+    # On the way between two poses, a slider may move slightly farther than at either pose: 0.2 mm for 5° at 60 mm.
     margin = -(1.0 - TRAVEL_SHARE) / 2.0 * float(np.ptp(np.atleast_2d(room.position), axis=1).min())
     within = room.holds(travels(task.start, poses), margin)
     if task.approach is not None:
@@ -285,7 +303,10 @@ def _travel(task: GeometryTask) -> Floats:
 def plan(
     task: GeometryTask, model: StageModel, unknowns: Floats, looks: Sequence[StageLook], noise: float
 ) -> list[StageLook]:
-    """Return the poses to look at after the first moves, with the marks to be expected. Raises AlignmentError."""
+    """Return the poses at which to look after the first moves, each with the marks that should be visible.
+
+    Raises AlignmentError if there is no pose at which a mark is visible.
+    """
     poses = _travel(task)
     fields = dict.fromkeys(model.views, task.field)
     candidates = find_candidates(model, unknowns, poses, inverse(task.start, poses).position, fields)
@@ -301,7 +322,10 @@ def plan(
 def solve(
     task: GeometryTask, model: StageModel, looks: Sequence[StageLook], picture_noise: float
 ) -> GeometryCalibration:
-    """Return the calibration by looks; `picture_noise` is that of a mark at rest [pixel]. Raises AlignmentError."""
+    """Compute the calibration from all looks. Raises AlignmentError if no geometry explains the looks.
+
+    `picture_noise` is the standard deviation of the u or v of a mark at rest [pixel].
+    """
     known = tuple(look._replace(marks={n: u for n, u in look.marks.items() if n in model.places}) for look in looks)
     fit = fit_stage(model, known)
     state, geometry = model.state(fit.unknowns), model.geometry(fit.unknowns)
@@ -332,7 +356,7 @@ def solve(
 
 
 def _undetermined(model: StageModel, fit: StageFit) -> tuple[str, ...]:
-    """Return the names of parameters in combinations that these looks do not determine, or no looks can."""
+    """Return the names of the parameters in combinations that these looks, or any looks, do not determine."""
     rest = np.eye(model.legs) - fit.determined @ fit.determined.T
     combinations = model.basis @ rest @ model.basis.T + model.held.T @ model.held
     shares = np.sqrt(np.maximum(np.diag(combinations), 0.0))
@@ -341,7 +365,7 @@ def _undetermined(model: StageModel, fit: StageFit) -> tuple[str, ...]:
 
 
 def _used(looks: Sequence[StageLook], fit: StageFit) -> list[StageLook]:
-    """Return the looks with outliers removed."""
+    """Return the looks without the outliers."""
     used = {each for each, is_used in zip(list_marks(looks), fit.used.tolist(), strict=True) if is_used}
     return [
         look._replace(marks={name: pixel for name, pixel in look.marks.items() if (number, name) in used})
@@ -350,7 +374,10 @@ def _used(looks: Sequence[StageLook], fit: StageFit) -> list[StageLook]:
 
 
 def _held_out(model: StageModel, looks: Sequence[StageLook], fit: StageFit) -> HeldOutResidual:
-    """Return the residuals of every fifth look by fits to the others, with the configured geometry and without."""
+    """Return the residuals in every fifth planned look, for two fits to the other looks.
+
+    One fit keeps the configured geometry, and the other fit calibrates the geometry.
+    """
     used = _used(looks, fit)
     first = len(DEFAULT_MOVES) + 1
     out = [look for number, look in enumerate(used) if number >= first and (number - first) % HELD_OUT == 2]
@@ -394,7 +421,7 @@ def _outliers(fit: StageFit, looks: Sequence[StageLook]) -> tuple[Outlier, ...]:
 def calibrated_cameras(
     model: StageModel, fit: StageFit, looks: Sequence[StageLook], pictures: int
 ) -> CameraCalibration:
-    """Return cameras and marks in the form that trirail.alignment.procedure.align takes."""
+    """Return cameras and marks in the form that trirail.alignment.procedure.align needs."""
     state, poses = model.state(fit.unknowns), model.poses(fit.unknowns, looks)
     marks, covariances = {}, {}
     every = np.arange(model.size)

@@ -1,11 +1,12 @@
-"""Projection of the table's plane into a picture: an affine map about one point, with a distortion by the lens.
+"""Projection of the plane of the table into a picture: an affine map, optionally with perspective or radial distortion.
 
-    s = M (w - o)                         affine, M in pixel/m: scale, turn, skew and mirror
+    s = M (w - o)                         affine, M in pixel/m: scale, rotation, skew and mirroring
     s = M (w - o) / (1 + g . (w - o))     perspective, g in 1/m
     u = b + s                             b is the pixel of the point o
     u = e + d (1 + k |d|²), d = b + s - e   radial, about the pixel e, k in 1/pixel²
 
-w is a point in the base frame [m]. Hartley and Zisserman, Multiple View Geometry, 2nd ed., 2.4 and 7.4.
+w is a point in the base frame [m], and u is its pixel. See Hartley and Zisserman, Multiple View Geometry, 2nd ed., 2.4
+and 7.4.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Lens = Literal["affine", "perspective", "radial"]
-"""Name of one of the maps above."""
+"""Kind of lens, which selects one of the maps in the description of this module."""
 LENSES: tuple[Lens, ...] = get_args(Lens)
 Pair = tuple[float, float]
 Points = NDArray[Any]
-"""Pixels, or metres in the base frame, (n, 2); complex for derivatives by a complex step."""
+"""Pixels, or points in the base frame [m], (n, 2). The values are complex if a derivative is computed by a complex
+step."""
 NEWTON_ITERATIONS = 20
 
 
 class CameraView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Projection of a camera at one place. It shows one or more marks."""
+    """Projection of a camera in a fixed position. The view shows one or more marks."""
 
     origin: Pair
     """Point o of the table's plane [m]."""
@@ -36,19 +38,19 @@ class CameraView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """M [pixel/m]."""
     lens: Lens = "affine"
     bend: Pair = (0.0, 0.0)
-    """Distortion: g of a perspective [1/m], (k, 0) of a radial lens [1/pixel²]."""
+    """Distortion: g for perspective [1/m], (k, 0) for a radial lens [1/pixel²]."""
     centre: Pair = (0.0, 0.0)
     """Pixel e on the axis of a radial lens, usually the middle of the picture."""
 
     @property
     def mirrored(self) -> bool:
-        """True if the picture is a mirror image of the table seen from above; with v downwards it usually is."""
+        """True if the picture is a mirror image of the table seen from above. This is usual, because v points down."""
         (a, b), (c, d) = self.matrix
         return a * d - b * c < 0.0
 
     @property
     def scale(self) -> float:
-        """Geometric mean of the scale over all directions [pixel/m]."""
+        """Scale of the map, averaged geometrically over directions [pixel/m]."""
         (a, b), (c, d) = self.matrix
         return float(abs(a * d - b * c) ** 0.5)
 
@@ -56,9 +58,9 @@ class CameraView(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def project_with(
     points: Points, origin: Points, pixel: Points, matrix: Points, bend: Points, view: CameraView
 ) -> Points:
-    """Return the pixels of points [m], (n, 2) both, for given parameters with the lens and centre of `view`.
+    """Return the pixels (n, 2) of points (n, 2) [m], for given parameters and the lens and centre of `view`.
 
-    The result is analytic in all parameters, so that derivatives may be taken by a complex step.
+    The result is an analytic function of all parameters. Derivatives can therefore be computed by complex steps.
     """
     away = points - origin
     seen = away @ matrix.T
@@ -68,17 +70,17 @@ def project_with(
         return np.asarray(pixel + seen)
     centre = np.asarray(view.centre)
     ideal = pixel + seen - centre
-    # |ideal|² as a plain sum of squares: np.abs and np.linalg.norm are not analytic and would lose the complex step.
+    # Compute |ideal|² as a sum of squares. np.abs and np.linalg.norm are not analytic, and complex steps would fail.
     return np.asarray(centre + ideal * (1.0 + bend[0] * (ideal * ideal).sum(axis=1))[:, None])
 
 
 def project_points(view: CameraView, points: Points) -> Points:
-    """Return the pixels of points of the table's plane [m], (n, 2) both."""
+    """Return the pixels (n, 2) of points (n, 2) in the plane of the table [m]."""
     return np.asarray(project_with(np.asarray(points, float), *_parameters(view), view))
 
 
 def locate_pixels(view: CameraView, seen: Points) -> Points:
-    """Return the points of the table's plane [m] at given pixels, (n, 2) both."""
+    """Return the points (n, 2) in the plane of the table [m] that appear at given pixels (n, 2)."""
     origin, pixel, matrix, bend = _parameters(view)
     seen = np.asarray(seen, float)
     if view.lens == "radial":
@@ -100,7 +102,7 @@ def projection_jacobians(view: CameraView, points: Points) -> NDArray[np.float64
 
 
 def _undistort(distorted: Points, k: float) -> Points:
-    """Return d for given d (1 + k |d|²), using Newton's method on the length of d."""
+    """Return d for given values of d (1 + k |d|²), by Newton's method for the length of d."""
     length = np.linalg.norm(distorted, axis=1)
     d = length.copy()
     for _ in range(NEWTON_ITERATIONS):

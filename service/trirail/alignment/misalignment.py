@@ -1,4 +1,4 @@
-"""Misalignment of a part, computed from the pixels of its marks and of their targets."""
+"""Computation of the misalignment of a part from the pixels of its marks and the pixels of their targets."""
 
 from __future__ import annotations
 
@@ -12,27 +12,28 @@ from trirail.alignment.rigid_motion import Floats, RigidMotion, find_swap, fit_r
 from trirail.errors import AlignmentError, AlignmentFault
 
 MIN_MARKS = 2
-"""Number of marks that determine a part's position and angle."""
+"""Least number of marks that determine the position and the angle of a part."""
 DEFAULT_DISTANCE_ERROR = 1000e-6
-"""Greatest relative error of a distance between marks, by default: 100 µm over 100 mm."""
+"""Default of the greatest relative error of a distance between two marks, equivalent to 100 µm over 100 mm."""
 
 
 class Misalignment(NamedTuple):
-    """Positions of the observed marks, and the rigid motion to their targets."""
+    """Positions of the observed marks, and the rigid motion that moves the marks to their targets."""
 
     names: tuple[str, ...]
     """Names of the observed marks that have a target."""
     positions: Floats
-    """Positions of these marks in the base frame, (n, 2) [m]."""
+    """Positions of the marks `names` in the base frame, (n, 2) [m]."""
     targets: Floats
-    """Targets of these marks in the base frame, (n, 2) [m]."""
+    """Targets of the marks `names` in the base frame, (n, 2) [m]."""
     motion: RigidMotion
+    """Motion that aligns the part."""
     distance: float
-    """Relative error of the distance between two marks, for the worst pair."""
+    """Relative error of the distance between two marks, for the pair with the greatest error."""
 
     @property
     def distances(self) -> Floats:
-        """Distance of each mark's travel in the motion that aligns the part, (n,) [m]."""
+        """Distances that the marks travel in the motion that aligns the part, (n,) [m]."""
         return np.asarray(np.linalg.norm(self.motion.displacements(self.positions), axis=1))
 
     @property
@@ -42,13 +43,13 @@ class Misalignment(NamedTuple):
 
     @property
     def arm(self) -> float:
-        """Greatest distance of a mark from the marks' centroid [m]."""
+        """Greatest distance of a mark from the centroid of the marks [m]."""
         return float(np.linalg.norm(self.positions - self.motion.centroid, axis=1).max())
 
     def deviations(self, noise_share: float = 1.0) -> tuple[float, float]:
-        """Return the root mean square errors of `worst` [m] and of the turn [rad].
+        """Return the root mean square errors of `worst` [m] and of the rotation [rad].
 
-        `noise_share` is the noise of the look as a share of the calibration's.
+        `noise_share` is the noise of the look, divided by the noise of the calibration.
         """
         arms = self.positions - self.motion.centroid
         jacobians = np.zeros((len(arms), 2, 3))
@@ -62,9 +63,9 @@ class Misalignment(NamedTuple):
 def measure_misalignment(
     calibration: CameraCalibration, marks: Marks, targets: Marks, distance: float = DEFAULT_DISTANCE_ERROR
 ) -> Misalignment:
-    """Return the misalignment of a part.
+    """Compute the misalignment of a part.
 
-    The weight of a mark is the inverse covariance of its position, from the calibration's noise.
+    Each mark is weighted by the inverse covariance of its position, which follows from the noise of the calibration.
 
     Parameters
     ----------
@@ -73,12 +74,13 @@ def measure_misalignment(
     marks, targets
         Pixels of the observed marks and of their targets.
     distance
-        Greatest relative error of a distance between marks.
+        Greatest permitted relative error of the distance between two marks.
 
     Raises
     ------
     AlignmentError
-        Fewer than two marks, a target without a view, a wrong distance between marks, or swapped marks.
+        Fewer than two marks were found, a target has no calibrated mark, a distance between marks is wrong, or marks
+        are swapped.
     """
     check_targets_known(calibration, targets)
     names = tuple(sorted(set(marks) & set(targets)))
@@ -90,7 +92,7 @@ def measure_misalignment(
     views = [calibration.views[calibration.marks[name].view] for name in names]
     at = _locate_marks(views, [marks[name] for name in names])
     to = _locate_marks(views, [targets[name] for name in names])
-    # Swapped marks may fail the check of distances as well, whose message would not name the cause.
+    # Check for swapped marks before the check of distances, which may also fail but would not name the cause.
     order = find_swap(at, to)
     if order is not None:
         moved = ", ".join(name for n, name in enumerate(names) if order[n] != n)
@@ -111,7 +113,7 @@ def measure_misalignment(
 
 
 def check_targets_known(calibration: CameraCalibration, targets: Marks) -> None:
-    """Raise AlignmentError unless the calibration has the mark of every target."""
+    """Raise AlignmentError if a target belongs to a mark that is not in the calibration."""
     if unknown := sorted(set(targets) - set(calibration.marks)):
         raise AlignmentError(AlignmentFault.MISSING, f"not in the calibration: {', '.join(unknown)}; calibrate with it")
 

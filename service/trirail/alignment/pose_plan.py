@@ -1,10 +1,11 @@
-"""Plan of the poses whose looks determine a stage best. Poses are chosen one after the other by the information matrix.
+"""Selection of the poses at which looks determine the geometry of a stage most accurately.
 
-The information of looks is A = sum J' J, where J contains the derivatives of the pixels with respect to the unknowns,
-in standard deviations. The mean variance of a mark's computed pixel over the travel is trace(Q A^-1), where Q is the
-mean of J' J over all candidates. This is the I-optimal (or V-optimal) design (Atkinson, Donev and Tobias, Optimum
-Experimental Designs, 2007, 10.6). It does not depend on the frames, because pixels do not, and it is what an alignment
-anywhere in the travel needs. The choice is greedy: each next pose is the candidate that lowers the mean variance most.
+The information matrix of a set of looks is A = sum J' J, where J contains the derivatives of the pixels with respect to
+the unknowns, divided by the standard deviation of a pixel. The mean variance of the computed pixels of marks over the
+travel is trace(Q A^-1), where Q is the mean of J' J over all candidates. The poses should minimise this variance
+(I-optimal or V-optimal design; Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, 10.6). This criterion
+does not depend on the choice of frames, because pixels do not, and it corresponds to the accuracy of alignments over
+the whole travel. The selection is greedy: the next pose is always the candidate that lowers the mean variance most.
 """
 
 from __future__ import annotations
@@ -19,17 +20,18 @@ from trirail.alignment.rigid_motion import Floats
 from trirail.alignment.stage_model import StageLook, StageModel, StageState, carry
 
 FIELD_MARGIN = 0.03
-"""Share of a picture at each border that planned marks avoid, because the first estimate does not include the lens."""
+"""Width of the border of a picture in which no mark is planned, as a fraction of the picture's size. The margin is
+necessary because the first estimate does not include the distortion of the lens."""
 WEAK_PRIOR = 1e-6
-"""Information of each unknown before the first look, as a share of the greatest of all candidates."""
+"""Information about each unknown before the first look, relative to the information in all candidates."""
 
 
 class Candidate(NamedTuple):
-    """Pose that the stage can reach, and the marks that the cameras see there."""
+    """Pose that can be selected, with the marks that the cameras see at this pose."""
 
     look: StageLook
     jacobian: Floats
-    """Derivatives of the marks' pixels with respect to the unknowns, (2 marks, size)."""
+    """Derivatives of the pixels of the marks with respect to the unknowns, (2 times number of marks, size)."""
 
 
 def find_candidates(
@@ -39,7 +41,10 @@ def find_candidates(
     sliders: Floats,
     fields: Mapping[str, Pair],
 ) -> list[Candidate]:
-    """Return the poses at which a mark is in its picture; `fields` is the size of each view's picture [pixel]."""
+    """Return the poses at which at least one mark is inside its picture.
+
+    `fields` are the sizes of the pictures of each view, columns and rows [pixel].
+    """
     state = model.state(unknowns)
     shown = {name: _projected(model, state, name, poses) for name in state.places}
     sizes = {name: np.array(fields[model.view_of[name]]) for name in shown}
@@ -76,7 +81,7 @@ def choose_poses(
     count: int,
     noise: float,
 ) -> list[StageLook]:
-    """Choose `count` candidates in turn, each the one that lowers the mean variance over all candidates most."""
+    """Select `count` candidates one after the other. Each lowers the mean variance over all candidates most."""
     every = np.concatenate([each.jacobian for each in candidates])
     scales = np.maximum(np.linalg.norm(every, axis=0), 1e-300)
     jacobians = [each.jacobian / scales / noise for each in candidates]

@@ -1,7 +1,8 @@
 """Alignment and calibration procedures: generators that request looks and motions, and return a result.
 
-A procedure yields LOOK or a StageMotion and receives an Observation. Its driver has the camera, the robot and the time;
-the procedure itself moves nothing. It also yields a LookReport after each look, whose answer it ignores.
+A procedure yields LOOK or a StageMotion, and its driver sends an Observation. The driver has access to the camera, the
+robot and the clock; the procedure itself has no side effects. After each look, the procedure also yields a LookReport,
+and ignores the answer of the driver.
 """
 
 from __future__ import annotations
@@ -57,17 +58,17 @@ __all__ = [
 ]
 
 DEFAULT_TOLERANCE_M, DEFAULT_ANGLE_RAD = 1e-6, math.radians(5.0 / 3600.0)
-"""Tolerances of a mark's position and of the part's angle: 1 µm, 5 arcsec."""
+"""Default tolerances of the positions of marks and of the angle of the part: 1 µm and 5 arcsec."""
 DEFAULT_CORRECTIONS = 3
 MAX_UNCONFIRMED_TRAVEL = 2.0
-"""Greatest travel of a mark in the first correction with an unconfirmed calibration, as a multiple of its travel in the
-calibration's moves."""
+"""Greatest travel of a mark in a correction with an unconfirmed calibration, as a multiple of
+CameraCalibration.reach."""
 NOISE_LIMIT_DEVIATIONS = 2.0
-"""Number of standard deviations of a look within which an error is not corrected, if the noise exceeds the
-tolerance."""
+"""If the noise of a look exceeds the tolerance, errors that exceed the tolerance by less than this number of standard
+deviations are not corrected."""
 CONFIRMATION_SHARE = 0.2
-"""Greatest miss of the predicted remaining error, as a share of the correction, with which it confirms the
-calibration."""
+"""Greatest difference between the remaining error and its prediction, as a fraction of the correction, with which the
+correction confirms the calibration."""
 
 
 class AlignmentTask(NamedTuple):
@@ -75,22 +76,27 @@ class AlignmentTask(NamedTuple):
 
     calibration: CameraCalibration
     targets: Mapping[str, Pair]
-    """Targets of the marks [pixel]."""
+    """Target pixels of the marks."""
     tolerance: float = DEFAULT_TOLERANCE_M
+    """Greatest distance of a mark from its target [m]."""
     angle: float = DEFAULT_ANGLE_RAD
+    """Greatest error of the angle of the part [rad]."""
     corrections: int = DEFAULT_CORRECTIONS
+    """Greatest number of corrections."""
     distance: float = DEFAULT_DISTANCE_ERROR
+    """Greatest relative error of the distance between two marks."""
     looks: int = 1
-    """Pictures per measurement."""
+    """Number of pictures per measurement."""
     approach: Triple | None = None
+    """Offset from which every motion arrives, as in StageMotion."""
 
     @property
     def noise_share(self) -> float:
-        """Noise of a measurement, as a share of the noise of a look of the calibration."""
+        """Noise of a measurement, divided by the noise of a look of the calibration."""
         return math.sqrt(self.calibration.looks / self.looks)
 
     def check(self) -> None:
-        """Raise RefusedError, with the value and the allowed range, for the first invalid argument."""
+        """Raise RefusedError for the first invalid argument, with the value and the permitted range."""
         calibration: object = self.calibration
         if not isinstance(calibration, CameraCalibration):
             text = f"calibration is {calibration!r:.100}: expected the CameraCalibration that calibrate_camera returns"
@@ -109,10 +115,10 @@ AlignmentProcedure = Generator[AlignmentRequest, Observation, Alignment]
 
 
 def align(task: AlignmentTask) -> AlignmentProcedure:
-    """Measure and correct until the part is within tolerance, no correction is left, or the error grows.
+    """Measure and correct the misalignment of a part until one of the reasons in AlignmentEnd applies.
 
-    A look after a correction counts only if the correction explains it. With an approach, the platform first reaches
-    its current pose from that side.
+    After a correction, success is reported only if the new look agrees with the motion. If an approach is given, the
+    platform first moves to its current pose from this offset.
 
     Raises
     ------
@@ -135,15 +141,15 @@ def align(task: AlignmentTask) -> AlignmentProcedure:
             confirmed = confirmed or (explained and _is_as_predicted(task, measurements, corrections[-1].share))
         end = _end_reason(task, measurements, misalignment.deviations(task.noise_share))
         if end is not None:
-            # Pictures that no motion explains may be stale, so they must not report success.
+            # Pictures that do not agree with the motion may be stale. They must not lead to a report of success.
             if end is AlignmentEnd.REACHED and not explained:
                 raise (yield from _report_stale(look))
             yield LookReport("alignment", look, measurement, end=end)
             seconds = measurements[-1].time - measurements[0].time
             confirmed = confirmed and end is not AlignmentEnd.GROWING
             return Alignment(end, tuple(measurements), tuple(corrections), seconds, confirmed)
-        # A wrong sign or scale shows in the next look, so an unconfirmed calibration may only move about as far as it
-        # has moved the stage itself.
+        # A wrong sign or scale of the calibration is only detected in the next look. With an unconfirmed calibration,
+        # the correction is therefore limited to about the distance that was travelled during the calibration.
         max_travel = MAX_UNCONFIRMED_TRAVEL * task.calibration.reach
         share = 1.0 if confirmed else min(1.0, max_travel / max(misalignment.worst, 1e-12))
         motion = _correction_motion(misalignment, look.pose, share, task.approach)
@@ -156,13 +162,13 @@ def align(task: AlignmentTask) -> AlignmentProcedure:
 def calibrate_and_align(
     task: Callable[[CameraCalibration], AlignmentTask], looks: int, approach: Triple | None
 ) -> AlignmentProcedure:
-    """Calibrate by DEFAULT_MOVES, then align with that calibration."""
+    """Calibrate the cameras by DEFAULT_MOVES, and then align the part with this calibration."""
     calibration = yield from calibrate_by_moves(looks=looks, approach=approach)
     return (yield from align(task(calibration)))
 
 
 def measure_part(task: AlignmentTask) -> Generator[AlignmentRequest, Observation, Measurement]:
-    """Measure the part once, without a motion."""
+    """Measure the misalignment of the part once, without a motion."""
     task.check()
     look = yield from observe_mean(task.looks)
     misalignment = yield from _measure_misalignment(task, look, "check")
@@ -172,10 +178,10 @@ def measure_part(task: AlignmentTask) -> Generator[AlignmentRequest, Observation
 
 
 def _measure_first(task: AlignmentTask) -> Generator[AlignmentRequest, Observation, tuple[Observation, Misalignment]]:
-    """Return the first look and its misalignment. No motion can show that the first look is new.
+    """Return the first look and the misalignment that it shows.
 
-    A look that shows an aligned part is compared with further pictures, because a late camera still shows an earlier
-    state.
+    Before the first look, there is no motion that could reveal a stale picture. If the look shows an aligned part, it
+    is therefore compared with further pictures. A late camera would show other positions in some of them.
     """
     pictures = yield from fresh_pictures.capture(task.looks)
     for _ in range(fresh_pictures.MAX_STALE_PICTURES):
@@ -183,7 +189,7 @@ def _measure_first(task: AlignmentTask) -> Generator[AlignmentRequest, Observati
         newest, tolerance = pictures[-1], 0.5 * task.tolerance
         if all(fresh_pictures.is_consistent(task.calibration, newest, each, 1, tolerance) for each in pictures):
             misalignment = yield from _measure_misalignment(task, look, "alignment")
-            # A stale look that shows an error is found out by the correction; one that shows none would end it.
+            # If a stale look shows an error, the correction reveals it. If it shows no error, there is no correction.
             if not _is_within(task, misalignment):
                 return look, misalignment
             tolerance = _miss_tolerance(task, misalignment)
@@ -201,7 +207,7 @@ def _measure_first(task: AlignmentTask) -> Generator[AlignmentRequest, Observati
 def _measure_again(
     task: AlignmentTask, before: Observation, previous: Misalignment
 ) -> Generator[AlignmentRequest, Observation, tuple[Observation, Misalignment, bool]]:
-    """Return the look after a correction, its misalignment, and True if the correction explains the look.
+    """Return the look after a correction, its misalignment, and True if the look agrees with the correction.
 
     Raises AlignmentError if the pictures show the marks unmoved.
     """
@@ -216,7 +222,7 @@ def _measure_again(
 
 
 def _report_stale(look: Observation) -> Generator[AlignmentRequest, Observation, AlignmentError]:
-    """Report that the pictures do not show the robot's current pose. Return the error to raise."""
+    """Report that the pictures do not show the current pose of the robot. Return the error, which the caller raises."""
     words = (
         f"{fresh_pictures.MAX_STALE_PICTURES} pictures do not show the marks where the motion put them; take a new "
         "picture at each look (a camera's buffer holds old ones), or remove backlash with an approach"
@@ -228,7 +234,7 @@ def _report_stale(look: Observation) -> Generator[AlignmentRequest, Observation,
 def _measure_misalignment(
     task: AlignmentTask, look: Observation, purpose: Literal["alignment", "check"]
 ) -> Generator[AlignmentRequest, Observation, Misalignment]:
-    """Return the misalignment shown by a look; report an error before it is raised."""
+    """Return the misalignment that a look shows. If this fails, yield a report before raising the error."""
     try:
         return measure_misalignment(task.calibration, look.marks, task.targets, task.distance)
     except AlignmentError as error:
@@ -237,7 +243,7 @@ def _measure_misalignment(
 
 
 def _miss_tolerance(task: AlignmentTask, misalignment: Misalignment) -> float:
-    """Return the miss of a mark's predicted position that is always accepted [m]: half of the tolerance."""
+    """Return the distance of a mark from its predicted position that is always accepted [m]: half of the tolerance."""
     return 0.5 * min(task.tolerance, task.angle * misalignment.arm)
 
 
@@ -246,7 +252,7 @@ def _is_within(task: AlignmentTask, misalignment: Misalignment) -> bool:
 
 
 def _has_grown(task: AlignmentTask, before: float, now: float, deviation: float) -> bool:
-    """Return True if an error has grown by more than the tolerance and the noise of both looks."""
+    """Return True if an error has grown by more than the sum of the tolerance and the noise of both looks."""
     return now > before + task.tolerance + fresh_pictures.NOISE_DEVIATIONS * math.sqrt(2.0) * deviation
 
 
@@ -269,14 +275,17 @@ def _measurement(look: Observation, misalignment: Misalignment) -> Measurement:
 def _end_reason(
     task: AlignmentTask, measurements: Sequence[Measurement], deviations: tuple[float, float]
 ) -> AlignmentEnd | None:
-    """Return the reason to end, None to continue; `deviations` are those of the last `worst` [m] and `turn` [rad]."""
+    """Return the reason why the alignment ends after the last measurement; None if it continues.
+
+    `deviations` are the standard deviations of `worst` [m] and `turn` [rad] in the last measurement.
+    """
     now, (place, turn) = measurements[-1], deviations
     is_precise = place <= task.tolerance and turn <= task.angle
     if is_precise and now.worst <= task.tolerance and abs(now.turn) <= task.angle:
         return AlignmentEnd.REACHED
     if len(measurements) > 1 and _has_grown(task, measurements[-2].worst, now.worst, place):
         return AlignmentEnd.GROWING
-    # Within its own noise a further correction is as likely to make the error larger as smaller.
+    # If the error is within the noise, a further correction is as likely to increase the error as to reduce it.
     is_near = (
         now.worst <= task.tolerance + NOISE_LIMIT_DEVIATIONS * place
         and abs(now.turn) <= task.angle + NOISE_LIMIT_DEVIATIONS * turn
@@ -287,13 +296,13 @@ def _end_reason(
 
 
 def _is_as_predicted(task: AlignmentTask, measurements: Sequence[Measurement], share: float) -> bool:
-    """Return True if the last correction, of a share of the error, has left the predicted error."""
+    """Return True if the error after the last correction is as predicted. `share` is the corrected fraction."""
     before, now = (each.worst for each in measurements[-2:])
     return abs(now - (1.0 - share) * before) <= max(task.tolerance, CONFIRMATION_SHARE * share * before)
 
 
 def _correction_motion(misalignment: Misalignment, pose: Triple, share: float, approach: Triple | None) -> StageMotion:
-    """Return the correction about the marks' centroid."""
+    """Return the motion that corrects a fraction `share` of the misalignment, with the marks' centroid as its tool."""
     motion = misalignment.motion
     x, y = (share * motion.shift).tolist()
     tool = rotation_matrix(-pose[2]) @ (motion.centroid - pose[:2])

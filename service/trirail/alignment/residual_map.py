@@ -1,8 +1,8 @@
 """Map of the errors that remain after a calibration of the geometry, computed from the same looks.
 
-The marks in a look show the pose of the platform independently of the legs: it is the rigid motion from their positions
-on the platform to the positions at which the cameras see them. trirail.kinematics.correction_fit makes the map from
-these poses.
+The marks in a look determine the pose of the platform without using the legs: the pose is the rigid motion from the
+positions of the marks on the platform to their positions in the base frame, as seen by the cameras. The map is fitted
+to these poses by trirail.kinematics.correction_fit.
 """
 
 from __future__ import annotations
@@ -23,24 +23,26 @@ from trirail.kinematics.geometry import Geometry, Room
 
 MIN_MARKS = 2
 CELLS = (2, 2, 2)
-"""Number of cells of the map along x, y and phi. 30 to 60 looks cannot determine more."""
+"""Number of cells of the map along x, y and phi. 30 to 60 looks cannot determine a finer map."""
 MAX_LEFT_SHARE = 0.8
-"""Share of the errors at held-out looks above which the map is not offered."""
+"""Remaining fraction of the errors in looks that were not used for the fit, above which the map does not help."""
 
 
 class ResidualMap(NamedTuple):
-    """Correction map, and how well it predicts looks that were held out of the fit."""
+    """Correction map, with the accuracy of its predictions for looks that were not used for the fit."""
 
     correction: Correction
     looks: int
+    """Number of looks to which the map was fitted."""
     before: tuple[float, float]
     """Root mean square pose errors without the map: of x and y [m], and of phi [rad]."""
     after: tuple[float, float]
-    """Root mean square pose errors at each look, with maps that were fitted without this look."""
+    """Root mean square pose errors of x and y [m], and of phi [rad]. For each look, a map fitted without this look is
+    used."""
 
     @property
     def helps(self) -> bool:
-        """True if the map clearly reduces the errors at held-out looks, in position or angle."""
+        """True if the map clearly reduces the errors of position or angle, and increases neither of them."""
         place, angle = (after / max(before, 1e-15) for before, after in zip(self.before, self.after, strict=True))
         return min(place, angle) < MAX_LEFT_SHARE and max(place, angle) <= 1.0
 
@@ -48,7 +50,7 @@ class ResidualMap(NamedTuple):
 def fit_residual_map(
     geometry: Geometry, room: Room, state: StageState, view_of: Mapping[str, str], looks: Sequence[StageLook]
 ) -> ResidualMap | None:
-    """Return the map of a calibrated stage, None if the looks are too few for one or do not cover the travel."""
+    """Return the map for a calibrated stage; None if there are too few looks, or if they do not cover the travel."""
     complete = [look for look in looks if len(look.marks) >= MIN_MARKS]
     if not complete:
         return None
@@ -62,7 +64,7 @@ def fit_residual_map(
 
 
 def _pose(state: StageState, view_of: Mapping[str, str], look: StageLook) -> Floats:
-    """Return the pose of the platform according to the marks alone, (3,) [m, rad]."""
+    """Return the pose of the platform that follows from the marks in a look, without the legs, (3,) [m, rad]."""
     places = np.array([state.places[name] for name in look.marks])
     seen = [locate_pixels(state.views[view_of[name]], np.array([pixel]))[0] for name, pixel in look.marks.items()]
     motion = fit_rigid_motion(places, np.array(seen))

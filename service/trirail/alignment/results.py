@@ -1,4 +1,4 @@
-"""Result of an alignment: the measurements, the corrections between them, and the reason why it ended."""
+"""Result of an alignment: all measurements and corrections, and the reason why the alignment ended."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ class AlignmentEnd(StrEnum):
     """Reason why an alignment ended."""
 
     REACHED = "reached"
-    """Every mark and the part's angle are within tolerance."""
+    """All marks and the angle of the part are within tolerance."""
     CORRECTIONS = "corrections"
-    """The allowed number of corrections has been used."""
+    """The permitted number of corrections has been made, but the part is not within tolerance."""
     GROWING = "growing"
-    """A correction increased the error, because of a wrong sign, a mirrored picture, or a camera that was moved."""
+    """A correction has increased the error. Causes are a wrong sign, a mirrored picture, or a camera that was moved."""
     NOISE = "noise"
-    """The noise of a look exceeds the tolerance, and the remaining error is within that noise."""
+    """The noise of a look exceeds the tolerance, and the remaining error is within the noise."""
 
 
 class Measurement(msgspec.Struct, frozen=True):
-    """Error of the part measured by one look."""
+    """Misalignment of the part, as measured by one look."""
 
     marks: dict[str, Pair]
-    """Pixels of the marks, the mean over the pictures of the look."""
+    """Pixels of the marks, averaged over the pictures of the look."""
     errors: dict[str, Pair]
-    """Displacement of each mark to its target, x, y in the base frame [m]."""
+    """Displacement from each mark to its target, x, y in the base frame [m]."""
     worst: float
     """Greatest distance that a mark travels in the motion that aligns the part [m]."""
     shift: Pair
-    """Displacement of the marks' centroid to its target [m]."""
+    """Displacement from the centroid of the marks to its target [m]."""
     turn: float
-    """Angle between the part and its target, counterclockwise [rad]."""
+    """Rotation that aligns the part, counterclockwise [rad]."""
     misfit: float
-    """Greatest distance of a mark from its target after the best rigid motion [m]."""
+    """Greatest distance of a mark from its target that would remain after the best rigid motion [m]."""
     distance: float
-    """Relative error of the distance between two marks, for the worst pair."""
+    """Relative error of the distance between two marks, for the pair with the greatest error."""
     pose: Triple
     """Measured pose of the platform: x, y [m], phi [rad]."""
     time: float
@@ -50,44 +50,44 @@ class Measurement(msgspec.Struct, frozen=True):
 
 
 class AlignmentCorrection(msgspec.Struct, frozen=True):
-    """Correction motion that has been completed."""
+    """Motion that has been made to correct the misalignment."""
 
     by: Triple
-    """Motion of the marks' centroid: x, y [m]; phi [rad]."""
+    """Motion of the centroid of the marks: x, y [m], phi [rad]."""
     share: float
-    """Corrected share of the measured error. It is below 1 for the first correction with an unconfirmed calibration."""
+    """Fraction of the measured error that was corrected. It may be less than 1 if the calibration is unconfirmed."""
     seconds: float
-    """Time from the preceding look until the robot is at rest [s]."""
+    """Time from the look before the correction until the robot was at rest [s]."""
 
 
 class Alignment(msgspec.Struct, frozen=True):
-    """History of an alignment. It has one more measurement than corrections."""
+    """Result and history of an alignment. The number of measurements is the number of corrections plus one."""
 
     why: AlignmentEnd
     measurements: tuple[Measurement, ...]
     corrections: tuple[AlignmentCorrection, ...]
     seconds: float
-    """Time from the first look to the last."""
+    """Time from the first look to the last look [s]."""
     confirmed: bool
-    """True if a correction with this calibration, here or before, had the predicted effect."""
+    """True if a correction with this calibration, in this or an earlier alignment, had the predicted effect."""
 
     @property
     def reached(self) -> bool:
-        """True if every mark and the part's angle are within tolerance."""
+        """True if all marks and the angle of the part are within tolerance."""
         return self.why is AlignmentEnd.REACHED
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """Names of the observed marks, sorted: the rows of `residuals`."""
+        """Names of the observed marks in alphabetical order, which is the order of the rows of `residuals`."""
         return tuple(sorted({name for each in self.measurements for name in each.errors}))
 
     @property
     def residuals(self) -> Floats:
-        """Distance of each mark from its target at each look, (marks, looks) [m]; NaN for a mark that was not found."""
+        """Distances of the marks from their targets, (marks, looks) [m]; NaN if a mark was not found in a look."""
         errors = [[each.errors.get(name, (math.nan, math.nan)) for each in self.measurements] for name in self.marks]
         return np.asarray(np.linalg.norm(errors, axis=2))
 
     @property
     def angle(self) -> float:
-        """Angle of the part at the last look [rad]."""
+        """Rotation that would still be needed to align the part after the last look [rad]."""
         return self.measurements[-1].turn

@@ -1,10 +1,10 @@
-"""The rigid motion that takes points to their targets, by weighted least squares with the exact rotation.
+"""Fit of the rigid motion that moves points to their targets, by weighted least squares with an exact rotation.
 
     q_i = m + s + R(delta) (p_i - m) + r_i,   minimal sum of r_i' W_i r_i
 
-p_i are the points, q_i their targets, m the centroid of the points, s the shift of the centroid and delta the turn
-about it. The closed solution for equal weights (Kabsch 1976, one arc tangent in the plane) starts a Gauss-Newton
-iteration.
+p_i are the points, q_i are their targets, m is the centroid of the points, s is the shift of the centroid, and delta is
+the rotation about the centroid. For equal weights, there is a closed solution (Kabsch 1976; an arc tangent in the
+plane). It is the initial value of a Gauss-Newton iteration.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 ITERATIONS = 8
 MAX_PERMUTED_MARKS = 6
-"""Number of marks up to which find_swap tries all permutations."""
+"""Greatest number of marks for which find_swap tries all permutations."""
 MAX_SWAP_SHARE = 0.25
-"""A permutation counts as a swap if it leaves less than this share of the sum of squared distances."""
+"""A permutation counts as a swap if it reduces the sum of squared distances to less than this fraction."""
 
 
 class RigidMotion(NamedTuple):
-    """Motion that takes points to their targets, with its residuals and covariance."""
+    """Rigid motion that moves points to their targets, with residuals and covariance."""
 
     centroid: Floats
     """Centroid of the points before the motion, (2,) [m]."""
@@ -35,12 +35,13 @@ class RigidMotion(NamedTuple):
     misfit: Floats
     """Residual of each point, (n, 2) [m]."""
     chi_squared: float
-    """Weighted sum of squares of the residuals; it has 2n - 3 degrees of freedom if the weights are right."""
+    """Weighted sum of squares of the residuals. If the weights are correct, it is chi-squared distributed with 2n - 3
+    degrees of freedom."""
     covariance: Floats
-    """Covariance of shift and turn, (3, 3) [m, rad]."""
+    """Covariance of shift and rotation, (3, 3) [m, rad]."""
 
     def displacements(self, points: Floats) -> Floats:
-        """Return the displacements of points by the motion, (n, 2) both [m]."""
+        """Return the displacements (n, 2) of points (n, 2) in this motion [m]."""
         arms = points - self.centroid
         return np.asarray(self.shift + arms @ rotation_matrix(self.turn).T - arms)
 
@@ -52,21 +53,21 @@ def rotation_matrix(angle: float) -> Floats:
 
 
 def fit_rigid_motion(points: Floats, targets: Floats, weights: Floats | None = None) -> RigidMotion:
-    """Return the rigid motion from points to targets.
+    """Return the rigid motion that moves points as close as possible to their targets.
 
     Parameters
     ----------
     points, targets
-        Positions, (n, 2) both [m]; at least two points, at different places.
+        Positions of at least two different points and of their targets, (n, 2) each [m].
     weights
-        Inverse covariances of targets - points, (n, 2, 2) [1/m²]; equal if None.
+        Inverse covariances of targets - points, (n, 2, 2) [1/m²]; if None, all weights are equal.
     """
     w = np.broadcast_to(np.eye(2), (len(points), 2, 2)) if weights is None else weights
     centroid = points.mean(axis=0)
     arms, goals = points - centroid, targets - targets.mean(axis=0)
     turn = float(np.arctan2((arms[:, 0] * goals[:, 1] - arms[:, 1] * goals[:, 0]).sum(), (arms * goals).sum()))
     shift = targets.mean(axis=0) - centroid
-    # The closed solution is the minimum for equal weights only; Gauss-Newton takes the full covariances into account.
+    # The closed solution is the minimum only for equal weights. Gauss-Newton takes the full covariances into account.
     for _ in range(ITERATIONS):
         rotated = arms @ rotation_matrix(turn).T
         residuals = targets - centroid - shift - rotated
@@ -82,16 +83,16 @@ def fit_rigid_motion(points: Floats, targets: Floats, weights: Floats | None = N
 
 
 def worst_distance_error(points: Floats, targets: Floats) -> float:
-    """Return the relative error of the distance between two points, for the worst pair."""
+    """Return the relative error of the distance between two points, for the pair with the greatest error."""
     pairs = list(itertools.combinations(range(len(points)), 2))
     errors = [np.linalg.norm(points[i] - points[j]) / np.linalg.norm(targets[i] - targets[j]) - 1.0 for i, j in pairs]
     return float(max(errors, key=abs))
 
 
 def find_swap(points: Floats, targets: Floats) -> tuple[int, ...] | None:
-    """Return the order of the points that is much closer to the targets; None if it is their own order.
+    """Return an order of the points in which they are much closer to the targets; None if there is no such order.
 
-    The points of a part that is turned by less than 90° are closest in their own order.
+    Points that are in the correct order are closest to the targets if the part is rotated by less than 90°.
     """
     if len(points) > MAX_PERMUTED_MARKS:
         return None

@@ -1,7 +1,7 @@
-"""Shapes of marks, for detection and simulation: crosses, discs, corners and codes with edges blurred by a lens.
+"""Shapes of marks for detection and simulation: crosses, discs, corners and codes, with blurred edges.
 
-The origin of a shape's frame is its middle; that of a corner is the tip. The brightness is 1 inside and 0 outside;
-across an edge it follows the logistic function nearest to a Gaussian's integral.
+The origin of the frame of a shape is its middle; for a corner, the origin is the tip. The brightness is 1 inside and 0
+outside. Across an edge, the brightness follows the logistic function that is closest to the integral of a Gaussian.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from trirail.alignment.rigid_motion import Floats
 
 MarkKind = Literal["cross", "disc", "corner", "code"]
 LOGISTIC_SLOPE = 1.702
-"""1 / (1 + exp(-1.702 x)) is within 0.01 of the Gaussian's integral."""
+"""Slope with which 1 / (1 + exp(-slope x)) differs from the integral of a Gaussian by less than 0.01."""
 
 
 class MarkShape(NamedTuple):
@@ -22,20 +22,21 @@ class MarkShape(NamedTuple):
 
     kind: MarkKind
     size: float
-    """Diameter of a disc, length of a cross's bars, or side of a corner's square or of a code with its border."""
+    """Diameter of a disc, length of the bars of a cross, side of the square of a corner, or side of a code with its
+    border."""
     width: float = 0.0
-    """Width of a cross's bars; 0 means a fifth of their length."""
+    """Width of the bars of a cross; 0 means a fifth of their length."""
     cells: tuple[tuple[int, ...], ...] = ()
-    """Rows of a code's cells with its border, in the direction of v: 1 for ink, 0 for ground."""
+    """Rows of the cells of a code, including the border, in the direction of v. Ink is 1 and ground is 0."""
 
     @property
     def bar_width(self) -> float:
-        """Width of a cross's bars, with the default applied."""
+        """Width of the bars of a cross, with the default applied."""
         return self.width or self.size / 5.0
 
 
 def brightness(shape: MarkShape, x: Floats, y: Floats, blur: float) -> Floats:
-    """Return the brightness of a shape at points of its frame; `blur` is the standard deviation of its edges."""
+    """Return the brightness of a shape at points in its frame. `blur` is the standard deviation of blurred edges."""
     half = shape.size / 2.0
     if shape.kind == "disc":
         return _blurred_step(half - np.hypot(x, y), blur)
@@ -47,14 +48,15 @@ def brightness(shape: MarkShape, x: Floats, y: Floats, blur: float) -> Floats:
     across, up = np.abs(x), np.abs(y)
     horizontal = _blurred_step(half - across, blur) * _blurred_step(shape.bar_width / 2.0 - up, blur)
     vertical = _blurred_step(half - up, blur) * _blurred_step(shape.bar_width / 2.0 - across, blur)
-    # Union of both bars, smooth also where their edges meet.
+    # The union of both bars is smooth, including the points at which their edges meet.
     return np.asarray(1.0 - (1.0 - horizontal) * (1.0 - vertical))
 
 
 def _code_brightness(shape: MarkShape, x: Floats, y: Floats, blur: float) -> Floats:
     cells = np.array(shape.cells, float)
     edges = shape.size * (np.arange(len(cells) + 1) / len(cells) - 0.5)
-    # Differences of steps, which add up to one step over cells of the same kind: no seam between them.
+    # Each cell is a difference of two steps. The steps between neighbouring cells with ink cancel, without a visible
+    # line.
     along, down = (-np.diff(_blurred_step(at[..., None] - edges, blur), axis=-1) for at in (x, y))
     return np.asarray(np.einsum("...i,ij,...j->...", down, cells, along))
 

@@ -1,4 +1,4 @@
-"""Simulated camera that renders the marks of a part on the table at the robot's real pose."""
+"""Simulated camera, which renders the marks of a part on the table at the real pose of the robot."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class DrawnMark(NamedTuple):
 
 
 class SimulatedCamera(NamedTuple):
-    """Projection of a camera, its marks, and the imperfections of its pictures.
+    """Camera with its projection, the marks that it can see, and the imperfections of its pictures.
 
-    Light falls off towards the corners by a share `shade`. `noise` is the standard deviation of a pixel's brightness,
-    on a scale of 255. A picture is exposed for `exposure` seconds; the exposure ends `delay` seconds before the picture
-    is read.
+    `shade` is the fraction by which the light decreases towards one corner. `noise` is the standard deviation of the
+    brightness of a pixel, on a scale from 0 to 255. Each picture is exposed for `exposure` seconds. The exposure ends
+    `delay` seconds before the picture is read.
     """
 
     view: CameraView
@@ -49,7 +49,7 @@ class SimulatedCamera(NamedTuple):
     delay: float = 0.0
 
     def picture(self, pose_at: Callable[[float], Triple], time: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Return the grey picture read at a time [s], (rows, columns). `pose_at` gives the robot's pose at a time."""
+        """Return the grey picture (rows, columns) that is read at a time [s]. `pose_at` returns the pose at a time."""
         end = time - self.delay
         if self.exposure > 0.0:
             instants = end - self.exposure * (np.arange(EXPOSURE_SAMPLES) + 0.5) / EXPOSURE_SAMPLES
@@ -61,7 +61,7 @@ class SimulatedCamera(NamedTuple):
         return np.clip(np.rint(shown), 0, MAX_BRIGHTNESS).astype(np.uint8)
 
     def pixels_at(self, pose: Triple) -> dict[str, Pair]:
-        """Return the exact pixels of the marks for a platform pose, including marks outside of the picture."""
+        """Return the exact pixels of all marks for a pose of the platform, including marks outside the picture."""
         points = {
             name: project_points(self.view, to_base_frame(mark.place, pose)[None])[0]
             for name, mark in self.marks.items()
@@ -78,7 +78,8 @@ class SimulatedCamera(NamedTuple):
             at = to_base_frame(mark.place, pose)[None]
             (u, v), jacobian = project_points(self.view, at)[0], projection_jacobians(self.view, at)[0]
             reach = 1.5 * mark.shape.size * float(np.abs(jacobian).max()) + 5.0 * self.blur
-            # Only the window around a mark is rendered. Beyond five blurs from its edges, a mark adds nothing.
+            # Only a window around the mark is rendered. At a distance of five blurs from its edges, a mark is
+            # invisible.
             top, bottom = (int(np.clip(v + d, 0, self.rows)) for d in (-reach, reach + 1))
             left, right = (int(np.clip(u + d, 0, self.columns)) for d in (-reach, reach + 1))
             if top >= bottom or left >= right:

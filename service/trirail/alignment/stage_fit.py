@@ -1,8 +1,9 @@
-"""Robust fit of a stage model to looks. Outliers are left out, and undetermined combinations keep configured values.
+"""Robust fit of a stage model to looks. Outliers are excluded, and undetermined combinations keep configured values.
 
-The residuals are weighted by their own noise, which is estimated from their median. A first fit with a soft loss (soft
-l1, Triggs et al. 2000, Bundle Adjustment, 4.3) finds the outliers. The last fit is least squares without them. In both
-fits, the drawings count as one more observation of each correction, with the doubts of trirail.alignment.stage_model.
+The noise is estimated from the median of the residuals. A first fit with a robust loss function (soft l1; Triggs et al.
+2000, Bundle Adjustment, 4.3) finds the outliers. The last fit is a least-squares fit without the outliers. In both
+fits, the drawings are treated as an additional observation of each correction, with the standard deviations
+StageModel.doubts.
 """
 
 from __future__ import annotations
@@ -18,38 +19,40 @@ from trirail.alignment.stage_model import StageLook, StageModel, list_marks
 from trirail.errors import AlignmentError, AlignmentFault, KinematicsError
 
 OUTLIER_DEVIATIONS = 6.0
-"""Distance of a mark from its computed pixel, in standard deviations, above which it is an outlier."""
+"""Distance of a mark from its computed pixel above which the observation is an outlier, in standard deviations."""
 MIN_NOISE_PX = 0.01
 MAX_OUTLIER_SHARE = 0.3
 TOLERANCE = 1e-12
 MAX_EVALUATIONS = 100
 MAX_ROUNDS = 6
 RAYLEIGH_MEDIAN = 1.1774
-"""Median of the distance in the plane, in standard deviations of one coordinate."""
+"""Median of the distance of normally distributed points from their mean in the plane, in standard deviations of one
+coordinate."""
 
 
 class StageFit(NamedTuple):
-    """Unknowns of a stage model, fitted to looks."""
+    """Result of the fit of a stage model to looks."""
 
     unknowns: Floats
     covariance: Floats
     """Covariance of the unknowns, (size, size); zero for combinations that keep their configured values."""
     determined: Floats
-    """Orthonormal basis of the leg unknowns that the looks determine, (legs, K)."""
+    """Orthonormal basis of the combinations of leg unknowns that the looks determine, (legs, K)."""
     noise: float
-    """Standard deviation of a mark's u or v, computed from the residuals [pixel]."""
+    """Standard deviation of the u or v of a mark, computed from the residuals [pixel]."""
     residuals: Floats
     """Observed minus computed pixels, (n, 2), in the order of list_marks."""
     used: NDArray[np.bool]
-    """True for each mark that is not an outlier, (n,)."""
+    """True for each observation that is not an outlier, (n,), in the order of list_marks."""
 
 
 def fit_stage(
     model: StageModel, looks: Sequence[StageLook], start: Floats | None = None, *, fixed_legs: bool = False
 ) -> StageFit:
-    """Fit a model to looks, starting from the configured stage or from `start`; `fixed_legs` keeps the legs unchanged.
+    """Fit a model to looks, starting from the configured stage or from the unknowns `start`.
 
-    Raises AlignmentError if the looks are too few, or do not match the moves.
+    If `fixed_legs` is set, only cameras and marks are fitted. Raises AlignmentError if there are too few looks, or if
+    the marks do not follow the moves.
     """
     marks = list_marks(looks)
     unknowns = model.initial() if start is None else start
@@ -58,7 +61,7 @@ def fit_stage(
         raise AlignmentError(
             AlignmentFault.MOVES, f"{len(marks)} marks seen over {len(looks)} looks are too few: add looks or marks"
         )
-    if fixed_legs:  # the configured legs must explain what the true ones do, so nothing is an outlier
+    if fixed_legs:  # with wrong legs, correct observations could appear as outliers: use all observations
         free = np.eye(model.size)[:, model.legs :]
         return _result(model, looks, _minimise(model, looks, unknowns, used, free, 1.0, robust=False), used, free)
     unknowns = _minimise(model, looks, unknowns, used, np.eye(model.size), 1.0, robust=True)
@@ -97,9 +100,9 @@ def _result(
 
 
 def leg_information(model: StageModel, jacobian: Floats) -> Floats:
-    """Return the information that looks contain about the legs, with cameras and marks unknown: rows (., legs).
+    """Return rows (., legs) with the information that looks contain about the legs if cameras and marks are unknown.
 
-    `jacobian` contains the derivatives of the pixels in standard deviations, (n, 2, size).
+    `jacobian` contains the derivatives of the pixels, divided by their standard deviation, (n, 2, size).
     """
     rows = jacobian.reshape(-1, model.size)
     legs, others = rows[:, : model.legs], rows[:, model.legs :]
@@ -109,7 +112,7 @@ def leg_information(model: StageModel, jacobian: Floats) -> Floats:
 
 
 def _determined(model: StageModel, jacobian: Floats) -> Floats:
-    """Return a basis (size, K) of the unknowns that the looks determine better than drawings do."""
+    """Return a basis (size, K) of the combinations of unknowns that looks determine more accurately than drawings."""
     _, values, directions = np.linalg.svd(leg_information(model, jacobian), full_matrices=False)
     known = directions[values > 1.0].T
     basis = np.zeros((model.size, known.shape[1] + model.size - model.legs))
@@ -130,14 +133,15 @@ def _minimise(
 ) -> Floats:
     from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
-    # Drawings count as one more observation of each correction. Otherwise, legs would explain the noise of few looks.
+    # The drawings are an additional observation of each correction. Otherwise, the noise of a small number of looks
+    # would cause large corrections of the legs.
     prior = np.eye(model.legs, model.size) @ basis
 
     def residuals(step: Floats) -> Floats:
         try:
             seen = model.residuals(unknowns + basis @ step, looks)[used].ravel() / noise
         except KinematicsError:
-            return np.full(2 * int(used.sum()) + len(prior), np.inf)  # too far: the solver takes a part of the step
+            return np.full(2 * int(used.sum()) + len(prior), np.inf)  # the solver will shorten the step
         return np.concatenate([seen, unknowns[: model.legs] + prior @ step])
 
     def jacobian(step: Floats) -> Floats:

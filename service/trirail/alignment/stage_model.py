@@ -1,17 +1,19 @@
-"""Model of everything that a look depends on: legs, encoder scales, cameras and marks, with its derivatives.
+"""Model of a stage with cameras: the pixels of marks as functions of legs, encoder scales, cameras and marks.
 
-If the sliders read m, leg i is at (1 + k_i) m_i. Forward kinematics give the platform's pose (t, phi). A mark at q on
-the platform is at w = t + R(phi) q, and its camera shows it at the pixel u(w) (trirail.alignment.images).
+If the reading of slider i is m_i, its real position is (1 + k_i) m_i. The forward kinematics give the pose (t, phi) of
+the platform. A mark at q on the platform is at w = t + R(phi) q in the base frame, and appears at the pixel u(w) of its
+camera (trirail.alignment.images).
 
-Pixels alone do not determine everything, wherever the stage looks. Three kinds of change are invisible:
+Some changes have no effect on the pixels at any pose, and cannot be determined from looks:
 
-- the base frame moves with the rails and the cameras, or the platform's frame with its edges or pivots and the marks;
-- all lengths grow by one factor, because a pixel has no size of its own;
-- two parameters of a leg compensate each other exactly, such as the rail angle and the encoder scale of a 3-PPR leg.
+- The base frame moves together with the rails and the cameras, or the platform's frame moves together with the edges or
+  pivots and the marks.
+- All lengths are multiplied by the same factor, because the real size of a pixel is unknown.
+- Two parameters of a leg compensate each other exactly, such as the rail angle and the encoder scale of a 3-PPR leg.
 
-The model therefore uses the frames in which the corrections to the configured legs are least (root mean square, with
-0.2 mm counted as much as 0.5 mrad or 500 ppm of scale). The unit of length is the mean of the three encoders. The third
-kind of change keeps the configured values.
+The frames are therefore chosen so that the corrections to the configured legs are as small as possible (root mean
+square, with equal weights for 0.2 mm, 0.5 mrad, and 500 ppm of an encoder scale). The unit of length is defined by the
+mean of the three encoder scales. Parameters that compensate each other keep their configured values.
 """
 
 from __future__ import annotations
@@ -31,26 +33,27 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import forward, inverse, jacobians
 
 LENGTH_DOUBT_M, ANGLE_DOUBT_RAD, SCALE_DOUBT = 2e-4, 5e-4, 5e-4
-"""Standard deviations above which drawings and data sheets are as good as the looks."""
+"""Standard deviations of the parameters in drawings and data sheets. A fit with greater standard deviations has no
+benefit."""
 INVISIBLE = 1e-9
-"""Singular value, as a share of the greatest one, below which no look shows a change."""
+"""Singular value, relative to the greatest singular value, below which a change has no effect on any look."""
 LENS_NUMBERS = {"affine": 0, "perspective": 2, "radial": 3}
-"""Number of parameters of a lens in addition to its affine map: g of a perspective; k and the centre of a radial
+"""Number of parameters of a lens in addition to the affine map: g for perspective, k and the centre for a radial
 lens."""
 
 
 class StageLook(NamedTuple):
-    """Marks that were seen, and the readings of the sliders."""
+    """Pixels of the observed marks, with the readings of the sliders."""
 
     sliders: tuple[float, float, float]
-    """Positions according to the configured encoder scales, A, B, C [m]."""
+    """Positions of the sliders A, B, C, computed with the configured encoder scales [m]."""
     pose: tuple[float, float, float]
-    """Pose according to the configured geometry: x, y [m], phi [rad]."""
+    """Pose x, y [m], phi [rad], computed with the configured geometry."""
     marks: Marks
 
 
 class StageState(NamedTuple):
-    """Values of the model's unknowns."""
+    """Parameters of legs, encoders, cameras and marks, converted from the unknowns of the model."""
 
     corrections: Floats
     """Corrections to the parameters of legs A, B, C, (3, 5) [m, rad]."""
@@ -62,14 +65,16 @@ class StageState(NamedTuple):
 
 
 class StageModel:
-    """Pixels of marks as a function of the unknowns: corrections of the legs in a basis, views and mark positions.
+    """Model that computes the pixels of marks from a vector of unknowns.
+
+    The unknowns are the visible corrections of legs and encoder scales, the views, and the positions of the marks.
 
     Parameters
     ----------
     start
         Configured geometry, without a correction map.
     samples
-        Poses in the stage's travel, (N, 3) [m, rad], from which the invisible changes are determined.
+        Poses within the travel of the stage, (N, 3) [m, rad], from which the invisible changes are determined.
     views, places
         First estimates of the cameras and of the positions of the marks on the platform.
     view_of
@@ -90,7 +95,7 @@ class StageModel:
         self.doubts = np.array([_doubt(name) for _, name in self.parameters])
         rows = _pose_changes(start, start, samples, inverse(start, samples).position) * self.doubts
         self.basis, self.held = _visible(rows, samples, self.doubts)
-        """Orthonormal basis of the visible corrections in units of `doubts`, (18, K)."""
+        """Orthonormal basis of the visible corrections, in units of `doubts`, (18, K)."""
         self._view_at, self._mark_at, at = {}, {}, self.basis.shape[1]
         for name, view in self.views.items():
             self._view_at[name] = at
@@ -102,20 +107,20 @@ class StageModel:
 
     @property
     def legs(self) -> int:
-        """Number of unknowns that belong to the legs and encoders. They come first."""
+        """Number of unknowns of the legs and encoders, which are the first unknowns."""
         return int(self.basis.shape[1])
 
     def view_unknowns(self, name: str) -> slice:
-        """Return the slice of the unknowns that belongs to a view: b, M by rows, lens."""
+        """Return the slice of the unknowns for a view: b, M by rows, and the parameters of the lens."""
         at = self._view_at[name]
         return slice(at, at + 6 + LENS_NUMBERS[self.views[name].lens])
 
     def mark_unknowns(self, name: str) -> slice:
-        """Return the slice of the unknowns that is the position of a mark."""
+        """Return the slice of the unknowns for the position of a mark."""
         return slice(self._mark_at[name], self._mark_at[name] + 2)
 
     def initial(self) -> Floats:
-        """Return the unknowns of the configured stage and the first estimates, (size,)."""
+        """Return the unknowns (size,) for the configured legs and the first estimates of views and marks."""
         unknowns = np.zeros(self.size)
         for name, view in self.views.items():
             lens = {"affine": (), "perspective": view.bend, "radial": (view.bend[0], *view.centre)}[view.lens]
@@ -125,18 +130,18 @@ class StageModel:
         return unknowns
 
     def state(self, unknowns: Floats) -> StageState:
-        """Convert the unknowns to values for legs, views and marks."""
+        """Convert the unknowns to parameters of legs, encoders, views and marks."""
         legs = (self.doubts * (self.basis @ unknowns[: self.legs])).reshape(3, 6)
         views = {name: self._view(name, unknowns) for name in self.views}
         places = {name: _pair(unknowns[self.mark_unknowns(name)]) for name in self.places}
         return StageState(legs[:, :5], legs[:, 5], views, places)
 
     def geometry(self, unknowns: Floats) -> Geometry:
-        """Return the geometry for given unknowns. Raises KinematicsError if it is impossible."""
+        """Return the geometry for given unknowns. Raises KinematicsError if the geometry is invalid."""
         return corrected(self.start, self.state(unknowns).corrections)
 
     def poses(self, unknowns: Floats, looks: Sequence[StageLook]) -> Floats:
-        """Return the poses of the platform at looks, (L, 3) [m, rad]. Raises KinematicsError."""
+        """Return the computed poses of the platform at the looks, (L, 3) [m, rad]. Raises KinematicsError."""
         return _poses(self.geometry(unknowns), self.state(unknowns), looks)
 
     def residuals(self, unknowns: Floats, looks: Sequence[StageLook]) -> Floats:
@@ -149,8 +154,9 @@ class StageModel:
         return result
 
     def jacobian(self, unknowns: Floats, looks: Sequence[StageLook]) -> Floats:
-        """Return the derivatives of the computed pixels with respect to the unknowns, (n, 2, size). Raises
-        KinematicsError.
+        """Return the derivatives of the computed pixels with respect to the unknowns, (n, 2, size).
+
+        Raises KinematicsError if a pose cannot be computed.
         """
         state, geometry = self.state(unknowns), self.geometry(unknowns)
         poses = _poses(geometry, state, looks)
@@ -180,12 +186,12 @@ class StageModel:
 
 
 def list_marks(looks: Sequence[StageLook]) -> list[tuple[int, str]]:
-    """Return the look and the name of each observed mark. The residuals have this order."""
+    """Return the index of the look and the name of the mark for each observation, in the order of the residuals."""
     return [(number, name) for number, look in enumerate(looks) for name in look.marks]
 
 
 def _groups(looks: Sequence[StageLook]) -> list[tuple[NDArray[np.int64], NDArray[np.int64], str, Floats]]:
-    """Return the rows, looks and pixels of each mark."""
+    """Return for each mark the rows of its residuals, the indices of the looks, its name, and the observed pixels."""
     rows_of: dict[str, list[tuple[int, int, Pair]]] = {}
     for row, (look, name) in enumerate(list_marks(looks)):
         rows_of.setdefault(name, []).append((row, look, looks[look].marks[name]))
@@ -207,7 +213,10 @@ def _doubt(parameter: str) -> float:
 
 
 def _pose_changes(geometry: Geometry, start: Geometry, poses: Floats, sliders: Floats) -> Floats:
-    """Return the pose changes caused by corrections of legs and encoder scales, (N, 3, 18): leg by leg, scale last."""
+    """Return the derivatives of poses with respect to corrections of legs and encoder scales, (N, 3, 18).
+
+    The last axis has six values per leg: five parameters and the encoder scale.
+    """
     by_legs = pose_derivatives(geometry, start, poses)
     J1, J2 = jacobians(geometry, poses)
     by_scales = np.linalg.solve(J2, J1) * sliders[:, None, :]
@@ -215,9 +224,9 @@ def _pose_changes(geometry: Geometry, start: Geometry, poses: Floats, sliders: F
 
 
 def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Floats]:
-    """Return orthonormal bases of the corrections that looks can determine, and of those that change no pose at all.
+    """Return orthonormal bases of the corrections that looks can determine, and of the corrections that change no pose.
 
-    `rows` are the pose changes for corrections in units of `doubts`, (N, 3, 18).
+    `rows` are the derivatives of the poses with respect to corrections in units of `doubts`, (N, 3, 18).
     """
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     zero, one = np.zeros(len(poses)), np.ones(len(poses))
@@ -236,7 +245,7 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
     unit = np.abs(moved).max()
     null = _null_space(np.concatenate([moved / unit, frames], axis=1))[:, : rows.shape[2]]
     held = _null_space(moved / unit)
-    # The common scale is exactly the mean of the three encoders.
+    # A common factor of all encoder scales is excluded, because their mean defines the unit of length.
     common = np.zeros(rows.shape[2])
     common[5::6] = 1.0 / doubts[5::6]
     null = np.concatenate([null, common[None] / np.linalg.norm(common)])
@@ -246,21 +255,24 @@ def _visible(rows: Floats, poses: Floats, doubts: Floats) -> tuple[Floats, Float
 
 
 def _null_space(matrix: Floats) -> Floats:
-    """Return an orthonormal basis of the vectors that a matrix maps to zero, in rows."""
+    """Return an orthonormal basis of the null space of a matrix. Each row is a vector of the basis."""
     _, values, directions = np.linalg.svd(np.linalg.qr(matrix, mode="r"))
     values = np.append(values, np.zeros(len(directions) - len(values)))
     return np.asarray(directions[values <= INVISIBLE * values[0]])
 
 
 def carry(poses: Floats, place: Floats) -> tuple[Floats, Floats]:
-    """Return the positions of a mark in the base frame, (n, 2) [m], and their derivatives with respect to phi."""
+    """Return the positions of a mark in the base frame at poses, (n, 2) [m], and the derivatives by phi."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     arm = np.stack([c * place[0] - s * place[1], s * place[0] + c * place[1]], axis=1)
     return poses[:, :2] + arm, np.stack([-arm[:, 1], arm[:, 0]], axis=1)
 
 
 def _projection_derivatives(view: CameraView, points: Floats) -> tuple[Floats, Floats]:
-    """Return the derivatives of pixels by the view's b, M by rows and lens, (n, 2, 6 ...), and by the points."""
+    """Return the derivatives of pixels with respect to the unknowns of a view, and with respect to the points.
+
+    The unknowns are b, M by rows, and the parameters of the lens, (n, 2, 6 …).
+    """
     M, away = np.array(view.matrix), points - view.origin
     n = len(points)
     by_b = np.broadcast_to(np.eye(2), (n, 2, 2))

@@ -1,1 +1,1 @@
-"""Control of the robot, one cycle at a time: modes, goals, feedback and setpoints. It does no input or output."""
+"""Control of the robot, cycle by cycle: modes, goals, feedback and setpoints. This package does no input or output."""

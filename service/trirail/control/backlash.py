@@ -1,12 +1,12 @@
-"""Backlash compensation for sliders that reverse. It is compiled and runs one cycle at a time.
+"""Backlash compensation for sliders that reverse. The functions are compiled and advance by one cycle per call.
 
 A slider with backlash lags its motor by half the backlash. The setpoint of a drive is therefore the position of the
-slider plus an offset: half the backlash in the direction of the last motion. The position of the slider is the drive's
-measurement minus that offset. After a reversal, the offset changes to the other side over the time given by
-trirail.motion.backlash_reserve. Only one change runs at a time: a slider that reverses during a change waits until the
-change is complete. After two reversals during a change, the offset first changes to the other side, because the slider
-may be anywhere within its backlash. While the last direction of a slider is unknown, for example after power-on, the
-offset is zero.
+slider plus an offset of half the backlash in the direction of the last motion. The position of the slider is the
+measurement of the drive minus this offset. After a reversal, the offset changes its sign gradually, over the time given
+by trirail.motion.backlash_reserve. If the slider reverses again during this change, the next change starts only when
+the current change is complete. If the slider reverses twice during a change, the offset changes to the opposite side
+and then back, because the slider may be anywhere within its backlash. While the last direction of a slider is unknown,
+for example after power-on, the offset is zero.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ __all__ = [
 ]
 
 MIN_REVERSAL_M = 5e-7
-"""Shortest motion that counts as a reversal [m]. Compensating shorter ones has no benefit and wears the drive."""
+"""Shortest motion that counts as a reversal [m]. To compensate shorter reversals has no benefit and wears the drive."""
 OFFSETS_KEPT = 5
-"""Number of past setpoints whose offsets are kept for trirail.control.feedback."""
+"""Number of past setpoints of which the offsets are stored, to correct late measurements."""
 
 BACKLASH = np.dtype(
     [
         ("half", "<f8", 3),  # half the backlash [m]
-        ("step", "<f8"),  # share of a change that is made per cycle; zero without backlash
+        ("step", "<f8"),  # fraction of a change that is completed per cycle; zero if no slider has backlash
         ("period", "<f8"),  # duration of a cycle [s]
         ("offset", "<f8", 3),  # offset in the latest setpoints [m]
         ("begin", "<f8", 3),  # offsets at the beginning and at the end of the change [m]
         ("end", "<f8", 3),
-        ("done", "<f8", 3),  # completed share of the change; one when it is complete
+        ("done", "<f8", 3),  # completed fraction of the change, 0 to 1
         ("turns", "<i8", 3),  # number of reversals since the change began
         ("heading", "<f8", 3),  # direction in which a slider last moved: 1 or -1; 0 if unknown
         ("farthest", "<f8", 3),  # farthest position in that direction [m]; NaN before the first command
-        ("offsets", "<f8", (OFFSETS_KEPT, 3)),  # offsets in the setpoints of previous cycles, the latest last
+        ("offsets", "<f8", (OFFSETS_KEPT, 3)),  # offsets in the setpoints of previous cycles, oldest first
     ],
     align=True,
 )
@@ -57,7 +57,7 @@ BACKLASH = np.dtype(
 
 
 def backlash(take_up: TakeUp, period: float) -> NDArray[np.void]:
-    """Return the initial state, (2,): the current state, and space for a tentative one."""
+    """Return an array (2,) with the initial state, and space for a tentative state."""
     state = np.zeros(2, BACKLASH)
     state["half"] = np.array(take_up.widths) / 2.0
     state["step"] = 1.0 / math.ceil(take_up.duration / period) if take_up.duration > 0.0 else 0.0
@@ -70,15 +70,15 @@ def backlash(take_up: TakeUp, period: float) -> NDArray[np.void]:
 def add_offset(states: NDArray[np.void], sliders: Array) -> None:
     """Add the offset of the next cycle to the solved slider positions, and write the new state to states[1].
 
-    To accept the setpoints, the caller assigns `states[0] = states[1]`. Otherwise, the next call starts from the same
-    state.
+    If the setpoints are accepted, the caller assigns `states[0] = states[1]`. If they are refused, the caller leaves
+    `states[0]` unchanged, and the next call starts from the same state again.
 
     Parameters
     ----------
     states : (2,)
         Current and tentative state, of dtype BACKLASH.
     sliders : (6, 3)
-        Rows lambda_10, v_10, gamma_10 of the sliders, then the same rows of the cross slides.
+        Position, velocity and acceleration of the sliders (rows lambda_10, v_10, gamma_10), then of the cross slides.
 
     """
     if states[0].step == 0.0:
@@ -115,21 +115,24 @@ def taking_up(states: NDArray[np.void]) -> bool:
 
 @compiled()
 def keep_offset(states: NDArray[np.void]) -> None:
-    """Append the offset of the previous cycle's setpoints to the past offsets."""
+    """Append the offset in the setpoints of the previous cycle to the stored past offsets."""
     states[0].offsets[:-1] = states[0].offsets[1:]
     states[0].offsets[-1] = states[0].offset
 
 
 @compiled()
 def due_offset(states: NDArray[np.void], age: int, i: int) -> float:
-    """Return the offset [m] in the setpoint that was active when slider i was measured, `age` SYNCs ago."""
+    """Return the offset that was part of the active setpoint when slider i was measured, `age` SYNCs ago [m]."""
     due: float = states[0].offsets[OFFSETS_KEPT - 2 - age, i]
     return due
 
 
 @compiled()
 def release_offsets(states: NDArray[np.void]) -> None:
-    """Freeze the offsets while the sliders move freely, so that nothing moves when they are held again."""
+    """Freeze the offsets while the setpoints follow the measured sliders.
+
+    Without this, a change of an offset could move a slider when the drives hold their positions again.
+    """
     for i in range(3):
         if states[0].done[i] < 1.0:
             states[0].end[i], states[0].done[i], states[0].heading[i] = states[0].offset[i], 1.0, 0.0

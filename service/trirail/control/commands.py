@@ -1,4 +1,4 @@
-"""Commands from clients: the check before a command starts, its effect, and the rule for its completion."""
+"""Execution of clients' commands: check whether a command is allowed, start it, and decide when it is complete."""
 
 from __future__ import annotations
 
@@ -27,22 +27,23 @@ _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
 class CommandProgress(NamedTuple):
-    """State of the robot from which a rule decides whether a command is complete."""
+    """Values from which a completion rule decides whether a command is complete."""
 
     mode: Mode
     latched: str | None
-    """Reason for the latched fault, if any."""
+    """Reason for the latched fault; None if there is no fault."""
     measured: MeasuredState
     settled: bool
-    """Whether the drives have had enough time to leave their fault state."""
+    """Whether the drives have had enough time to leave their fault state since the command arrived."""
 
 
 Rule = Callable[[CommandProgress], str | None]
-"""Function that returns "" if a command is complete, None if it is in progress, or the reason why it has failed."""
+"""Completion rule of a command. It returns None while the command is in progress, then "" or the reason of a
+failure."""
 
 
 def completed_on_arrival(_: CommandProgress) -> str:
-    """Return "" because the command is complete when it arrives."""
+    """Return "" always: the command takes effect in the cycle in which it arrives."""
     return ""
 
 
@@ -52,19 +53,19 @@ def standing(now: CommandProgress) -> str | None:
 
 
 def powered_up(now: CommandProgress) -> str | None:
-    """Return "" once the drives have power and the robot holds its position."""
+    """Return "" once the drives have power and the robot has left the mode ENABLING without a failure."""
     if now.mode is Mode.ENABLING:
         return None
     return "" if now.mode not in (Mode.FAULT, Mode.DISABLED) else now.latched or "disabled while powering up"
 
 
 def powered_down(now: CommandProgress) -> str | None:
-    """Return "" once the robot is at rest and no drive has power."""
+    """Return "" once the robot is at rest and no drive can move its slider any more."""
     return _timed_out(now) or (None if now.mode is Mode.STOPPING or now.measured.powered else "")
 
 
 def unpowered(now: CommandProgress) -> str | None:
-    """Return "" once no drive has power."""
+    """Return "" once no drive can move its slider any more."""
     return _timed_out(now) or (None if now.measured.powered else "")
 
 
@@ -83,20 +84,21 @@ def cleared(now: CommandProgress) -> str | None:
 
 
 def _timed_out(now: CommandProgress) -> str:
-    """Return the fault message of a drive that has timed out; "" if there is none."""
+    """Return the fault message of a drive that has timed out; "" if no drive has timed out."""
     fault = now.measured.feedback.fault
     return fault.message if fault is not None and fault.cause == "timeout" else ""
 
 
 def powered_message(measured: MeasuredState, latched: str | None) -> str:
-    """Return the message that refuses a reset and names the drives that can still move."""
+    """Return the refusal of a reset that is sent while drives can still move. The message names these drives."""
     states = zip(NAMES, measured.feedback.state, strict=True)
     drives = ", ".join(f"drive {name} is {state}" for name, state in states if state in CAN_MOVE)
     return f"{drives} by its last statusword: send reset again when the drives are at rest (fault: {latched})"
 
 
 SETTLE = 0.1
-"""Time that the drives have to leave their fault state after a reset [s]."""
+"""Time after a reset before the states of the drives are evaluated, so that the drives can leave their fault state
+[s]."""
 
 
 class Commands:
@@ -147,7 +149,8 @@ class Commands:
         action = self._modes.check(event).action
         goal = self._ledger.goal
         if event is ModeEvent.PAUSE and goal is not None and goal.kind.renewed:
-            event = ModeEvent.STOP  # neither can resume: a jog's key has been released, a track's target has moved on
+            # Jogs and tracks cannot be resumed: the key of a jog has been released, the target of a track has moved on.
+            event = ModeEvent.STOP
         if action is Action.POWER_UP:
             self._setpoints.check_rest()
             if self._measured.homed and (outside := self._setpoints.check_start()) is not None:
@@ -174,7 +177,7 @@ class Commands:
         self._change_mode(request)
 
     def _override(self, request: CommandRequest) -> None:
-        """Set the speed override for the current motion and all later ones."""
+        """Set the speed override for the current motion and all later motions."""
         rate = self._planner.override = request.content.percent / 100.0
         self._planner.update_rate()
         words = f"override {rate:.0%} by {request.user}"
@@ -182,7 +185,7 @@ class Commands:
         self._ledger.notices.append(Notice("service", "info", text.text, user=request.user, **text.fields))
 
     def _set_output(self, request: CommandRequest) -> None:
-        """Set an output. It switches together with the next setpoints."""
+        """Set an output. The output switches together with the next setpoints."""
         name, value = request.content.output, request.content.value
         self._outputs.set(name, value, self._modes.state.mode)
         words = f"output {name} {'on' if value else 'off'} by {request.user}"
@@ -190,7 +193,7 @@ class Commands:
         self._ledger.notices.append(Notice("output", "info", text.text, user=request.user, **text.fields))
 
     def _acquire(self, request: CommandRequest) -> None:
-        """Grant a user the lease, or renew it."""
+        """Grant the lease to the sender of the command, or renew the sender's lease."""
         change = self._lease.acquire(request.user, request.content, self._modes.cycle)
         if change is not None:
             self._change_lease(change)
@@ -199,7 +202,7 @@ class Commands:
         self._change_lease(self._lease.release(request.user, request.content))
 
     def _change_lease(self, change: LeaseChange) -> None:
-        """Report the new holder of the lease, stop other users' motion, and withdraw their waiting goals."""
+        """Report a change of the lease. Unless the new holder owns all active goals and commands, stop the robot."""
         user = self._lease.user
         text = change.message
         self._ledger.notices.append(Notice("lease", change.level, text.text, user=user, **text.fields))
@@ -214,7 +217,7 @@ class Commands:
 
 
 class Effect(NamedTuple):
-    """Effect of a command, and the rule for its completion."""
+    """Method that starts a command, and rule that decides when the command is complete."""
 
     rule: Rule
     begin: Callable[[Commands, CommandRequest], None] = Commands._change_mode
@@ -234,7 +237,7 @@ EFFECTS: dict[Command, Effect] = {
     Command.ACQUIRE: Effect(completed_on_arrival, Commands._acquire),
     Command.RELEASE: Effect(standing, Commands._release),
 }
-"""Effect of each command."""
+"""Effect and completion rule of each command."""
 
 
 def _reason(request: CommandRequest) -> EventText:

@@ -1,9 +1,9 @@
-"""Control of the robot, one cycle at a time. It uses no clock, socket or file.
+"""Control of the robot, cycle by cycle. This module uses no clock, socket or file.
 
-A cycle has three steps: `observe` evaluates the drives' feedback, `solve` computes the slider positions, and `write`
-sends the setpoints that the last gate has accepted. Between two cycles, `conclude` evaluates the cycle that has ended,
-and `decide` handles requests and chooses the motion of the next cycle. Answers and notices are collected in the
-`ledger`.
+Each cycle has three steps: `observe` evaluates the feedback of the drives, `solve` computes the slider positions, and
+`write` sends the setpoints that the last gate has accepted. Between two cycles, `conclude` evaluates the cycle that has
+ended, and `decide` handles requests and chooses the motion of the next cycle. The `ledger` collects answers and
+notices.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ from trirail.wire.records import Part
 from trirail.wire.vocabulary import FaultCause, Mode
 
 TimedInput = tuple[Request | Disturbance | PlanAnswer | PlannerLost, int]
-"""Input of the control in a cycle, and the time at which it was received, on the monotonic clock [ns]."""
+"""Message for the control, and the time on the monotonic clock at which the message was received [ns]."""
 
 
 class SteadyState(NamedTuple):
-    """State of the control in which the compiled call can run cycles without Python."""
+    """State from which the compiled call can run quiet cycles, that is, cycles without Python."""
 
     run: Run | None
-    """Motion that supplies the setpoints; None if no motion is under way."""
+    """Motion from which the setpoints are computed; None if the robot is not executing a motion."""
     follows: bool
-    """Whether the setpoints follow the measured sliders. If False and there is no run, the setpoints do not change."""
+    """Whether the setpoints follow the measured sliders. If False and `run` is None, the setpoints do not change."""
     held: bool
     """Argument `held` of trirail.control.cycle.follow."""
     at_rest: bool
@@ -70,11 +70,11 @@ class SteadyState(NamedTuple):
     until: float
     """Last cycle that can run without Python."""
     settles_by: int | None
-    """Cycle in which the settling time-out of the current goal ends; None if no goal is settling."""
+    """Cycle in which the in-position time-out of the current goal elapses; None if no goal is settling."""
 
 
 class Control:
-    """Control of one robot: its modes, motion, kinematics and limits, for one group of drives."""
+    """Control of one robot with its drives: modes, goals, commands, setpoints and outputs."""
 
     def __init__(self, config: Config, drives: DriveGroup, planner: PlannerPort) -> None:
         robot = corrected_geometry(config)
@@ -121,7 +121,7 @@ class Control:
 
     @property
     def state(self) -> ModeState:
-        """Current mode, and the action that follows once the robot is at rest."""
+        """Current mode, with the flags for the next change once the robot is at rest."""
         return self.modes.state
 
     @property
@@ -130,7 +130,7 @@ class Control:
         return self.modes.fault
 
     def steady_state(self) -> SteadyState | None:
-        """Return the state for running cycles without Python; None if Python must run the next cycle."""
+        """Return the state from which compiled code can run the next cycles; None if Python must run the next cycle."""
         mode, runs, goal, settling = self.state.mode, self.schedule.runs, self.ledger.goal, self.measured.settling
         follows = self._follows
         stopped_now = mode is Mode.FAULT and self.modes.entered == self.modes.cycle
@@ -157,7 +157,10 @@ class Control:
         return self.state.mode not in (Mode.HOLDING, Mode.MOVING, Mode.STOPPING) or not self.measured.homed
 
     def _waits(self, run: Run | None) -> bool:
-        """Return whether the motion has ended and its goal is waiting, either to settle or to be renewed."""
+        """Return True if the motion has reached its end while its goal is still active.
+
+        Such a goal waits until the robot is in position, or until the client renews the goal.
+        """
         if run is None or not run.arrived:
             return False
         goal = self.ledger.goal
@@ -165,16 +168,16 @@ class Control:
         return self.state.mode is Mode.MOVING and (self.measured.settling.under_way or target)
 
     def resume(self, newest: int, time: float, code: int | None) -> None:
-        """Update the control after the compiled call has run cycles.
+        """Take over the result of the cycles that the compiled call has run without Python.
 
         Parameters
         ----------
         newest
             Number of the last cycle that the compiled call has run.
         time
-            Time of the run's law in that cycle [s].
+            Time of the run's law in cycle `newest` [s].
         code
-            Result of the compiled call in that cycle if the control must handle it, else None.
+            Result of trirail.control.cycle.command in cycle `newest`, if the control must react to it; otherwise None.
 
         """
         self.schedule.cycle += newest - self.cycles
@@ -186,7 +189,7 @@ class Control:
             self.conclude()
 
     def cycle(self, read: Callable[[], Feedback], inputs: Iterable[TimedInput] = ()) -> None:
-        """Run one complete cycle: handle the inputs, `read` the feedback, execute the cycle, and conclude it."""
+        """Run one complete cycle: handle the inputs, `read` the feedback, execute the cycle, and evaluate it."""
         self.decide(inputs)
         self.execute(read())
         self.conclude()
@@ -199,15 +202,15 @@ class Control:
         behind: int | None = None,
         code: int | None = None,
     ) -> None:
-        """Run the steps of one cycle, given the drives' feedback at its SYNC. Any exception stops the robot.
+        """Run the steps of one cycle with the drives' feedback at the SYNC of the cycle. Any exception stops the robot.
 
         Parameters
         ----------
         mark
-            Function called at the end of each part of the cycle.
+            Function that is called at the end of each part of the cycle, to measure the duration of the parts.
         behind, code
-            If the compiled call has already begun this cycle: the result of `observe`, and the result of `command` or
-            `hold`.
+            Results of `observe`, and of `command` or `hold`, in trirail.control.cycle, if the compiled call has already
+            executed these functions for this cycle.
 
         """
         try:
@@ -218,7 +221,7 @@ class Control:
             else:
                 self.schedule.cycle += 1
                 self._check_solved(code)
-        except Exception as error:  # noqa: BLE001 - after any error in the program the robot must stop now
+        except Exception as error:  # noqa: BLE001 - any error in the program must stop the robot immediately
             self._trip_for(error)
         self._switch_outputs()
         mark(Part.KINEMATICS)
@@ -232,7 +235,7 @@ class Control:
     # ------------------------------------------------------------------ the cycle, in its order
 
     def start(self, feedback: Feedback) -> None:
-        """Start the control before the first cycle, with the measured slider positions as the commanded ones."""
+        """Prepare the first cycle. The commanded slider positions start at the measured positions."""
         if self.outputs.any:
             self.outputs.allow_paths(self._drives.path_outputs)
         self.measured.start(feedback)
@@ -242,9 +245,9 @@ class Control:
         self._report_warnings(feedback)
 
     def observe(self, feedback: Feedback, behind: int | None = None) -> None:
-        """Evaluate the drives' feedback at this SYNC; trip on a drive fault or an excessive following error.
+        """Evaluate the drives' feedback at this SYNC, and trip on a drive fault or an excessive following error.
 
-        `behind` is the result of the compiled `observe` if that has been called already.
+        `behind` is the result of the compiled `observe`, or None if `observe` has not been called for this cycle yet.
         """
         before = self.measured.feedback
         if behind is None:
@@ -256,7 +259,7 @@ class Control:
             drive, cause, code, message = feedback.fault
             text = coded(message, EventCode.DRIVE_FAULT, cause=cause, drive=drive, code=code)
             if mode is Mode.FAULT and feedback.fault != before.fault:
-                # The first fault stays latched; this one is a consequence of it.
+                # The first fault remains latched. The new fault is treated as a consequence of the first.
                 detail = FaultDetail(cause, drive, code)
                 self.ledger.notices.append(Notice("fault", "error", message, fault=detail, **text.fields))
             self.modes.trip(text, cause, drive, code)
@@ -273,7 +276,10 @@ class Control:
                 self._end_homing()
 
     def _report_warnings(self, feedback: Feedback) -> None:
-        """Report the drives' warnings. A warning appears in the feedback of one cycle only."""
+        """Report warnings of the drives, and drives that were lost or have returned.
+
+        A warning appears in the feedback of only one cycle.
+        """
         for warning in feedback.warnings:
             text = coded(warning, EventCode.DRIVE_WARNING, warning=warning)
             self.ledger.notices.append(Notice("service", "warning", warning, **text.fields))
@@ -309,7 +315,7 @@ class Control:
         self._drives.set_outputs(self.outputs.words.tolist())
 
     def _goal_ended(self, goal: str, outcome: Outcome) -> None:
-        """Switch back the outputs that an ended goal still holds, and report its switches before its end."""
+        """Switch back the outputs that an ended goal has left switched, and report its switches before its end."""
         self.outputs.close(goal, outcome, self.modes.cycle + self._concluding, self.measured.record)
         self._report_switches(all_=True)
 
@@ -320,7 +326,7 @@ class Control:
             self.ledger.notices.append(Notice("output", "info", text.text, goal=goal, marks=switches, **text.fields))
 
     def _handle_edges(self, before: Feedback, now: Feedback) -> None:
-        """Report the inputs that have changed, and stop the current goal if it ends at one of these edges."""
+        """Report digital inputs that have changed, and stop the current goal if it ends at one of these edges."""
         goal, pose = self.ledger.goal, self.measured.pose
         x, y, phi = pose
         for name, value in self.outputs.edges(before.inputs, now.inputs):
@@ -343,7 +349,7 @@ class Control:
     # ------------------------------------------------------------------ between two cycles
 
     def conclude(self) -> None:
-        """Evaluate the cycle that has ended: end goals or the motion, and answer completed commands."""
+        """Evaluate the cycle that has ended: end goals and motions that are complete, and answer completed commands."""
         self._concluding = True
         try:
             schedule, code = self.schedule, self._solve_code
@@ -365,8 +371,8 @@ class Control:
     def decide(self, inputs: Iterable[TimedInput]) -> None:
         """Prepare the next cycle.
 
-        Handle the inputs, end a lease or a jog that was not renewed in time, start a motion that has been planned, and
-        request the next check.
+        Handle the inputs, end a lease, jog or track that was not renewed in time, start a planned motion, and send the
+        next check of a goal to the planner.
         """
         try:
             for each, now_ns in inputs:
@@ -387,7 +393,7 @@ class Control:
             self._trip_for(error)
 
     def handle(self, received: Request | Disturbance | PlanAnswer | PlannerLost, now_ns: int) -> None:
-        """Handle a request, a disturbance or a plan that was received at a time on the monotonic clock [ns]."""
+        """Handle one input. `now_ns` is the time on the monotonic clock at which the input was received [ns]."""
         try:
             match received:
                 case Disturbance():
@@ -410,7 +416,7 @@ class Control:
             self._trip_for(error)
 
     def _answer(self, request: GoalRequest | CommandRequest, now_ns: int) -> None:
-        """Start a command or enqueue a goal. Reply with a refusal if it is not accepted."""
+        """Start a command or add a goal to the queue. If the request is not allowed, reply with a refusal."""
         try:
             if isinstance(request, GoalRequest):
                 self.goal_queue.enqueue(request, now_ns, self.modes.cycle)
@@ -428,12 +434,12 @@ class Control:
 
     @property
     def override(self) -> float:
-        """Speed override as a factor."""
+        """Speed override; 1 is the planned speed."""
         return self._planner.override
 
     @property
     def target(self) -> Triple | None:
-        """End pose of the current goal; for a track, the last reported pose of its target; None for a jog."""
+        """End pose of the current goal. For a track, the last reported pose of the target; for a jog, None."""
         last, goal = self.schedule.last, self.ledger.goal
         if goal is None or last is None:
             return None
@@ -445,7 +451,7 @@ class Control:
     # ------------------------------------------------------------------ requests
 
     def _admit(self) -> bool:
-        """Return whether the robot is moving to a goal. Raises RefusedError if the robot cannot accept a goal now."""
+        """Return True if the robot is moving to a goal. Raises RefusedError if the robot cannot accept a goal now."""
         self.modes.check(ModeEvent.GOAL)
         self._check_homed()
         return self.state.mode is Mode.MOVING
@@ -455,10 +461,10 @@ class Control:
             raise RefusedError(RefusalCode.NOT_HOMED, "the positions of the sliders are unknown: send home first")
 
     def _place(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
-        """Return the pose from which a relative move begins: the end of the earlier goals, or the measured pose.
+        """Return the pose from which a relative move begins: the end pose of the earlier goals, or the measured pose.
 
-        Raises RefusedError if a goal has stopped on its path, because it is paused or the override is 0. The user would
-        then expect the move to begin where the robot stands.
+        Raises RefusedError if the robot has stopped on the path of a goal, because the goal is paused or the override
+        is 0. In this case, the user would expect the move to begin at the present pose, not at the end of the path.
         """
         if origin == "measured":
             return self.measured.pose
@@ -471,16 +477,17 @@ class Control:
         return self._end_pose
 
     def _place_of_check(self, origin: Literal["commanded", "measured"]) -> Sequence[float]:
-        """Return the pose from which a check is planned.
+        """Return the pose from which the path of a check is planned.
 
-        It is the pose that `_place` returns. If a goal is waiting on its path, it is the end of that path.
+        This is the same pose as in `_place`, but a stopped goal is not an error: the check is planned from the end of
+        the goal's path.
         """
         self._check_homed()
         return self.measured.pose if origin == "measured" else self._end_pose
 
     @property
     def _end_pose(self) -> Sequence[float]:
-        """Pose at the end of the goals under way; the commanded pose if they have no fixed end."""
+        """Pose at the end of all current goals; the commanded pose if there is no goal, or for a jog or track."""
         last, goal = self.schedule.last, self.ledger.goal
         if last is None or goal is None or goal.kind.renewed:
             return self.commanded.pose
@@ -494,9 +501,9 @@ class Control:
         return (self.state.mode is Mode.HOLDING and self.measured.homed) or self.measured.settling.under_way
 
     def _end_motion(self, run: Run) -> None:
-        """Handle the end of the motion, which is at its target or at a standstill on the way.
+        """Handle the end of a motion, either at its target or at a standstill before the target.
 
-        A goal whose path has ended remains under way until the robot is in position.
+        At the target, the goal remains active until the robot is in position.
         """
         goal, settling = self.ledger.goal, self.measured.settling
         if not run.arrived:
@@ -509,7 +516,7 @@ class Control:
             settling.begin(self.modes.cycle)
 
     def _check_arrival(self) -> None:
-        """End a goal whose path has ended, once the robot is in position or the time-out has elapsed."""
+        """End a goal after the end of its path, once the robot is in position or the time-out has elapsed."""
         settling = self.measured.settling
         settled = settling.result(self.modes.cycle)
         if settled is None:
@@ -519,7 +526,7 @@ class Control:
         self.modes.apply_event(ModeEvent.ARRIVED, coded("standstill", EventCode.STANDSTILL))
 
     def _power_up(self) -> None:
-        """Continue once all drives are enabled; trip if they are not enabled within the time-out."""
+        """Complete the enabling once all drives are enabled; trip if the time-out elapses first."""
         if all(state is PowerState.OPERATION_ENABLED for state in self.measured.feedback.state):
             if not self.measured.homed:
                 words = "all drives are enabled; the positions of the sliders are unknown: send home"
@@ -543,7 +550,7 @@ class Control:
             self.modes.trip(text, FaultCause.ENABLE)
 
     def _end_homing(self) -> None:
-        """Hold the position once homing is complete or has been stopped."""
+        """Change to holding once homing is complete or has been stopped."""
         if self.state.mode not in (Mode.HOMING, Mode.STOPPING) or self.schedule.runs:
             return  # the robot was not homing
         if self.measured.homed:
@@ -563,7 +570,7 @@ class Control:
             self.modes.apply_event(ModeEvent.HOMED, coded("all drives are homed", EventCode.HOMED))
 
     def _rest_at_setpoints(self) -> bool:
-        """Command the pose that matches the setpoints, at rest. If no pose matches, trip and return False."""
+        """Set the commanded motion to rest at the pose of the setpoints. If no pose matches, trip and return False."""
         a, b, c = self.setpoints.rows[0]
         pose = self.measured.pose_of((a, b, c))
         if pose is None:
@@ -575,7 +582,7 @@ class Control:
         return True
 
     def _follow_measured(self) -> None:
-        """Command the measured pose and the measured slider positions."""
+        """Set the commanded pose to the measured pose, and move the setpoints towards the measured slider positions."""
         held = self.state.mode not in (Mode.DISABLED, Mode.FAULT)
         stopped_now = self.state.mode is Mode.FAULT and self.modes.entered == self.modes.cycle
         self.setpoints.follow(self.schedule, held=held, stopped_now=stopped_now)

@@ -1,10 +1,10 @@
 """Compiled computations of one cycle: the measured state of the robot, and the next setpoints of the sliders.
 
 `observe` evaluates the drives' feedback at a SYNC. `command` moves the platform along its path by one period and solves
-the slider positions; they are used only if the last gate accepts them. `hold` does the same for a platform at rest.
-`follow` moves the setpoints towards the measured sliders. All functions work on preallocated arrays, allocate no
-memory, and write to the record of the cycle. The control decides on changes of mode between `observe` and the other
-functions.
+the slider positions, which become setpoints only if the last gate accepts them. `hold` does the same for a platform at
+rest. `follow` moves the setpoints towards the measured sliders. All functions work on preallocated arrays, allocate no
+memory, and write to the record of the cycle. Between `observe` and the other functions, the control may change the
+mode.
 
 The functions share these arrays:
 
@@ -15,16 +15,16 @@ bounds
 feedback : (2,)
     Latest and previous feedback, of dtype FEEDBACK.
 written : (5, 3)
-    Setpoints of the previous cycles, the latest last [m].
+    Setpoints of the previous cycles, oldest first [m].
 motion : (2, 3, 3)
     Commanded motion of the platform in this cycle and in the previous one; rows are pose, velocity, acceleration.
 sliders : (2, 6, 3)
-    Accepted and tentative sliders; rows are position, velocity and acceleration of the sliders, then of the cross
-    slides.
+    Accepted and tentative motion of the sliders; rows are position, velocity and acceleration of the sliders, then of
+    the cross slides.
 backlash : (2,)
     Accepted and tentative state of the backlash compensation, of dtype BACKLASH.
 refused_values : (2,)
-    Values that the last gate has refused.
+    Refused value, and the value with which it was compared.
 record : (1,)
     Record of the cycle, of dtype trirail.wire.records.DTYPE.
 
@@ -70,18 +70,19 @@ __all__ = [
 ]
 
 MAX_AGE = 3
-"""Greatest age at which a position is compared with its setpoint [SYNCs]. A drive with an older position is silent."""
+"""Greatest age of a position for which a following error is computed [SYNCs]. A drive with an older position is
+silent."""
 PASSED, AT_REST = 1, 2
-"""Bits in the result of `command`: the current goal has ended on the path, and the motion is at rest."""
+"""Bits in the result of `command`: the path has passed the end of the current goal; the motion is at rest."""
 MAX_DISTANCE_STEPS = 1000
-"""Greatest plausible distance of a setpoint from its slider [steps]. Beyond this distance, the setpoint has followed a
-wrong position."""
+"""Greatest plausible distance of a setpoint from its slider, in multiples of the travel in one cycle. A greater
+distance shows that the setpoint has followed a wrong position."""
 BACKWARDS = -1
-"""Refusal of `command`: the time along the path would decrease."""
+"""Refusal by `command`: the time along the path would decrease."""
 DRIFTING = -2
-"""Refusal of `command` and `hold`: the platform would move although the mode requires a standstill."""
+"""Refusal by `command` and `hold`: the platform would move although the mode requires a standstill."""
 NOT_BRAKING = -3
-"""Refusal of `command`: the motion would continue although it must brake."""
+"""Refusal by `command`: the motion would continue although the mode requires braking."""
 MAX_DRIFT = 1e-12
 """Greatest change of a pose per cycle that is treated as rounding [m, rad]. At 1 kHz, a drift of 1 nm/s is refused."""
 MAX_DRIFT_VELOCITY = 1e-9
@@ -128,7 +129,7 @@ def observe(
     monitored: NDArray[np.void],
     record: NDArray[np.void],
 ) -> int:
-    """Compute pose, velocities and following errors from feedback[0], then copy it to feedback[1].
+    """Compute pose, velocities and following errors from feedback[0], then copy feedback[0] to feedback[1].
 
     The pose does not change if a slider position jumps, or if no pose matches the slider positions.
 
@@ -137,9 +138,9 @@ def observe(
     fastest
         Velocity above which a slider position counts as jumping [m/s].
     limit
-        Limit of the following errors [m].
+        Greatest permitted following error [m].
     at_rest
-        Whether the commanded motion is at rest. If so, `monitored` records whether the robot is in position.
+        Whether the commanded motion is at rest. Only at rest does `monitored` record whether the robot is in position.
     jumps : (3,)
         Output: whether the position of each slider jumps.
     scratch : (2, 3)
@@ -160,7 +161,8 @@ def observe(
         cycles = 1 + before.age[i] - now.age[i]
         if cycles > 0:  # otherwise there is no newer position
             row.velocity[i] = (now.position[i] - before.position[i]) / (cycles * period)
-        # At a SYNC, a drive reaches the setpoint that it accepted one SYNC earlier and that was written a cycle before.
+        # The setpoint that a drive reaches at this SYNC was accepted at the previous SYNC, and written one cycle
+        # before.
         age = min(now.age[i], MAX_AGE)
         row.backlash[i] = due_offset(backlash, age, i)
         if not now.follows[i]:
@@ -200,7 +202,7 @@ def _record_command(motion: Array, sliders: Array, progress: float, remaining: f
 
 @compiled()
 def _is_drifting(motion: Array, refused_values: Array) -> bool:
-    """Return whether the platform moves. If it does, write its change and velocity to `refused_values`."""
+    """Return True if the platform moves. In this case, write the change and the velocity to `refused_values`."""
     for n in range(3):
         change = motion[0, 0, n] - motion[1, 0, n]
         if not (abs(change) <= MAX_DRIFT and abs(motion[0, 1, n]) <= MAX_DRIFT_VELOCITY):
@@ -218,10 +220,10 @@ def _solve(
     backlash: NDArray[np.void],
     refused_values: Array,
 ) -> int:
-    """Solve the slider positions for the platform's motion. They stay unchanged if the last gate refuses the result.
+    """Solve the slider positions for the platform's motion. If the last gate refuses the result, change nothing.
 
-    Returns 0, 1 + i if leg i is singular or a number is not finite, 3 + a code of trirail.motion.limits.gate, or
-    DRIFTING.
+    Returns 0 if the result is accepted, 1 + i if leg i is singular or a number is not finite, 3 + a code of
+    trirail.motion.limits.gate, or DRIFTING.
     """
     if bounds[0].allowed == _NONE and _is_drifting(motion, refused_values):
         return DRIFTING
@@ -263,22 +265,22 @@ def command(
     refused_values: Array,
     record: NDArray[np.void],
 ) -> int:
-    """Move the platform along its path to a time of its law, and solve the slider positions.
+    """Move the platform along its path to the point that its law gives for `time`, and solve the slider positions.
 
     Parameters
     ----------
     knots, pieces, in_sliders, tools
         The path.
     law_knots, law_pieces
-        The law, which gives the time along the path.
+        The law, a function from the time of the law to the time along the path.
     time
         Time of the law [s].
     target
-        Rate at which the law ends.
+        Rate of the time along the path at the end of the law.
     furthest : (1,)
-        Greatest time along the path up to now [s]. An earlier time is refused.
+        Greatest time along the path in any cycle until now [s]. An earlier time is refused.
     begun, end, arrival
-        Times along the path at which the current goal begins and ends, and time of the law at which it ends [s].
+        Times along the path at which the current goal begins and ends, and time of the law at which the goal ends [s].
 
     Returns
     -------
@@ -320,7 +322,7 @@ def hold(
     refused_values: Array,
     record: NDArray[np.void],
 ) -> int:
-    """Solve the slider positions for a platform at rest. The result is coded as that of `command`."""
+    """Solve the slider positions for a platform at rest. The result has the same coding as the result of `command`."""
     motion[1] = motion[0]
     refused = _solve(legs, bounds, motion, sliders, backlash, refused_values)
     _record_command(motion, sliders, 0.0, 0.0, record)
@@ -349,18 +351,18 @@ def follow(
     backlash: NDArray[np.void],
     record: NDArray[np.void],
 ) -> None:
-    """Command the measured pose at rest, and move each setpoint towards the position of its slider.
+    """Set the commanded motion to rest at the measured pose, and move each setpoint towards its measured slider.
 
-    A setpoint changes by at most `step` per cycle, and does not follow a position that jumps. For a drive that moves by
-    itself, the setpoint is set to the measured position immediately. The same applies to a drive without power whose
-    setpoint is more than MAX_DISTANCE_STEPS away, because that setpoint has followed a wrong position.
+    A setpoint changes by at most `step` per cycle, and does not follow a position that jumps. For a drive that moves
+    without setpoints, the setpoint equals the measured position. The same applies to a drive that is not enabled if the
+    setpoint is more than MAX_DISTANCE_STEPS away, because this setpoint has followed a wrong position.
 
     Parameters
     ----------
     held
-        Whether enabled drives keep their setpoints.
+        Whether the setpoints of enabled drives remain unchanged.
     stopped_now
-        Whether all drives were stopped in this cycle, so that all of them keep their setpoints.
+        Whether all drives were stopped in this cycle. If True, the setpoints of all drives remain unchanged.
     step
         Greatest change of a setpoint per cycle [m].
 

@@ -1,4 +1,4 @@
-"""Measured state of the robot, computed from the drives' feedback: pose, velocities and following errors."""
+"""Computation of the robot's measured pose, velocities and following errors from the feedback of the drives."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ CAN_MOVE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerSta
 
 
 class MeasuredState:
-    """Measured state according to the latest feedback, stored in the record of the cycle.
+    """Measured state of the robot after the latest feedback. The values are stored in the record of the cycle.
 
     Parameters
     ----------
     step
         Greatest travel of a slider in one cycle [m].
     limit
-        Limit of the following errors [m].
+        Greatest permitted following error [m].
     windows
-        Limits of the residuals at rest.
+        In-position windows, dwell time and time-out.
     take_up
-        Motion that takes up the sliders' backlash.
+        Widths of the sliders' backlash, and the time in which a motor crosses the backlash after a reversal.
 
     """
 
@@ -53,12 +53,13 @@ class MeasuredState:
         self.jumping = np.zeros(3, np.bool)
         """Whether the position of each slider has changed faster than the slider can move."""
         self.settling = Settling(windows, period)
-        """Monitor of whether the robot is in position."""
+        """Monitor that decides whether the robot is in position."""
         self.backlash = backlash(take_up, period)
         """State of the backlash compensation, (2,) of dtype trirail.control.backlash.BACKLASH."""
         self.legs = legs
         self._period = period
-        self.fastest = 2.0 * step / period  # the age may be wrong by one cycle, which doubles a step
+        # The age of a position may be wrong by one cycle. Two steps then appear as one.
+        self.fastest = 2.0 * step / period
         self.limit = limit
         self._packed = self.numbers.view(np.uint8).data
         self.written = np.zeros((2 + cycle.MAX_AGE, 3))
@@ -66,13 +67,13 @@ class MeasuredState:
 
     @property
     def position(self) -> Triple:
-        """Latest positions of the sliders [m]. Unlike `feedback`, they are also updated by the compiled call."""
+        """Latest positions of the sliders [m]. In quiet cycles, this property is up to date, but `feedback` is not."""
         x, y, z = self.numbers["position"][0].tolist()
         return x, y, z
 
     @property
     def pose(self) -> Triple:
-        """Latest measured pose. It is computed from the last slider positions for which the loops could be closed."""
+        """Latest measured pose, computed from the last slider positions that match a pose and did not jump."""
         return self._recorded("pose")
 
     @property
@@ -82,7 +83,7 @@ class MeasuredState:
 
     @property
     def following_error(self) -> Triple:
-        """Active setpoint minus position [m]; zero for a drive that moves by itself."""
+        """Active setpoint minus position of each slider [m]; zero for a drive that moves without setpoints."""
         return self._recorded("following_error")
 
     @property
@@ -98,7 +99,7 @@ class MeasuredState:
 
     @property
     def unready(self) -> tuple[str, ...]:
-        """Reasons why drives cannot be reset yet. Each reason is one line and is listed once."""
+        """Reasons why drives cannot be reset yet. Each reason is one line and appears only once."""
         return tuple(dict.fromkeys(str(each) for each in self.feedback.unready if each is not None))
 
     @property
@@ -107,15 +108,16 @@ class MeasuredState:
         return all(self.feedback.homed)
 
     def start(self, feedback: Feedback) -> None:
-        """Start with the first feedback, and use its positions as the past setpoints."""
+        """Store the first feedback, and use the measured positions as the setpoints of the past cycles."""
         self._pack(feedback)
         self.numbers[1] = self.numbers[0]
         self.written[:] = self.record["commanded_position"] = feedback.position
 
     def update(self, feedback: Feedback, at_rest: bool = False) -> int:
-        """Evaluate the feedback of the next cycle; return 0, or 1 + i if slider i exceeds its following error limit.
+        """Evaluate the feedback of the next cycle, and return the result of trirail.control.cycle.observe.
 
-        `at_rest` states whether the commanded motion is at rest.
+        The result is 0, or 1 + i if slider i exceeds the limit of the following error. `at_rest` is True if the
+        commanded motion is at rest.
         """
         self._pack(feedback)
         return cycle.observe(
@@ -134,7 +136,7 @@ class MeasuredState:
         )
 
     def pose_of(self, sliders: Triple) -> Triple | None:
-        """Return the pose for slider setpoints that is closest to the latest pose; None if no pose matches them."""
+        """Return the pose that matches slider setpoints, on the branch of the latest pose; None if no pose matches."""
         self.scratch[:] = sliders, self.pose
         self.scratch[0] -= self.backlash[0]["offset"]
         if forward_into(self.legs, self.scratch[0], self.scratch[1], self.scratch[1]):

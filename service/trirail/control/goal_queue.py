@@ -1,4 +1,4 @@
-"""Queue of received goals: the goal being planned, those waiting to be planned, and the check for expired ones."""
+"""Queue of received goals. The queue sends one goal at a time to the planner, and ends goals that have expired."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from trirail.wire.messages import Notice, Outcome
 from trirail.wire.packets import GoalRequest
 
 MAX_PASSES = 8
-"""Number of goals from other users that may overtake a goal whose planning takes long."""
+"""Greatest number of times that goals of other users may interrupt the planning of a lengthy goal."""
 MAX_TARGET_AGE_S = 0.5
-"""Greatest difference between the time of a track's target and the present [s]. An older or later report is useless."""
+"""Greatest difference between the time of a track's target and the present [s]. Other reports are refused."""
 
 
 class _ReceivedGoal(NamedTuple):
-    """Received goal, and the time at which the gateway received it, expressed as a cycle number."""
+    """Goal, and the time at which the gateway received the goal, expressed as a cycle number."""
 
     request: GoalRequest
     cycle: float
     passes: int = 0
-    """Number of goals from other users that have overtaken this goal."""
+    """Number of times that goals of other users have interrupted the planning of this goal."""
 
     def known_since(self, period: float) -> float:
-        """Return the time of a track's target, expressed as a cycle number."""
+        """Return the time at which the target of a track was at the reported pose, expressed as a cycle number."""
         return self.cycle - self.request.age / period
 
 
 class GoalQueue:
-    """Queue that passes goals to the planner, taking users in turn, and reports the outcomes to the ledger."""
+    """Queue of goals for the planner. Users are served in turn, and the ledger receives the outcome of each goal."""
 
     def __init__(
         self,
@@ -64,17 +64,20 @@ class GoalQueue:
         self._outputs = outputs
         self._waiting: deque[_ReceivedGoal] = deque()
         self._served: dict[str, int] = {}
-        """Sequence number of each user's latest goal that was planned since the queue was last idle."""
+        """Sequence number of the latest goal of each user that was planned since the queue was last idle."""
         self._planned: _ReceivedGoal | None = None
         self._busy_reported = False
 
     @property
     def idle(self) -> bool:
-        """Whether no goal is being planned and none is waiting."""
+        """Whether the queue is empty and the planner has no goal."""
         return not self._waiting and not self._planner.busy
 
     def due(self, cycle: int) -> float:
-        """Return the cycle, not earlier than `cycle`, before which `step` must be called if nothing is received."""
+        """Return the cycle in which `step` must be called even if nothing is received until then.
+
+        `cycle` is the number of the next cycle.
+        """
         expiring = min((goal.expires for number, goal in enumerate(self._ledger.goals) if number), default=math.inf)
         if self._planner.busy and self._planned is not None:
             request, sent, _ = self._planned
@@ -86,7 +89,7 @@ class GoalQueue:
         return min(math.floor(expiring) + 1 if math.isfinite(expiring) else math.inf, cycle + self._planner.due)
 
     def enqueue(self, request: GoalRequest, now_ns: int, cycle: int) -> None:
-        """Add a goal to the queue. A frequent renewal replaces an earlier one that is still waiting.
+        """Add a goal to the queue. A frequent renewal replaces an earlier renewal that is still waiting.
 
         Parameters
         ----------
@@ -109,12 +112,13 @@ class GoalQueue:
         self._ledger.keep_alive(request, self._alive_until(sent))
 
     def step(self, cycle: int, admit: Callable[[], bool], place: PoseSource) -> GoalRequest | None:
-        """Request a plan for the next goal, or accept a finished plan. Return the goal that begins, if any.
+        """Request a plan for the next goal, or accept a finished plan. Return the goal that begins, or None.
 
         Parameters
         ----------
         admit
-            Function that returns whether the robot is moving to a goal, and raises RefusedError if no goal is accepted.
+            Function that returns True if the robot is moving to a goal. It raises RefusedError if the robot cannot
+            accept a goal now.
         place
             Function that returns the pose from which a relative move begins.
 
@@ -131,7 +135,7 @@ class GoalQueue:
         try:
             if self._planner.busy and self._planned is not None:
                 self._report_busy(self._planned.request)
-                # During planning, a renewed goal may have ended, and the lease may have passed to another user.
+                # During planning, the goal to be renewed may have ended, or another user may have acquired the lease.
                 self._ledger.check_id(self._planned.request)
                 self._lease.check(self._planned.request.user)
                 self._check_age(self._planned, cycle)
@@ -162,7 +166,10 @@ class GoalQueue:
             self._ledger.withdraw(request, outcome, reason)
 
     def stop_alone(self, goal_id: str, reason: EventText) -> bool:
-        """Stop a goal that has not begun; return False for the one under way. Raises RefusedError for an unknown id."""
+        """Stop a goal that has not begun, and return True. Return False without effect for the current goal.
+
+        Raises RefusedError if no goal has this id.
+        """
         if self._ledger.goal is not None and self._ledger.goal.id == goal_id:
             return False
         for number, goal in enumerate(self._ledger.goals):
@@ -188,14 +195,14 @@ class GoalQueue:
                 return
 
     def _next(self) -> _ReceivedGoal:
-        """Remove and return the oldest goal of the user whose turn is next, the one served longest ago."""
+        """Remove and return the oldest waiting goal of the user who was served least recently."""
         sent = min(self._waiting, key=lambda sent: self._served.get(sent.request.user, 0))
         self._waiting.remove(sent)
         self._served[sent.request.user] = max(self._served.values(), default=0) + 1
         return sent
 
     def _is_passed(self, planned: _ReceivedGoal) -> bool:
-        """Return whether another user's goal may overtake the goal being planned."""
+        """Return whether the planning of a goal may be interrupted for a goal of another user."""
         if not self._planner.awaits_answer or not planned.request.goal.lengthy or planned.passes >= MAX_PASSES:
             return False
         return any(sent.request.user != planned.request.user for sent in self._waiting)
@@ -225,9 +232,10 @@ class GoalQueue:
     def _timed(self, planned: Goal, sent: _ReceivedGoal, cycle: int) -> Goal:
         """Return the goal with the time of its target converted to the time of the schedule.
 
-        Raises RefusedError if that time is too far from the present.
+        Raises RefusedError if the time of the target is too far from the present.
         """
-        # "Now" is the SYNC of this cycle, at which the drives accept the setpoints of the schedule's current cycle.
+        # The present is the SYNC of this cycle, at which the drives accept the setpoints of the schedule's current
+        # cycle.
         if not planned.timed:
             return planned
         ago = (cycle - sent.known_since(self._period)) * self._period
@@ -248,7 +256,7 @@ class GoalQueue:
         return planned.at(self._schedule.cycle * self._period - ago)
 
     def _report_busy(self, request: GoalRequest) -> None:
-        """Report that a goal is waiting for a busy planner. This is reported once per busy period."""
+        """Report that a goal is waiting because the planner is busy. Only one report is sent per busy period."""
         busy = self._planner.busy_message
         if busy and not self._busy_reported:
             words, silence = f"{busy}: goal {request.id} waits", self._planner.silence
@@ -268,7 +276,7 @@ class GoalQueue:
             )
 
     def _alive_until(self, sent: _ReceivedGoal) -> float:
-        """Return the cycle in which the goal ends unless renewed; infinite if the goal needs no renewal."""
+        """Return the cycle in which the goal ends without a renewal; infinite if the goal needs no renewals."""
         return sent.cycle + sent.request.goal.timeout / self._period
 
     def _drop(self, number: int, goal_id: str, outcome: Outcome, reason: EventText) -> None:

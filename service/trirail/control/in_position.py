@@ -1,4 +1,4 @@
-"""Detection of "in position", with windows, a dwell time and a time-out.
+"""Detection that the robot is in position at the end of a path, with windows, a dwell time and a time-out.
 
 While the commanded motion is at rest, each cycle compares the measured sliders and pose with the commanded ones. The
 robot is in position once all six values have stayed inside their windows for every cycle of the dwell time.
@@ -28,9 +28,9 @@ MONITOR = np.dtype(
     [
         ("window", "<f8", (2, 3)),  # for the sliders [m]; for x, y [m] and phi [rad]
         ("residual", "<f8", (2, 3)),  # commanded minus measured, in the same order
-        ("heading", "<f8", 3),  # 1 or -1: direction in which a slider was last commanded to move; 0 for no motion
-        ("overshoot", "<f8", 3),  # of each slider, since the end of the path [m]
-        ("dwell", "<i8"),  # required number of cycles
+        ("heading", "<f8", 3),  # direction of the last commanded motion of a slider, 1 or -1; 0 if it did not move
+        ("overshoot", "<f8", 3),  # overshoot of each slider since the end of the path [m]
+        ("dwell", "<i8"),  # number of successive cycles inside the windows that is required
         ("inside", "<i8"),  # number of successive cycles inside the windows until now
         ("moved", "u1"),  # whether the commanded motion was moving in the previous cycle
     ],
@@ -40,18 +40,21 @@ MONITOR = np.dtype(
 
 
 class SettlingResult(NamedTuple):
-    """Result of settling. Its fields are also fields of the event that reports the end of the goal."""
+    """Result of the in-position monitor. The event that reports the end of the goal has the same fields."""
 
     settle: float | None
-    """Time from the end of the path to the first cycle of the dwell [s]; None if the robot did not settle in time."""
+    """Time from the end of the path to the beginning of the dwell time [s]; None after a time-out."""
     residual: Residual
-    """Commanded minus measured values at the end."""
+    """Commanded minus measured values when the goal ends."""
     overshoot: Triple
     """Greatest distance of each slider beyond its target since the end of the path [m]."""
 
 
 class Settling:
-    """Monitor for a goal whose path has ended. `monitored` is the part of its state that compiled code updates."""
+    """Monitor that decides, after the end of a goal's path, whether the robot is in position.
+
+    Compiled code updates the array `monitored` in every cycle.
+    """
 
     def __init__(self, limits: InPosition, period: float) -> None:
         self.monitored = np.zeros(1, MONITOR)
@@ -64,12 +67,12 @@ class Settling:
 
     @property
     def under_way(self) -> bool:
-        """Whether the path of a goal has ended but the goal has not."""
+        """Whether a goal is still active after the end of its path, until the robot is in position."""
         return self._since is not None
 
     @property
     def ends(self) -> int | None:
-        """Cycle of the time-out; None if no goal is settling."""
+        """Cycle in which the time-out elapses; None if no goal is settling."""
         return self._since + self._timeout if self._since is not None else None
 
     def begin(self, cycle: int) -> None:
@@ -92,14 +95,14 @@ class Settling:
         return self.now(None) if cycle - self._since >= self._timeout else None
 
     def now(self, settle: float | None) -> SettlingResult:
-        """Return a result with the current residuals and overshoot."""
+        """Return a result with the current residuals and overshoot, and with the given settling time [s]."""
         sliders, pose, overshoot = map(
             tuple, (*self.monitored["residual"][0].tolist(), *self.monitored["overshoot"].tolist())
         )
         return SettlingResult(settle, Residual(sliders, pose), overshoot)
 
     def describe(self, settled: SettlingResult, labels: Labels = NAMES) -> EventText:
-        """Return a result as text, with the settling time or with the residuals."""
+        """Return a text about the result, with the settling time, or with the residuals after a time-out."""
         if settled.settle is not None:
             x, y, phi = map(abs, settled.residual.pose)
             residual = (

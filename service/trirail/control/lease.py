@@ -1,7 +1,8 @@
-"""Lease: the exclusive right of one user to move the robot, for as long as the user's client renews it.
+"""Management of the lease, the exclusive right of one user to move the robot.
 
-The control keeps the lease, not the gateway. The lease therefore ends when any link to its holder is lost: the program,
-the network or the gateway. The time-out counts cycles, so that recorded sessions can be replayed.
+The client of the user must renew the lease regularly. The lease is managed by the control, not by the gateway. The
+lease therefore ends if the client, the network or the gateway fails. The time-out is counted in cycles, because a
+replay of a recorded session must give the same result.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from trirail.wire.messages import Level
 from trirail.wire.vocabulary import AcquireLease, LeasePolicy, ReleaseLease
 
 REMEMBERED_IDS = 1000
-"""Number of ended leases that are remembered, so that a late renewal does not revive one of them."""
+"""Number of ended leases that are remembered, so that a late renewal cannot revive an ended lease."""
 
 
 class LeaseChange(NamedTuple):
-    """Change of the lease holder, to be announced."""
+    """Message that announces a change of the lease holder."""
 
     level: Level
     message: EventText
@@ -30,31 +31,31 @@ class _Lease(NamedTuple):
     id: str | None
     timeout: float
     alive_until: int
-    """Last cycle of the lease unless it is renewed."""
+    """Last cycle of the lease if the lease is not renewed."""
 
 
 class LeaseArbiter:
-    """Rules of the lease, and its current holder. `check` raises an error for a user who must not move the robot."""
+    """Current lease, and the rules for acquiring, renewing and releasing a lease."""
 
     def __init__(self, policy: LeasePolicy, period: float) -> None:
         self._required = policy == "required"
         self._period = period
         self._held: _Lease | None = None
         self._ended: dict[tuple[str, str], str] = {}
-        """Reason why each ended lease ended, by user and id."""
+        """Reasons why leases have ended. The keys are user and id of the lease."""
 
     @property
     def user(self) -> str | None:
-        """Holder of the lease; None if there is none."""
+        """Name of the user who holds the lease; None if no user holds the lease."""
         return self._held.user if self._held is not None else None
 
     @property
     def alive_until(self) -> float:
-        """Last cycle of the lease unless it is renewed; infinite if nobody holds the lease."""
+        """Last cycle of the lease if the lease is not renewed; infinite if no user holds a lease."""
         return self._held.alive_until if self._held is not None else math.inf
 
     def check(self, user: str) -> None:
-        """Raise RefusedError if the user must not move the robot now."""
+        """Raise RefusedError if the user is not allowed to move the robot now."""
         if self._held is None:
             if self._required:
                 raise RefusedError(
@@ -67,7 +68,11 @@ class LeaseArbiter:
             )
 
     def acquire(self, user: str, lease: AcquireLease, cycle: int) -> LeaseChange | None:
-        """Grant or renew a lease; return None for a renewal. Raises RefusedError if another client holds it."""
+        """Grant or renew a lease. Return the announcement of a new holder, or None after a renewal.
+
+        Raises RefusedError if the lease with this id has ended, or if another client holds the lease and `lease.force`
+        is not set.
+        """
         before = self._held
         if lease.id is not None and (why := self._ended.get((user, lease.id))) is not None:
             raise RefusedError(RefusalCode.LEASE_OVER, f"{why}: acquire a new one")
@@ -89,7 +94,7 @@ class LeaseArbiter:
         return change
 
     def release(self, user: str, lease: ReleaseLease) -> LeaseChange:
-        """Release a user's lease. Raises RefusedError if the user does not hold it."""
+        """Release the lease of a user. Raises RefusedError if the user does not hold this lease."""
         held = self._held
         if held is not None and held.user == user and lease.id in (None, held.id):
             return self._end("info", coded(f"lease released by {user}", EventCode.LEASE_RELEASED, user=user))
@@ -101,7 +106,7 @@ class LeaseArbiter:
         raise RefusedError(RefusalCode.LEASED, f"{whose} holds the lease, and only its holder can release it")
 
     def expire(self, cycle: int) -> LeaseChange | None:
-        """End the lease if it was not renewed in time; return None if it continues."""
+        """End the lease if it was not renewed in time. Return None if there is no lease or the lease is still valid."""
         held = self._held
         if held is None or cycle <= held.alive_until:
             return None

@@ -1,4 +1,4 @@
-"""Ledger of goals and commands. Every goal ends exactly once, and every command is answered exactly once."""
+"""Ledger of active goals and commands. It ensures that each goal ends once and that each command is answered once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from trirail.wire.packets import (
 from trirail.wire.vocabulary import Command
 
 Withdrawal = Literal["stopped", "faulted"]
-"""Outcome of a goal that ends before it begins. It is used in the event and as the code of the refusal."""
+"""Outcome of a goal that ends before it begins. The event and the refusal of the goal both contain this word."""
 _LEVELS: dict[Outcome, Level] = {
     "faulted": "error",
     "rejected": "warning",
@@ -38,33 +38,33 @@ _LEVELS: dict[Outcome, Level] = {
 
 
 class ActiveGoal(NamedTuple):
-    """Goal that is under way or queued."""
+    """Goal that the robot is moving to, or that is queued behind the current goal."""
 
     id: str
     user: str
     kind: type[Goal]
     blend: float | None
-    """Distance from the end of this goal at which the next may begin [m]; None if the next goal preempts this one."""
+    """Distance from the end of this goal at which the next goal may begin [m]; None if the next goal preempts it."""
     expires: float
     """Last cycle in which the goal may begin."""
     alive_until: float
-    """Cycle in which the goal ends unless it is renewed."""
+    """Last cycle of the goal if the goal is not renewed."""
     released: bool = False
-    """Whether that cycle has passed. A late renewal then does not revive the goal."""
+    """Whether the goal was not renewed in time. A late renewal cannot revive the goal."""
     bound: str | None = None
-    """Limit at which a jog stops, or which the target of a track exceeds."""
+    """Name of the limit that stops a jog, or that the target of a track exceeds."""
     settles: bool = True
-    """Whether the goal is done only when the robot is in position."""
+    """Whether the goal waits after the end of its path until the robot is in position."""
     target: Triple | None = None
     """Last reported pose of a track's target."""
     stop_at: StopAt | None = None
     """Edge of an input at which the goal ends."""
     lag: float | None = None
-    """Last lag of a track, as in trirail.wire.messages.GoalReply."""
+    """Latest lag of a track behind its target; see trirail.wire.messages.GoalReply."""
 
 
 class _GoalEnd(NamedTuple):
-    """Information about a goal that has ended. `bound` is the limit at which a jog has ended."""
+    """Summary of a goal that has ended. `bound` is the limit at which a jog has ended."""
 
     user: str
     kind: type[Goal]
@@ -73,7 +73,7 @@ class _GoalEnd(NamedTuple):
     bound: str | None
 
     def renewal_error(self, goal_id: str) -> RefusedError:
-        """Return the error that refuses a renewal of this goal."""
+        """Return the error for a renewal that arrives after the end of this goal."""
         if self.bound is not None:
             text = f"jog {goal_id!r} has ended at the limit of {self.bound}: begin a new one, away from it"
             return RefusedError(RefusalCode.AT_LIMIT, text)
@@ -84,19 +84,19 @@ class _GoalEnd(NamedTuple):
 
 
 class Ledger:
-    """Ledger of the goals and commands under way. Outgoing messages are collected in `answers` and `notices`."""
+    """Ledger of the active goals and commands. The lists `answers` and `notices` collect the outgoing messages."""
 
     def __init__(self, on_end: Callable[[str, Outcome], None] = lambda _goal, _outcome: None) -> None:
-        """Create an empty ledger. `on_end` receives the id and outcome of each goal before its end is announced."""
+        """Create an empty ledger. Before the end of a goal is announced, `on_end` is called with its id and outcome."""
         self._on_end = on_end
         self.goals: deque[ActiveGoal] = deque()
-        """Goal that the robot is moving to, followed by the queued goals."""
+        """Current goal, followed by the queued goals."""
         self.answers: list[Answer] = []
         self.notices: list[Notice] = []
         self._commands: dict[Command, deque[tuple[CommandRequest, int]]] = {}
         self._ended: dict[str, _GoalEnd] = {}
         self._refused: tuple[str, RefusalCode] | None = None
-        """Id of the last frequent goal that was refused, and the code of that refusal."""
+        """Id of the last refused goal of a frequently renewed kind, and the code of the refusal."""
 
     # ------------------------------------------------------------------ goals
 
@@ -106,7 +106,7 @@ class Ledger:
         return self.goals[0] if self.goals else None
 
     def check_id(self, request: GoalRequest) -> None:
-        """Raise RefusedError if the id has already been used, unless the request renews the goal under way."""
+        """Raise RefusedError if the id has already been used, unless the request renews the current goal."""
         goal_id = request.id
         running = any(goal.id == goal_id for goal in self.goals)
         ended = self._ended.get(goal_id)
@@ -118,16 +118,19 @@ class Ledger:
             raise _not_renewed(goal_id)
 
     def pass_over(self, request: GoalRequest) -> None:
-        """Accept a renewal that was replaced by a newer one."""
+        """Answer a renewal as accepted although a newer renewal has replaced it."""
         self.answers.append(Accepted(request.ticket, GoalReply(request.id, None)))
 
     def keep_alive(self, request: GoalRequest, until: float) -> None:
-        """Extend the goal under way until the cycle `until`, if the request renews it and the goal is not ending."""
+        """Extend the current goal until the cycle `until` if the request renews the goal.
+
+        A goal that ends because a renewal was refused is not extended.
+        """
         if self.renewed_by(request) and self.goals[0].alive_until > -math.inf:
             self.goals[0] = self.goals[0]._replace(alive_until=until)
 
     def release(self, cycle: int) -> ActiveGoal | None:
-        """Return the goal under way if it was not renewed in time. Each goal is returned only once."""
+        """Return the current goal if the goal was not renewed in time. Each goal is returned only once."""
         goal = self.goal
         if goal is None or goal.released or cycle <= goal.alive_until:
             return None
@@ -137,16 +140,16 @@ class Ledger:
     def begin(
         self, request: GoalRequest, plan: AcceptedPlan, expires: float, alive_until: float, *, at_end: bool = False
     ) -> None:
-        """Accept a goal. It preempts the goals before it, unless it follows them or renews the goal under way.
+        """Accept a goal or a renewal. A new goal preempts the active goals, unless the new goal is queued.
 
         Parameters
         ----------
         expires
             Last cycle in which the goal may begin.
         alive_until
-            Cycle in which the goal ends unless it is renewed.
+            Last cycle of the goal if the goal is not renewed.
         at_end
-            Whether the previous motion has ended. If so, a previous goal with a blend is done.
+            Whether the previous motion has ended. If True, a previous goal with a blend ends as done, not as preempted.
 
         """
         self.answers.append(Accepted(request.ticket, structs.replace(plan.reply, id=request.id)))
@@ -178,7 +181,7 @@ class Ledger:
             self.notices.append(Notice("output", "info", text.text, goal=request.id, planned=marks, **text.fields))
 
     def _renew(self, request: GoalRequest, plan: AcceptedPlan) -> None:
-        """Apply a renewal to the goal under way, and announce a target that is out of reach."""
+        """Update the current goal from a renewal, and announce a target that is beyond a limit."""
         goal, goal_under_way = request.goal, self.goals[0]
         if goal.target is not None and plan.bound not in (None, goal_under_way.bound):
             words = (
@@ -198,7 +201,7 @@ class Ledger:
         self._end_goal(goal.id, goal.user, goal.kind, "done", reason)
 
     def end(self, outcome: Outcome, reason: EventText, but: int = 0, settled: SettlingResult | None = None) -> None:
-        """End all goals except the first `but` goals."""
+        """End all active goals except the first `but` goals."""
         kept = [self.goals.popleft() for _ in range(min(but, len(self.goals)))]
         while self.goals:
             goal = self.goals.popleft()
@@ -209,7 +212,7 @@ class Ledger:
         self.goals.extend(kept)
 
     def withdraw(self, request: GoalRequest, outcome: Withdrawal, reason: str) -> None:
-        """End a goal that has not begun, and answer its request."""
+        """End a goal that has not begun, and answer the request with a refusal."""
         self.answers.append(
             Refused(request.ticket, RefusalCode(outcome), f"goal {request.id} {outcome} before it began: {reason}")
         )
@@ -219,7 +222,7 @@ class Ledger:
             self._end_goal(request.id, request.user, type(request.goal), outcome, ended, refusal=refusal)
 
     def is_all_of(self, user: str | None) -> bool:
-        """Return whether all active goals and commands that need the lease belong to one user."""
+        """Return whether all active goals, and all active commands that need the lease, belong to the given user."""
         commands = (request for under_way in self._commands.values() for request, _ in under_way)
         senders = [goal.user for goal in self.goals] + [one.user for one in commands if not one.name.ignores_lease]
         return all(sender == user for sender in senders)
@@ -227,8 +230,8 @@ class Ledger:
     def refuse(self, request: GoalRequest | CommandRequest, refusal: RefusedError) -> None:
         """Refuse a request and announce the refusal. A refused goal has ended, unless its id was already in use.
 
-        If a goal is renewed frequently, only the first refusal is announced, because hundreds of renewals may follow
-        before the answer reaches their sender.
+        If refusals of a frequently renewed goal repeat, only the first refusal is announced, because the client may
+        send hundreds of renewals before the answer arrives.
         """
         text = answered = str(refusal)
         if isinstance(request, GoalRequest) and request.goal.frequent and not self.renewed_by(request):
@@ -250,14 +253,14 @@ class Ledger:
             outcome: Outcome = "expired" if refusal.code is RefusalCode.EXPIRED else "rejected"
             if self.renewed_by(request):
                 self.notices.append(_refused(text, request.user, refusal))
-                if not request.goal.frequent:  # a refused renewal also ends the goal that it was meant to renew
+                if not request.goal.frequent:  # a refused renewal also ends the goal
                     self.keep_alive(request, -math.inf)
             else:
                 reason = coded(text, EventCode.REFUSED)
                 self._end_goal(request.id, request.user, type(request.goal), outcome, reason, refusal=refusal)
 
     def renewed_by(self, request: GoalRequest) -> bool:
-        """Return whether a request renews the goal under way, which must have the same id, user and kind."""
+        """Return whether a request renews the current goal. Both must have the same id, user and kind."""
         goal = self.goal
         return (
             goal is not None
@@ -277,7 +280,7 @@ class Ledger:
         settled: SettlingResult | None = None,
         refusal: RefusedError | None = None,
     ) -> None:
-        if goal_id in self._ended:  # the event that ended the goal also withdraws its renewals
+        if goal_id in self._ended:  # the event that ended the goal has also withdrawn a waiting renewal
             return
         self._on_end(goal_id, outcome)
         level = _LEVELS.get(outcome, "info")
@@ -294,26 +297,26 @@ class Ledger:
     # ------------------------------------------------------------------ commands
 
     def undertake(self, request: CommandRequest, cycle: int) -> None:
-        """Add a command, which is answered once it is complete."""
+        """Add a command that has started in `cycle`. The command is answered when it is complete."""
         self._commands.setdefault(request.name, deque()).append((request, cycle))
 
     @property
     def busy(self) -> bool:
-        """Whether a command is under way."""
+        """Whether a command is in progress."""
         return any(self._commands.values())
 
     def settle(self, verdict: Callable[[Command, int], str | None], mode: str, cycle: int) -> None:
         """Answer the commands that are complete or have failed.
 
-        Commands of the same name complete in the order of their arrival.
+        Commands of the same name are answered in the order of their arrival.
 
         Parameters
         ----------
         verdict
-            Function that takes the name of a command and the cycle in which it arrived, and returns the result of its
-            Rule.
+            Function that returns the result of a command's completion rule. The arguments are the name of the command
+            and the cycle in which the command arrived.
         mode
-            Mode after the command.
+            Current mode, which the answer contains.
         cycle
             First cycle that shows the effect of the command.
 

@@ -1,4 +1,4 @@
-"""Planner that runs in the calling process, for replays, tests and tools. It answers after a fixed number of cycles."""
+"""Planner that runs in the calling process, for replays, tests and tools. Answers have a fixed delay in cycles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trirail.wire.plan_packets import PlanAnswer, PlanRequest
 
 
 class LocalPlanner:
-    """Implementation of trirail.control.plan_requests.PlannerPort that calls the planner directly."""
+    """Implementation of PlannerPort that plans in the same process, without a planner process."""
 
     def __init__(self, config: Config, delay: int = 1) -> None:
         self.delay = delay
@@ -20,7 +20,7 @@ class LocalPlanner:
         self._turns = 0
 
     def request_plan(self, request: PlanRequest) -> None:
-        """Compute the plan now, and keep it as an answer for a later cycle."""
+        """Compute the plan immediately, and store the answer until it is due."""
         self._answers.append((self._turns + self.delay, self._planner.plan(request)))
 
     def answers(self) -> list[PlanAnswer]:

@@ -1,4 +1,4 @@
-"""Modes of the service as a pure state machine that defines the effect of each event in each mode."""
+"""State machine of the robot's modes. A table without side effects defines the effect of each event in each mode."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class ModeEvent(Enum):
     RESET = auto()
     PAUSE = auto()
     RESUME = auto()
-    NOT_RENEWED = auto()  # the jog or track was not renewed in time
-    INPUT_EDGE = auto()  # an input at which the current goal ends has changed
+    NOT_RENEWED = auto()  # the client did not renew its jog or track in time
+    INPUT_EDGE = auto()  # the digital input that ends the current goal has switched
     HOME = auto()
-    POWERED = auto()  # all drives have reached the state operation enabled
-    HOMED = auto()  # all drives know their positions and follow setpoints again
+    POWERED = auto()  # all drives have reached the state "operation enabled"
+    HOMED = auto()  # all drives know their positions and follow setpoints again after homing
     STANDSTILL = auto()  # the commanded motion is at rest
     ARRIVED = auto()  # the commanded motion is at rest at the end of its path
     FAULT = auto()  # a drive, the bus or a setpoint is faulty
@@ -34,7 +34,7 @@ class ModeEvent(Enum):
 
 
 class Action(Enum):
-    """Action that the loop takes when the state changes, in the same cycle."""
+    """Action that the loop executes in the cycle in which the state changes."""
 
     NOTHING = auto()
     POWER_UP = auto()
@@ -49,10 +49,10 @@ class Action(Enum):
 
 
 class ModeState(NamedTuple):
-    """Mode, and what happens once the robot is at rest.
+    """Mode of the robot, with flags for the next change once the robot is at rest.
 
-    With `disable_after` the drives are then disabled, with `paused` the goal is kept to be resumed, and with `released`
-    the jog or track ends.
+    If `disable_after` is set, the drives are disabled. If `paused` is set, the goal remains available for a resume. If
+    `released` is set, the goal ends: a jog or track that was not renewed, or a goal that an input has stopped.
     """
 
     mode: Mode
@@ -62,12 +62,12 @@ class ModeState(NamedTuple):
 
     @property
     def has_goal(self) -> bool:
-        """Whether there can be a goal under way in this state."""
+        """Whether the robot can have an active goal in this state."""
         return self.mode is Mode.MOVING or self.paused or self.released
 
 
 class Step(NamedTuple):
-    """Next state, and the action to take on the transition."""
+    """Transition to a state, with the action that belongs to the transition."""
 
     state: ModeState
     action: Action = Action.NOTHING
@@ -236,7 +236,7 @@ STATES = tuple(_TABLE)
 def step(state: ModeState, event: ModeEvent) -> Step | Refusal:
     """Return the effect of `event` in `state`. An event without an entry in the table changes nothing.
 
-    A request whose result already holds is confirmed, not refused: an example is stopping a robot that is at rest. The
-    first fault stays latched until a reset, after which the robot is disabled.
+    A request that would change nothing is confirmed, not refused. An example is a stop while the robot is at rest. The
+    mode FAULT lasts until a reset, after which the robot is disabled.
     """
     return _TABLE[state].get(event, Step(state))

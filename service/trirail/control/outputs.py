@@ -1,8 +1,8 @@
-"""Digital outputs: their values, and the marks on a goal's path at which they switch.
+"""Digital outputs, and the marks on the path of a goal at which outputs switch.
 
-An output switches in the cycle whose setpoints are nearest to its mark on the commanded path, because the drives take
-up the setpoints and the outputs at the same SYNC. The error is therefore at most half a cycle. If an output has a
-delay, it switches earlier by that delay; this is possible because the commanded path is known in advance.
+The drives apply setpoints and outputs at the same SYNC. An output therefore switches in the cycle that has the
+setpoints nearest to the mark, and the error is at most half a cycle. If the device behind an output has a delay, the
+output switches earlier by this delay. This is possible because the commanded path is known in advance.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ OUTPUT: Final = np.dtype(
         ("delay", "<f8"),  # delay of the device that the output switches [s]
         ("next", "<i8"),  # index of the next planned switch, and end of this output's rows in the table
         ("end", "<i8"),
-        ("goal", "<i8"),  # number of the goal whose pulse or stretch holds the output; 0 for none
-        ("mark", "<i8"),  # the mark that has switched it
-        ("opened", "<i8"),  # value of the output while the goal holds it
-        ("until", "<i8"),  # cycle in which a pulse ends; 0 for none
+        ("goal", "<i8"),  # number of the goal with an active pulse or stretch on the output; 0 if there is none
+        ("mark", "<i8"),  # index of the mark that has switched the output
+        ("opened", "<i8"),  # value of the output during the pulse or stretch
+        ("until", "<i8"),  # cycle in which the pulse ends; 0 if no pulse is active
     ],
     align=True,
 )
@@ -47,14 +47,14 @@ PLANNED: Final = np.dtype(
     [
         ("s", "<f8"),  # time along the path [s]
         ("on", "<i8"),
-        ("cycles", "<i8"),  # duration of a pulse; 0 if the value stays
-        ("opens", "<i8"),  # whether a later switch or the end of a pulse switches it back
+        ("cycles", "<i8"),  # duration of a pulse [cycles]; 0 if the switch is not a pulse
+        ("opens", "<i8"),  # whether this goal later switches the output back
         ("goal", "<i8"),
         ("mark", "<i8"),
     ],
     align=True,
 )
-"""Planned switch. The table is sorted by output and by time along the path."""
+"""Planned switch of an output. The table of planned switches is sorted by output and by time along the path."""
 SWITCHED: Final = np.dtype(
     [
         ("cycle", "<i8"),
@@ -69,11 +69,11 @@ SWITCHED: Final = np.dtype(
     ],
     align=True,
 )
-"""Switch that has taken place."""
+"""Record of a switch that has taken place."""
 LOG_LENGTH = 512
-"""Number of switches that the log can hold until Python reads them."""
+"""Number of rows in the log of switches, which compiled code fills and Python empties."""
 TABLE_DELAY = 0.1
-"""Time after which switches are reported even if they do not fill a message [s]."""
+"""Longest time for which switches are collected before they are reported in one message [s]."""
 TABLE_LENGTH = 50
 """Greatest number of switches in one message."""
 
@@ -103,7 +103,7 @@ def _note(
     mark: int,
     record: NDArray[np.void],
 ) -> int:
-    """Append a switch to the log and return the new number of rows. A full log ignores further switches."""
+    """Append a switch to the log and return the new number of rows. If the log is full, the switch is not logged."""
     if number < len(log):
         row = log[number]
         row.cycle, row.output, row.on, row.goal, row.mark, row.closed = cycle, output, on, goal, mark, 0
@@ -155,9 +155,9 @@ def switch(
             output.until, output.goal = 0, 0
         if not moves or output.next >= output.end:
             continue
-        # Switch with the nearer of two setpoints: this one if the mark is before the middle between this setpoint and
-        # the next. The law gives both, also while it brakes, and no later decision can change the motion within one
-        # period.
+        # Switch together with the setpoint that is nearer to the mark: with the current setpoint if the mark is before
+        # the middle between the current and the next setpoint. The law gives both setpoints, even while it brakes. No
+        # later decision can change the motion within one period.
         here = law_at(law_knots, law_pieces, time + output.delay)[0]
         there = law_at(law_knots, law_pieces, time + period + output.delay)[0]
         while output.next < output.end and planned[output.next].s <= (here + there) / 2.0:
@@ -171,7 +171,7 @@ def switch(
 
 
 class Outputs:
-    """Outputs and inputs of a robot. Their names are those in the configuration."""
+    """Digital outputs and inputs of a robot, by their names in the configuration."""
 
     def __init__(self, outputs: Mapping[str, Output], inputs: Mapping[str, Input], period: float) -> None:
         self._named = dict(outputs)
@@ -190,18 +190,18 @@ class Outputs:
             row["axis"], row["bit"], row["delay"] = NAMES.index(output.drive), 1 << output.bit, output.delay
         self.make_safe()
         self._goals: dict[str, int] = {}
-        """Numbers of the goals in the tables, by goal id; 0 means no goal."""
+        """Number that represents each goal in the tables, under the id of the goal. The number 0 represents no goal."""
         self._number = 0
         self._over: set[str] = set()
-        """Goals that have ended but whose last switches are not yet reported."""
+        """Goals that have ended, but with switches that have not been reported yet."""
         self._table: list[GoalMarks] = []
-        """Goals whose switches are in the table."""
+        """Marks of the goals that have switches in the table."""
         self._built_for: tuple[Run | None, int, int] = (None, -1, 0)
         self._first = [0] * len(self._names)
         """First row of the table for each output."""
         self._safe_in: Mode | None = None
         self._reported = 0
-        """Cycle of the latest report."""
+        """Cycle in which switches were last reported."""
 
     @property
     def any(self) -> bool:
@@ -209,7 +209,7 @@ class Outputs:
         return bool(self._names)
 
     def allow_paths(self, allowed: tuple[bool, bool, bool]) -> None:
-        """Set for each drive whether it takes outputs together with setpoints, as switching along a path requires."""
+        """Set which drives apply outputs together with setpoints. Only their outputs can switch along a path."""
         self._path_allowed = allowed
 
     # ------------------------------------------------------------------ values
@@ -244,7 +244,7 @@ class Outputs:
                 self.make_safe()
 
     def make_safe(self) -> None:
-        """Set all outputs to their safe values. Pulses and stretches that are in progress end."""
+        """Set all outputs to their safe values, and end active pulses and stretches."""
         self.state["until"] = self.state["goal"] = 0
         for number, output in enumerate(self._named.values()):
             self._write(number, output.safe)
@@ -262,7 +262,7 @@ class Outputs:
     # ------------------------------------------------------------------ inputs
 
     def edges(self, before: Sequence[int], now: Sequence[int]) -> list[tuple[str, bool]]:
-        """Return the inputs that differ between two readings of the drives' words, with their new values."""
+        """Return the names and new values of the inputs that differ between two readings of the drives' input words."""
         return [
             (name, bool(now[axis] & bit))
             for name, (axis, bit) in self._inputs.items()
@@ -278,7 +278,7 @@ class Outputs:
     # ------------------------------------------------------------------ marks
 
     def check_marks(self, marks: Sequence[Mark]) -> None:
-        """Raise RefusedError if a mark names an unknown output or one that cannot be switched along a path."""
+        """Raise RefusedError if a mark names an unknown output, or an output that cannot switch along a path."""
         for mark in marks:
             drive = self._find(mark.output).drive
             if not self._path_allowed[NAMES.index(drive)]:
@@ -318,7 +318,7 @@ class Outputs:
         return self._goals[goal]
 
     def _note_passed(self) -> None:
-        """Record which switches of each goal in the table have taken place."""
+        """Inform the marks of each goal in the table which of their switches have taken place."""
         for number, name in enumerate(self._names):
             passed = self.planned["goal"][self._first[number] : int(self.state[number]["next"])]
             for goal in (goal for goal in self._table if goal.goal in self._goals):
@@ -336,7 +336,7 @@ class Outputs:
         )
 
     def stamp(self, deadline_ns: int) -> None:
-        """Store the deadline of the latest cycle as the time of the switches in that cycle [ns]."""
+        """Store the deadline of the latest cycle in all log entries that have no time yet [ns]."""
         for row in self.log[: self.logged]:
             row["deadline_ns"] = row["deadline_ns"] or deadline_ns
 
@@ -351,11 +351,14 @@ class Outputs:
         return self._reported + self.report_after
 
     def update_log(self, logged: int, report_due: int) -> None:
-        """Update the log after compiled cycles: its number of rows, and the cycle after which it is reported."""
+        """Set the number of rows in the log, and the cycle after which the log is reported, after compiled cycles."""
         self.logged, self._reported = logged, report_due - self.report_after
 
     def close(self, goal: str, outcome: Outcome, cycle: int, record: NDArray[np.void]) -> None:
-        """Switch back the outputs that an ended goal still holds. Pulses of a goal that is done run to their end."""
+        """Switch back the outputs that are still switched by an ended goal.
+
+        If the goal is done, its pulses still run to their end.
+        """
         if goal not in self._goals:
             return
         number = self._goals[goal]
@@ -372,9 +375,9 @@ class Outputs:
             row["goal"] = row["until"] = 0
 
     def pop_switches(self, cycle: int, *, all_: bool = False) -> list[tuple[Switch, ...]]:
-        """Return the switches to report now, grouped into one table per message.
+        """Remove and return the switches that must be reported now, in one tuple per message.
 
-        Their times are on the monotonic clock, or NaN if the record of the cycle does not exist yet.
+        The times of the switches are on the monotonic clock, or NaN if the deadline of the cycle is not known yet.
         """
         due = all_ or self.logged >= TABLE_LENGTH or (cycle - self._reported) * self._period >= TABLE_DELAY
         if self.logged and not due:

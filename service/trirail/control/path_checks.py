@@ -1,7 +1,7 @@
-"""Checks of goals. A goal is planned from rest at the end of the current motion, only to answer the request.
+"""Checks of goals without motion: a goal is planned, and the reply says whether the robot could execute the goal.
 
-A check moves nothing and publishes no event. It does not depend on the mode or on the lease. Goals take precedence over
-checks.
+The path of a check begins at rest, by default at the end of the current motion. A check moves nothing and publishes no
+event. It does not depend on the mode or on the lease. Goals take precedence over checks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NO_MOTION = (0.0, 0.0, 0.0)
 
 
 class PathChecks:
-    """Queue of checks. The planner receives one check at a time, while it is not planning a goal."""
+    """Queue of checks. One check at a time is sent to the planner, whenever no goal is being planned."""
 
     def __init__(
         self,
@@ -48,10 +48,10 @@ class PathChecks:
         self._outputs = outputs
         self._waiting: deque[CheckRequest] = deque()
         self._number = 0
-        """Number of the last request. It is negative, because the numbers of goal requests are positive."""
+        """Number of the last check sent to the planner. Checks have negative numbers, requests for goals positive."""
         self._asked_before: int | None = None
-        """Number of goal requests sent before the pending check. A later goal request replaces the check at the
-        planner."""
+        """Number of goal requests sent before the pending check. If this number has increased, the planner has dropped
+        the check in favour of a goal."""
 
     @property
     def due(self) -> bool:
@@ -76,7 +76,7 @@ class PathChecks:
                 self._refuse(refusal)
 
     def receive(self, answer: PlanAnswer) -> None:
-        """Answer the check that was last sent to the planner; ignore every other answer."""
+        """Answer the pending check if `answer` belongs to it; ignore all other answers of the planner."""
         if self._asked_before is None or answer.number != self._number:
             return
         if isinstance(answer, NotPlanned):
@@ -87,7 +87,7 @@ class PathChecks:
         self._ledger.answers.append(Checked(request.ticket, reply))
 
     def fail(self, reason: str) -> None:
-        """Refuse the pending check, because the planner will not answer it."""
+        """Refuse the pending check, because the planner will not answer."""
         if self._under_way:
             self._refuse(RefusedError(RefusalCode.PLANNER_LOST, f"{reason}: send the check again"))
 
@@ -111,7 +111,7 @@ class PathChecks:
         )
 
     def _refuse(self, refusal: RefusedError) -> None:
-        """Answer the first check with a refusal."""
+        """Answer the first check in the queue with a refusal."""
         code, text = refusal.code, str(refusal)
         self._ledger.answers.append(
             Refused(self._dequeue().ticket, code, text, refusal.slider, refusal.value, refusal.limit)

@@ -1,7 +1,7 @@
-"""Requests to the planner, for one goal at a time, and application of its answers to the motion under way.
+"""Requests to the planner for one goal at a time, and application of the planned motions to the schedule.
 
-The planner is a separate process. Its answer may arrive late, twice, for a motion that is no longer under way, or
-never. Nothing that stops the robot waits for the planner.
+The planner is a separate process. An answer may arrive late or twice, may be missing, or may belong to a motion that
+has ended. No function that stops the robot waits for the planner.
 """
 
 from __future__ import annotations
@@ -32,41 +32,41 @@ from trirail.wire.messages import GoalReply
 from trirail.wire.plan_packets import NotPlanned, PathExtension, PlanAnswer, PlanRequest, PreemptingMotion
 
 LEADS = (0.003, 0.012, 0.048)
-"""Time between the request for a motion that starts from motion and the start of that motion [s]: for the first
-request and for each repetition."""
+"""Time between a request and the start of the planned motion, if the robot is moving [s]. The first value is used for
+the first request, the others for its repetitions."""
 MIN_LEAD_CYCLES = 2
-"""Shortest time between request and start [cycles], because an answer arrives in the next cycle at the earliest."""
+"""Shortest time between a request and the start of the motion [cycles]. An answer arrives at least one cycle later."""
 PLANNING_TIMEOUT_S = 8.0
-"""Longest wait for the planner's answer [s]. A dead planner is reported immediately."""
+"""Longest wait for an answer of the planner [s]. The end of the planner process is reported without this delay."""
 BUSY_AFTER_S = 0.5
 """Time without an answer after which the planner is reported as busy [s]."""
 LEAD_FACTOR = 2
-"""Time between a repeated request and the start of its motion, in multiples of the delay of the last answer."""
+"""Shortest time between a repeated request and the start of the motion, in multiples of the last answer's delay."""
 MAX_RATE_CHANGE_CYCLES = 12
-"""Longest wait for a change of rate before a goal is planned anyway [cycles]."""
+"""Longest time that planning of a goal waits for a change of the rate [cycles]."""
 ROUNDING = (1e-9, 1e-7, 1e-5)
 """Greatest differences in position, velocity and acceleration between the commanded motion and the start of a new
-one [m, rad, …]."""
+motion [m, rad, …]."""
 
 
 class PlannerPort(Protocol):
-    """Port through which requests are sent to the planner."""
+    """Connection of the control to the planner, which may be another process."""
 
     def request_plan(self, request: PlanRequest) -> None:
         """Send a request without waiting. The control receives the planner's answer in a later cycle."""
 
 
 class AcceptedPlan(NamedTuple):
-    """Plan that has been accepted for a goal."""
+    """Plan of a goal that has become part of the schedule."""
 
     reply: GoalReply
     """Reply to the sender of the goal, without the goal's id."""
     bound: str | None = None
-    """Limit at which a jog stops, or which the target of a track exceeds."""
+    """Name of the limit that stops a jog, or that the target of a track exceeds."""
 
 
 class PlanRequests:
-    """Updates of the motion schedule: rate changes, which are computed here, and goals, which the planner plans."""
+    """Updates of the motion schedule. Changes of the rate are computed here; goals are planned by the planner."""
 
     def __init__(self, config: Config, port: PlannerPort, schedule: Schedule) -> None:
         self.override = 1.0
@@ -108,7 +108,7 @@ class PlanRequests:
 
     @property
     def awaits_answer(self) -> bool:
-        """Whether the planner has yet to answer the current request."""
+        """Whether a request has been sent to the planner and has not been answered."""
         return self._goal is not None and self._request is not None and self._answer is None
 
     @property
@@ -132,12 +132,12 @@ class PlanRequests:
 
     @property
     def busy_message(self) -> str:
-        """Message for the user that the planner is busy; empty if it is not."""
+        """Message to the user that the planner is busy; empty if the planner is not busy."""
         silence = self.silence
         return f"the planner is busy, no answer for {silence:.1f} s" if silence > BUSY_AFTER_S else ""
 
     def warm_up(self) -> None:
-        """Run the code once on a schedule that is never executed, because the first run is slow."""
+        """Compute a rate change for a schedule that is never executed, because the first call of the code is slow."""
         nowhere = Schedule(rest(ZERO_RATES), self._period)
         path = Path(np.array([0.0, 1.0]), np.zeros((1, 3, 6)))
         nowhere.replace_runs(deque([unpack_run(self._legs, pack_run(Run(self._legs, path, constant_law(1.0), 1.0)))]))
@@ -164,17 +164,17 @@ class PlanRequests:
         self._goal = self._request = self._answer = self._lost = self._since = None
 
     def set_running(self, running: bool) -> None:
-        """Run the current motion at the speed override, or brake it."""
+        """Run the current motion at the speed override, or brake to a standstill."""
         self._running = running
         self._start_rate_change()
 
     def update_rate(self) -> None:
-        """Apply a new override or a changed path to the current motion, unless it is braking."""
+        """Adapt the rate of the current motion to a new override or a changed path, unless the motion is braking."""
         if self._running:
             self._start_rate_change()
 
     def discard_rate_change(self) -> None:
-        """Discard the rate change, because no motion is under way."""
+        """Discard the rate change, because the motion has ended."""
         self._running, self._change = False, None
 
     def receive(self, answer: PlanAnswer) -> None:
@@ -190,11 +190,11 @@ class PlanRequests:
             self._lost = reason
 
     def step(self) -> AcceptedPlan | None:
-        """Advance a rate change, then request or apply the motion of the goal. Return the plan if one is accepted.
+        """Advance a rate change, then request or apply the motion of the goal. Return the plan once it is accepted.
 
-        A rate change takes precedence over a request. If the sliders do not allow the change within
-        MAX_RATE_CHANGE_CYCLES, the goal is planned from the current motion anyway. While a request is pending, only a
-        change to a lower rate is made. Raises RefusedError if the goal cannot be reached.
+        A rate change takes precedence over a request. If the limits of the sliders delay the change for more than
+        MAX_RATE_CHANGE_CYCLES, the goal is planned from the current motion without waiting. While a request is pending,
+        the rate is only lowered. Raises RefusedError if the goal cannot be reached.
         """
         self._change_rate()
         if self._goal is None:
@@ -230,7 +230,7 @@ class PlanRequests:
             self._change = None
 
     def _request_plan(self, goal: Goal) -> None:
-        """Request a motion to the goal from the current one. Raises RefusedError after too many requests."""
+        """Request a motion from the current motion to the goal. Raises RefusedError after too many requests."""
         if self._attempts == len(self._leads):
             text = f"{self._attempts} plans came too late, or the motion under way changed: send the goal again"
             raise RefusedError(RefusalCode.NO_PLAN, text)
@@ -261,7 +261,10 @@ class PlanRequests:
         return max(lead, self._answer_cycles + 1) if goal.frequent else lead
 
     def _apply(self, answer: PlanAnswer) -> AcceptedPlan | None:
-        """Apply the planner's answer once it is due; drop it and request another if the motion has changed."""
+        """Apply the planner's answer once it is due. If the current motion no longer fits, drop the answer.
+
+        After a dropped answer, `step` requests another plan.
+        """
         if isinstance(answer, NotPlanned):
             raise answer.error()
         try:
@@ -293,7 +296,7 @@ class PlanRequests:
         return AcceptedPlan(planned.reply, planned.bound)
 
     def _stopping(self, under_way: Run, planned: PreemptingMotion) -> Run:
-        """Return the current motion with a law that stops it. The goals on its path are removed."""
+        """Return a copy of the current motion that stops on its path, without the goals that follow on the path."""
         run = under_way.copy()
         run.seams.clear()
         run.marks.clear()
@@ -302,8 +305,8 @@ class PlanRequests:
         return run
 
     def _continues(self, runs: Iterable[Run]) -> bool:
-        """Return whether the runs continue the commanded motion and each begins where the one before it ends."""
-        # From rest, a trajectory may begin with an acceleration; the planner has checked the resulting jerk.
+        """Return True if the runs continue the commanded motion and each other without a jump."""
+        # A trajectory may begin with an acceleration from rest, because the planner has checked the resulting jerk.
         state = self._schedule.commanded
         for run in runs:
             begins = run.state(0.0, state.pose)
@@ -334,7 +337,7 @@ class PlanRequests:
 
 
 def _same(one: MotionState, other: MotionState) -> bool:
-    """Return whether two states of motion agree within rounding. The result is False for NaN."""
+    """Return whether two states of motion agree within ROUNDING. The result is False for NaN."""
     return all(
         abs(a - b) <= allowed
         for allowed, here, there in zip(ROUNDING, one, other, strict=True)

@@ -1,4 +1,4 @@
-"""Events for drives that restart or disappear, and for sliders that have moved when their drives return."""
+"""Messages about drives that are lost and return, and about sliders that have moved while their drives were off."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from trirail.wire.messages import Level
 
 
 class ReturningDrives:
-    """Detector of drives that are lost or configured again. It compares each feedback with the previous one."""
+    """Detector of drives that are lost or have been configured again. It compares successive feedback."""
 
     def __init__(self, labels: tuple[str, str, str], windows: Triple) -> None:
-        """Set the labels of the drives. `windows` are the greatest position changes that are not reported [m]."""
+        """Set the labels of the drives. A slider that moves by more than its value of `windows` [m] is reported."""
         self._labels = labels
         self._windows = windows
         self._before: tuple[Unready | None, ...] = (None, None, None)
@@ -22,7 +22,7 @@ class ReturningDrives:
         """Position of each drive when it was lost [m]; None if it was not homed."""
 
     def update(self, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
-        """Yield the messages about changes, each with its level."""
+        """Yield a level and a message for each drive that has been lost or has returned."""
         if feedback.unready == self._before:
             return
         reported = {feedback.fault.message} if feedback.fault is not None else set()
@@ -39,7 +39,7 @@ class ReturningDrives:
         self._before = feedback.unready
 
     def _back(self, i: int, feedback: Feedback) -> Iterator[tuple[Level, EventText]]:
-        """Yield messages that a drive is configured again, and whether its slider has moved."""
+        """Yield a message that a drive is configured again, and a warning if its slider has moved or is not homed."""
         label, position, last = self._labels[i], feedback.position[i], self._last[i]
         waiting = any(each is not None for each in feedback.unready)
         if waiting:

@@ -1,4 +1,4 @@
-"""Setpoints of the sliders. They are either solved and checked by the last gate, or follow the measured sliders."""
+"""Setpoints of the sliders. They are computed from the commanded motion, or they follow the measured sliders."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from trirail.wire.event_codes import EventCode, EventText, coded
 from trirail.wire.vocabulary import Mode
 
 _ALLOWED = {Mode.HOLDING: AllowedMotion.NONE, Mode.STOPPING: AllowedMotion.BRAKING}
-"""Motion that each mode allows. The gate is not used in modes in which the commanded motion follows the measured
-one."""
+"""Motion that the last gate allows in each mode; any motion in other modes. The last gate is not used in modes in which
+the setpoints follow the measured sliders."""
 
 
 class Setpoints:
-    """Setpoints for the next SYNC.
+    """Setpoints for the next SYNC, and their check by the last gate.
 
     Parameters
     ----------
     tolerance
-        Result of trirail.motion.limits.standing_tolerance.
+        Tolerances for a robot at rest outside its limits, from trirail.motion.limits.standing_tolerance.
     step
         Greatest travel of a slider in one cycle [m].
 
@@ -56,12 +56,12 @@ class Setpoints:
 
     @property
     def refused_values(self) -> Array:
-        """Values that the last gate has refused, (2,)."""
+        """Refused value, and the value with which it was compared, (2,)."""
         return self._bounds.last_violation
 
     @property
     def rows(self) -> list[list[float]]:
-        """Position, velocity and acceleration of the sliders, then of the cross slides; one row each."""
+        """Six rows: position, velocity and acceleration of the sliders, then of the cross slides."""
         return self.sliders[0].tolist()  # type: ignore[no-any-return]  # numpy does not annotate the type of its lists
 
     @property
@@ -71,7 +71,7 @@ class Setpoints:
         return (a, b, c), (u, v, w)
 
     def start(self) -> None:
-        """Start with setpoints equal to the measured slider positions."""
+        """Set the first setpoints to the measured slider positions."""
         self.sliders[0, 0] = self._measured.position
 
     def allow(self, mode: Mode) -> None:
@@ -79,9 +79,9 @@ class Setpoints:
         self.bounds[0]["allowed"] = _ALLOWED.get(mode, AllowedMotion.ANY)
 
     def solve(self, schedule: Schedule, run: Run | None) -> int:
-        """Advance the commanded motion by one period of the run, and solve the slider positions for it.
+        """Advance the commanded motion along the run by one period, and solve the slider positions.
 
-        The slider positions do not change if the last gate refuses the result. Returns the code of
+        If the last gate refuses the result, the slider positions do not change. Returns the result of
         trirail.control.cycle.command.
         """
         legs, bounds, refused_values = self._legs, self._bounds.packed, self._bounds.last_violation
@@ -96,7 +96,7 @@ class Setpoints:
         )
 
     def refusal(self, code: int) -> str | None:
-        """Return the reason why the last gate refused the setpoints; None if the code contains no refusal."""
+        """Return the reason why the setpoints were refused; None if the result code contains no refusal."""
         refused = cycle.refusal(code)
         if refused == 0:
             return None
@@ -115,18 +115,18 @@ class Setpoints:
         return f"setpoint refused: {self._bounds.violation(refused - len(NAMES))}"
 
     def follow(self, schedule: Schedule, *, held: bool, stopped_now: bool) -> None:
-        """Command the measured pose, and move the setpoint of each drive that holds no position to its measured one.
+        """Set the commanded pose to the measured pose, and let the setpoints follow the measured sliders.
 
-        A setpoint moves no faster than a slider. Nothing therefore moves when the drives are enabled, and a drive that
-        has missed the command to stop does not jump. For a drive that moves by itself to home, the setpoint is the
-        measured position.
+        With setpoints at the measured positions, nothing moves when the drives are enabled. A setpoint moves no faster
+        than a slider. A drive that has missed the command to stop therefore does not jump. While a drive homes itself,
+        the setpoint equals the measured position.
 
         Parameters
         ----------
         held
-            Whether enabled drives keep their setpoints.
+            Whether the setpoints of enabled drives remain unchanged.
         stopped_now
-            Whether all drives were stopped in this cycle, so that all of them keep their setpoints.
+            Whether all drives were stopped in this cycle. If True, the setpoints of all drives remain unchanged.
 
         """
         measured = self._measured
@@ -134,19 +134,19 @@ class Setpoints:
         cycle.follow(self._legs, measured.numbers, measured.jumping, held, stopped_now, self.step, *arrays)
 
     def set_cross_slides(self, pose: Sequence[float]) -> None:
-        """Set the positions of the cross slides for a pose. The gate compares the next setpoint with them."""
+        """Set the positions of the cross slides for a pose. The last gate compares the next setpoint with them."""
         self._motion[:] = 0.0
         self._motion[0] = pose
         if inverse_into(self._legs, self._motion, self._tried) == 0:
             self.sliders[0, 3:] = self._tried[3:]
 
     def record_progress(self, progress: float, remaining: float) -> None:
-        """Record the completed share of the current goal, and its remaining time [s]."""
+        """Write the completed fraction and the remaining time [s] of the current goal to the record."""
         record = self._measured.record
         record["progress"], record["remaining"] = progress, remaining
 
     def check_rest(self) -> None:
-        """Raise RefusedError on enable if a setpoint is still moving towards its slider."""
+        """Raise RefusedError if a setpoint has not reached its slider, in which case the drives must not be enabled."""
         places = self._measured.position
         for name, setpoint, position in zip(self._bounds.labels, self.rows[0], places, strict=True):
             if not abs(setpoint - position) <= self.step:
@@ -156,10 +156,10 @@ class Setpoints:
                 )
 
     def check_start(self) -> EventText | None:
-        """Return a warning if the robot is outside its limits by more than the tolerance, else None.
+        """Return a warning if the robot is outside its limits by more than the tolerance; otherwise None.
 
-        From there, only motion back towards the limits is accepted. Raises RefusedError if the robot is at or beyond a
-        singular pose, because no motion may pass through one.
+        A robot outside its limits can only move back towards the limits. Raises RefusedError if the robot is at or
+        beyond a singular pose, because no motion may pass through a singular pose.
         """
         pose = self._measured.pose_of(self._measured.position)
         self._motion[:] = 0.0

@@ -1,4 +1,4 @@
-"""Changes of mode, and the resulting actions on drives, motion and goals in the same cycle."""
+"""Changes of the mode, with their effects on drives, motion and goals. The effects take place in the same cycle."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OUTCOMES: dict[ModeEvent, Outcome] = {
     ModeEvent.INPUT_EDGE: "done",
     ModeEvent.FAULT: "faulted",
 }
-"""Outcome of a goal that an event ends; "stopped" for events that are not listed."""
+"""Outcome of a goal that is ended by an event. For all other events the outcome is "stopped"."""
 _ORDERS: dict[Action, Callable[[DriveGroup], None]] = {
     Action.POWER_UP: lambda drives: drives.enable(),
     Action.POWER_DOWN: lambda drives: drives.disable(),
@@ -35,7 +35,7 @@ _ORDERS: dict[Action, Callable[[DriveGroup], None]] = {
     Action.HOME: lambda drives: drives.home(),
     Action.STOP_HOMING: lambda drives: drives.stop_homing(),
 }
-"""Order to the drives for each action. Actions that are not listed affect only the motion."""
+"""Call to the drives for each action. Actions without an entry affect only the motion."""
 _KEEPS_GOALS = (
     ModeEvent.GOAL,
     ModeEvent.STANDSTILL,
@@ -48,11 +48,14 @@ _KEEPS_GOALS = (
         if not name.stops and name.name in ModeEvent.__members__ and name is not Command.HOME
     ),
 )
-"""Events after which goals that have been received but not begun are kept."""
+"""Events that do not withdraw the goals that have been received but have not begun."""
 
 
 class Transitions:
-    """Current mode of the robot, and its changes. Between two cycles, `cycle` is the number of the next one."""
+    """Current mode of the robot, and the methods that change the mode.
+
+    Between two cycles, `cycle` is the number of the next cycle.
+    """
 
     def __init__(
         self,
@@ -78,9 +81,9 @@ class Transitions:
         self.entered = 0
         """Cycle in which the robot entered the current mode."""
         self._edge: EventText | None = None
-        """Edge of an input that has ended the current goal."""
+        """Text about the input edge that has stopped the current goal; None if no edge has stopped the goal."""
         self.orders = 0
-        """Number of orders sent to the drives."""
+        """Number of actions that have been sent to the drives."""
 
     def check(self, event: ModeEvent) -> Step:
         """Return the effect that an event would have now. Raises RefusedError if the current mode does not allow it."""
@@ -91,7 +94,10 @@ class Transitions:
         return decided
 
     def apply_event(self, event: ModeEvent, reason: EventText, goal: GoalRequest | None = None) -> None:
-        """Change the mode and take the action, if the mode allows the event. `goal` is the goal being started."""
+        """Change the mode and execute the action of the transition, if the current mode allows the event.
+
+        `goal` is the goal that the event starts, or None.
+        """
         decided = step(self.state, event)
         if isinstance(decided, Refusal):
             return
@@ -107,7 +113,7 @@ class Transitions:
         if goal is not None or not self.state.has_goal:
             self._measured.settling.cancel()
         if not self.state.has_goal:
-            self._schedule.stop_on_path()  # also while braking, so that no later goal begins on the way
+            self._schedule.stop_on_path()  # also while the robot brakes; otherwise the next goal could begin
             outcome = _OUTCOMES.get(event, "stopped")
             arrived = EventCode.RELEASED if before.released else EventCode.ARRIVED
             at_end = self._edge if self._edge is not None else coded(arrived.value, arrived)
@@ -125,7 +131,7 @@ class Transitions:
             self._planner.discard_rate_change()
 
     def handle_disturbance(self, event: ModeEvent, reason: EventText) -> None:
-        """Handle a disturbance: the loss of the gateway, late ticks, or the end of the service."""
+        """Handle the loss of the gateway, a series of late ticks, or the shutdown of the service."""
         decided = step(self.state, event)
         if not isinstance(decided, Refusal) and decided.state != self.state:
             self._ledger.notices.append(Notice("service", "warning", reason.text, **reason.fields))
@@ -133,7 +139,7 @@ class Transitions:
         self.withdraw(event, reason)
 
     def trip(self, reason: EventText, cause: str, drive: str = "", code: int = 0) -> None:
-        """Stop all three drives now and latch the reason. `cause`, `drive` and `code` are as in FaultDetail."""
+        """Stop all three drives immediately and latch the reason. FaultDetail explains `cause`, `drive` and `code`."""
         if self.state.mode is Mode.FAULT:
             return
         self.fault = reason.text
@@ -143,7 +149,7 @@ class Transitions:
         self.withdraw(ModeEvent.FAULT, reason)
 
     def withdraw(self, event: ModeEvent, reason: EventText) -> None:
-        """End goals that have not begun, if the event stops the robot. Call this after `apply_event`."""
+        """End the goals that have not begun, unless the event is one of _KEEPS_GOALS. Call this after `apply_event`."""
         if event not in _KEEPS_GOALS:
             self._goal_queue.withdraw("faulted" if event is ModeEvent.FAULT else "stopped", reason.text)
 
@@ -155,7 +161,7 @@ class Transitions:
             case Action.CLEAR:
                 self.fault = None
             case Action.BRAKE:
-                if not decided.state.paused:  # stop on the current path, so that later goals do not begin
+                if not decided.state.paused:  # brake within the current path; later goals must not begin
                     self._schedule.stop_on_path()
                 self._planner.set_running(False)
             case Action.RESUME:

@@ -1,1 +1,1 @@
-"""Recursion of the paper, the robot built on it, and its calibration. All modules are pure mathematics, compiled."""
+"""Kinematics of the robot, based on the recursion of the paper, and calibration. All modules are pure mathematics."""

@@ -1,4 +1,4 @@
-"""Vectors and 3 x 3 matrices as tuples, which compiled code holds in registers: no allocation, no loops."""
+"""Vectors and 3 x 3 matrices as tuples. Compiled code keeps tuples in registers, without allocations and loops."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def dot(x: Vector, y: Vector) -> float:
 
 @inlined
 def cross(x: Vector, y: Vector) -> Vector:
-    """Return x̃ y, where x̃ is the skew-symmetric matrix associated to x."""
+    """Return x̃ y, the cross product, where x̃ is the skew-symmetric matrix of x."""
     return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
 
 
@@ -77,6 +77,6 @@ def product(a: Matrix, q: Matrix) -> Matrix:
 
 @inlined
 def turned(phi: float, q: Matrix) -> Matrix:
-    """Return q^phi q, with q^phi of (3): on to a frame that is turned by phi [rad] about the z axis."""
+    """Return q^phi q, with q^phi from (3), which rotates the frame of q by phi [rad] about the z axis."""
     c, s = math.cos(phi), math.sin(phi)
     return add(scale(c, q[0]), scale(s, q[1])), subtract(scale(c, q[1]), scale(s, q[0])), q[2]

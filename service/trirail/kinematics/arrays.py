@@ -1,4 +1,4 @@
-"""Type aliases of the arrays and vectors in the mathematics."""
+"""Type aliases for the arrays, vectors and matrices of the kinematics."""
 
 from __future__ import annotations
 

@@ -1,13 +1,14 @@
-"""Calibration: identification of the robot as built, from measured poses and the slider readings at these poses.
+"""Calibration: identification of the as-built geometry from measured poses and the slider readings at these poses.
 
-The measured poses differ from forward(geometry, sliders) by independent normal noise. The encoders of the sliders are
-taken as exact in comparison. The result is the geometry with the least weighted sum of squared differences.
+The measured poses are assumed to differ from forward(geometry, sliders) by independent normal noise. The encoders of
+the sliders are treated as exact. The result is the geometry with the least weighted sum of squared differences.
 
-Such data determines at most five combinations of the seven numbers of a leg. They are the PARAMETERS of its mechanism,
-and are given as corrections to a starting geometry.
+Measured poses and slider readings can determine at most five combinations of the seven numbers of a leg. These
+combinations are the PARAMETERS of the leg. The result consists of corrections to the parameters of a starting geometry.
 
-Poses with too little variety determine fewer combinations. The undetermined ones show in the singular values of the
-Jacobian of each leg. They keep the values of the starting geometry, and the result names them.
+If the poses do not vary enough, some combinations of parameters remain undetermined. They are detected from the
+singular values of the Jacobian of each leg. Undetermined combinations keep the values of the starting geometry, and the
+result names their parameters.
 """
 
 from __future__ import annotations
@@ -25,15 +26,18 @@ from trirail.kinematics.robot import forward, inverse, jacobians
 
 __all__ = ["Calibration", "CalibrationError", "Open", "corrected", "identify", "pose_derivatives"]
 
-MIN_NAMED_SHARE = 0.1  # least share of a parameter in an undetermined combination, in units of its doubt, to name it
-MINIMUM = 6  # each pose gives one equation per leg: five for its parameters, and one to contradict
-MISFIT = 3.0  # ratio of residual to noise (root mean square) above which the data cannot be that of this robot
+MIN_NAMED_SHARE = 0.1  # least weight at which a parameter is named as undetermined; parameters are divided by DOUBT
+MINIMUM = 6  # least number of poses: each gives one equation per leg, for five parameters and one check
+MISFIT = 3.0  # ratio of residual to noise (root mean square) above which the data does not belong to this robot
 TOLERANCE = 1e-12
-MAX_EVALUATIONS = 200  # data that fits needs only a few
+MAX_EVALUATIONS = 200  # good data needs only a few evaluations
 
 
 class CalibrationError(TrirailError):
-    """Data from which no geometry can be identified. `row` counts from 0; it is None if no single row is at fault."""
+    """Error that no geometry can be identified from the data.
+
+    `row` is the index of the row that causes the error, counted from 0, or None if there is no such row.
+    """
 
     def __init__(self, message: str, *, row: int | None = None) -> None:
         super().__init__(message)
@@ -41,7 +45,7 @@ class CalibrationError(TrirailError):
 
 
 class Open(NamedTuple):
-    """Parameters of a leg for which the data leaves one or more independent combinations undetermined."""
+    """Parameters of a leg that the data does not determine, and the number of their undetermined combinations."""
 
     leg: str
     parameters: tuple[str, ...]
@@ -49,14 +53,14 @@ class Open(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """Geometry identified from N poses. Corrections have the rows A, B, C and the columns of Geometry.parameters."""
+    """Result of a calibration with N poses. Corrections have rows A, B, C and the columns of Geometry.parameters."""
 
     geometry: Geometry
     corrections: Array  # (3, 5), relative to the starting geometry [m, rad]
     standard_errors: Array  # (3, 5), from the stated noise; infinite for undetermined parameters
     open: tuple[Open, ...]
     residuals: Array  # (N, 3): measured minus computed x, y, phi [m, m, rad]
-    misfit: float  # ratio of residual to noise (root mean square) per degree of freedom: about 1 for good data
+    misfit: float  # root mean square of residual divided by noise, per degree of freedom; about 1 for good data
 
 
 def identify(
@@ -64,8 +68,9 @@ def identify(
 ) -> Calibration:
     """Return the geometry that agrees best with measured `poses` and `sliders`, both (N, 3) in m and rad.
 
-    The noises are the standard deviations of a measured coordinate [m] and angle [rad]. Raises CalibrationError if
-    there are too few poses, if the starting geometry has no pose near a measured one, or if no geometry fits.
+    `position_noise` and `angle_noise` are the standard deviations of a measured coordinate [m] and angle [rad]. Raises
+    CalibrationError if there are too few poses, if the starting geometry cannot reach a measured pose, or if no
+    geometry fits.
     """
     if len(poses) < MINIMUM:
         raise CalibrationError(
@@ -85,7 +90,7 @@ def identify(
         try:
             return (_residuals(geometry(z), poses, sliders) / noise).ravel()
         except KinematicsError:
-            return np.full(poses.size, math.inf)  # the step is too large: the solver then takes a part of it
+            return np.full(poses.size, math.inf)  # the step is too large, and the solver will shorten it
 
     def jacobian(z: Array) -> Array:
         reached = forward(geometry(z), sliders, near=poses)
@@ -128,17 +133,18 @@ def identify(
 
 
 def corrected(start: Geometry, corrections: Array) -> Geometry:
-    """Return a geometry with corrections (3, 5) [m, rad] to its parameters. Raises KinematicsError like Geometry."""
+    """Return a geometry with corrections (3, 5) added to its parameters [m, rad]. Raises KinematicsError if invalid."""
     first, second, third = (leg.corrected(row) for leg, row in zip(start.each, corrections.tolist(), strict=True))
     return Geometry(legs=(first, second, third), labels=start.labels)
 
 
 def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array:
-    """Return the derivatives of the poses of `geometry` by corrections to `start`, at fixed sliders: (N, 3, 3, 5).
+    """Return the derivatives of poses with respect to the parameters of the legs, at fixed sliders, (N, 3, 3, 5).
 
-    The axes are: the pose from which the platform moves, out of `poses` (N, 3); x, y, phi; the leg; its parameters. The
-    loop of a leg requires F = 0. The derivative of F is J1 by the slider and -J2 by the pose, (16), so J2 d pose = dF.
-    Raises KinematicsError like inverse.
+    The parameters are corrections to `start`, and the derivatives are evaluated for `geometry`. The axes of the result
+    are the pose in `poses` (N, 3); x, y, phi; the leg; and the parameters of the leg. The loop of a leg requires F = 0.
+    The derivatives of F are J1 with respect to the slider, and -J2 with respect to the pose, (16). Therefore J2 d pose
+    = dF. Raises KinematicsError if inverse does.
     """
     _, J2 = jacobians(geometry, poses)
     joints = inverse(geometry, poses)
@@ -150,7 +156,7 @@ def pose_derivatives(geometry: Geometry, start: Geometry, poses: Array) -> Array
 
 
 def _check(start: Geometry, poses: Array, sliders: Array) -> None:
-    """Refuse data that the starting geometry cannot follow, and name the row."""
+    """Raise CalibrationError if the starting geometry cannot reach a measured pose or slider reading."""
     for row, (pose, reading) in enumerate(zip(poses, sliders, strict=True)):
         try:
             inverse(start, pose)
@@ -169,11 +175,12 @@ def _residuals(geometry: Geometry, poses: Array, sliders: Array) -> Array:
 
 
 def _separate(start: Geometry, derivatives: Array) -> tuple[Array, tuple[Open, ...]]:
-    """Separate the corrections that the data determines from the rest, given the whitened derivatives.
+    """Separate the corrections that the data determines from the undetermined corrections.
 
-    Returns a basis (15, K) of the former, and the parameters of the latter. No correction of one leg can compensate one
-    of another leg, because their effects at each pose are independent. The undetermined combinations therefore belong
-    to one leg each, and can be named.
+    `derivatives` are pose_derivatives divided by the noise. Returns a basis (15, K) of the determined corrections, and
+    the parameters of the undetermined corrections. The effects of different legs at each pose are independent, so that
+    a correction of one leg cannot compensate a correction of another leg. Each undetermined combination therefore
+    belongs to a single leg.
     """
     columns: list[Array] = []
     unknown: list[Open] = []

@@ -16,14 +16,14 @@ from trirail.kinematics.loops import SlideLine
 from trirail.kinematics.mechanism import beta, close, demand, line, move
 from trirail.kinematics.recursion import ZERO
 
-ROUNDING = 1e-15  # share of the squares whose difference is (det J2)² that may be due to rounding
-LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; codes 1 to 3 are those of the legs
-LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for what Geometry.packed() returns
+ROUNDING = 1e-15  # relative rounding error of (det J2)² = A² + B² - C², relative to A² + B²
+LOOPS_OPEN, J2_SINGULAR = 4, 5  # codes of forward_into; codes 1 to 3 refer to the legs
+LEGS_TYPE = "Array(f8, 3, 'C', readonly=True)"  # numba's name for the type of Geometry.packed()
 
 
 @compiled()
 def sign_of_det_j2(legs: Array, pose: Vector) -> float:
-    """Return -1 or 1 as the sign of det J2; 0 if the pose is singular or not finite."""
+    """Return the sign of det J2 as -1 or 1; 0 if the pose is singular or not finite."""
     a, b, c = close(legs[0], pose), close(legs[1], pose), close(legs[2], pose)
     rows = beta(a), beta(b), beta(c)
     det = dot(rows[0], cross(rows[1], rows[2]))
@@ -44,18 +44,18 @@ def _loop_equation(a: SlideLine, b: SlideLine, c: SlideLine) -> Vector:
 
 @compiled(f"UniTuple(f8, 3)({LEGS_TYPE}, f8[::1])")
 def loop_equation(legs: Array, sliders: Array) -> Vector:
-    """Return A, B, C [m] of the equation A cos phi + B sin phi = C that follows for phi from the three loops.
+    """Return the coefficients A, B, C [m] of the equation A cos phi + B sin phi = C, which determines phi.
 
-    Each leg requires n_i . G = a_i cos phi + b_i sin phi - c_i. The normals n_i all turn together, or all stay fixed.
-    With the sines w_i between the cross slides, sum w_i n_i = 0 at every phi. The sum of the equations with these
-    weights therefore does not contain G.
+    Each leg requires n_i . G = a_i cos phi + b_i sin phi - c_i. Depending on the mechanism, all normals n_i rotate
+    together, or all are fixed. If w_i is the sine of the angle between the cross slides of the two other legs, then sum
+    w_i n_i = 0 at every phi. The sum of the three equations with the weights w_i therefore does not contain G.
     """
     return _loop_equation(line(legs[0], sliders[0]), line(legs[1], sliders[1]), line(legs[2], sliders[2]))
 
 
 @compiled()
 def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> int:
-    """Write the pose for the legs as configured, without a correction."""
+    """Write the pose for given slider positions, without applying a correction for as-built errors."""
     for i in range(3):
         if not math.isfinite(sliders[i]):
             return 1 + i
@@ -64,15 +64,15 @@ def _forward(legs: Array, sliders: Array | Vector, near: Array, pose: Array) -> 
     square = A * A + B * B
     if square - C * C < -ROUNDING * square:
         return LOOPS_OPEN
-    # det J2 = A sin phi - B cos phi. Its sign differs between the two solutions, and stays the same on any path that
-    # passes no singularity.
+    # det J2 = A sin phi - B cos phi. The two solutions have different signs of det J2. On a path without a singularity,
+    # the sign does not change.
     sign = sign_of_det_j2(legs, (near[0], near[1], near[2]))
     if sign == 0.0 or not square - C * C > ROUNDING * square:
         return J2_SINGULAR
     det = sign * math.sqrt(square - C * C)
     cosine, sine = (A * C - B * det) / square, (B * C + A * det) / square
     pose[2] = math.atan2(sine, cosine)
-    # The requirements on n . G agree at this phi. Least squares treats them all equally.
+    # At this phi, the three equations for n . G have a common solution. Least squares treats all three equally.
     xx = xy = yy = x = y = 0.0
     code = 0
     for i, each in enumerate(lines):
@@ -99,15 +99,16 @@ def forward_into(legs: Array, sliders: Array, near: Array, pose: Array) -> int:
     """Write the pose for given slider positions. The function raises no exception and allocates no memory.
 
     `sliders`, `near` and `pose` have shape (3,). `near` is a pose on the desired branch, and may be the same array as
-    `pose`. Returns 0; 1 + i if slider i is not finite or the cross slide of leg i is parallel to its rail; 4 if no pose
-    closes the loops; 5 if J2 is singular at the pose or at `near`. Unless the result is 0, `pose` is undefined.
+    `pose`. Returns 0 if successful; 1 + i if slider i is not finite or the cross slide of leg i is parallel to its
+    rail; 4 if no pose closes the loops; 5 if J2 is singular at the pose or at `near`. After an error, `pose` is
+    undefined.
     """
     return _forward_real(legs, sliders, near, pose)
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1], f8[:, ::1])")
 def forward_batch(legs: Array, sliders: Array, near: Array, poses: Array) -> int:
-    """Apply forward_into to arrays (N, 3). The codes of row k begin after 5 k."""
+    """Apply forward_into to arrays (N, 3). If row k fails, return 5 k plus the code of forward_into; otherwise 0."""
     for k in range(len(sliders)):
         code = _forward_real(legs, sliders[k], near[k], poses[k])
         if code != 0:
@@ -127,10 +128,11 @@ def _solve(rows: tuple[Vector, Vector, Vector], right: Vector) -> Vector:
 
 @compiled()
 def forward_motion(legs: Array, sliders: Matrix, near: Array, motion: Array) -> int:
-    """Write pose, velocity and acceleration (3, 3) of the platform for those of the sliders, given as three rows.
+    """Write pose, velocity and acceleration of the platform, (3, 3), for given motion of the sliders.
 
-    By (16), J2 times the velocity of the platform equals J1 times that of the sliders. The accelerations of the sliders
-    are linear in that of the platform, with the same matrices and an offset, which is subtracted. Returns a code of
+    The rows of `sliders` are position, velocity and acceleration. By (16), J2 times the velocity of the platform equals
+    J1 times the velocity of the sliders. The same equation applies to the accelerations after subtracting an offset:
+    the acceleration of the sliders if the platform has this velocity, but no acceleration. Returns a code of
     forward_into.
     """
     code = _forward(legs, sliders[0], near, motion[0])

@@ -21,7 +21,7 @@ UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @compiled()
 def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
-    """Write the motion of all joints. This is `inverse_into` for calls from compiled code."""
+    """Write the motion of all joints for a motion of the platform. Compiled code calls this instead of inverse_into."""
     commanded = (
         (motion[0, 0], motion[0, 1], motion[0, 2]),
         (motion[1, 0], motion[1, 1], motion[1, 2]),
@@ -40,18 +40,18 @@ def inverse_motion(legs: Array, motion: Array, out: Array) -> int:
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, ::1])")
 def inverse_into(legs: Array, motion: Array, out: Array) -> int:
-    """Write the motion of all joints for one motion of the platform, without raising or allocating memory.
+    """Write the motion of all joints for a motion of the platform. It raises no exception and allocates no memory.
 
-    `motion` (3, 3) holds the rows pose, velocity, acceleration in m, rad, s. `out` (6, 3) has a column for each leg,
-    with position, velocity and acceleration of its slider, then of its cross slide. Returns 0, or 1 + i if leg i is
-    singular or a number is not finite. In that case, `out` is undefined.
+    The rows of `motion` (3, 3) are pose, velocity, acceleration in m, rad, s. The rows of `out` (6, 3) are position,
+    velocity and acceleration of the sliders, then of the cross slides, with one column for each leg. Returns 0, or 1 +
+    i if leg i is singular or a number is not finite. After an error, `out` is undefined.
     """
     return inverse_motion(legs, motion, out)
 
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, :, ::1], f8[:, :, ::1])")
 def inverse_batch(legs: Array, motion: Array, out: Array) -> int:
-    """Apply inverse_into to `motion` (3, N, 3) and `out` (6, N, 3). The codes of row k begin after 3 k."""
+    """Apply inverse_into to `motion` (3, N, 3) and `out` (6, N, 3). Return 0, or 3 k plus the code if row k fails."""
     for k in range(motion.shape[1]):
         code = inverse_motion(legs, motion[:, k], out[:, k])
         if code != 0:
@@ -61,10 +61,13 @@ def inverse_batch(legs: Array, motion: Array, out: Array) -> int:
 
 @compiled(f"i8({LEGS_TYPE}, f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])")
 def jacobians_batch(legs: Array, poses: Array, j1: Array, j2: Array) -> int:
-    """Write the diagonals of J1 and all of J2, (17), (N, 3, 3), for poses (N, 3). Returns a code of inverse_batch."""
+    """Write the diagonal of J1 and all elements of J2, (17), for poses (N, 3). Returns a code of inverse_batch.
+
+    `j1` and `j2` have shape (N, 3, 3).
+    """
     for k in range(len(poses)):
         pose, by_pose = (poses[k, 0], poses[k, 1], poses[k, 2]), UNIT
-        if is_corrected(legs):  # rows of by_pose: derivatives of the corrected pose by x, y and phi
+        if is_corrected(legs):  # rows of by_pose: derivatives of the corrected pose with respect to x, y and phi
             by_pose = (
                 corrected_motion(legs, (pose, UNIT[0], ZERO))[1],
                 corrected_motion(legs, (pose, UNIT[1], ZERO))[1],

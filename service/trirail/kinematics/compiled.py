@@ -1,4 +1,4 @@
-"""Functions compiled by numba, with plain IEEE arithmetic. They are cached on disk, and the cache is never stale."""
+"""Decorators that compile functions with numba, with IEEE arithmetic and a cache on disk that is never out of date."""
 
 from __future__ import annotations
 
@@ -19,43 +19,47 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 ROOMS = ("kinematics", "motion", "control", "processes")
-"""Folders with compiled functions. Inlined code and constants cross files and folders, so all of them share one
-version."""
+"""Folders with compiled functions. Compiled functions contain code and constants from other files. An edit in any of
+these folders therefore invalidates all cached functions."""
 
 
 def _sources() -> bytes:
     package = Path(__file__).parents[1]
     files = [file for room in ROOMS for file in sorted((package / room).rglob("*.py"))]
     sources = [(file.relative_to(package).parts[0], file.read_bytes()) for file in files]
-    # Constants may come from any file of the kinematics, but elsewhere only from files with compiled functions.
+    # In the kinematics, any file may define constants of compiled functions; in other folders, only files that contain
+    # compiled functions.
     return b"".join(source for room, source in sources if room == ROOMS[0] or b"@compiled(" in source)
 
 
 FINGERPRINT = hashlib.sha256(_sources()).hexdigest()
 FUNCTIONS = len(re.findall(rb"^@compiled\((?!\))", _sources(), re.MULTILINE))
-"""Number of functions in these folders that are compiled before their first call."""
+"""Number of functions in ROOMS that are compiled when their module is imported."""
 
 _listener: list[Callable[[str], None]] = []
 _functions: list[Any] = []
 
 
 def compile_no_more() -> None:
-    """Free the 16 MB of memory that are needed only to compile more functions."""
+    """Free 16 MB of memory that are only needed to compile functions. No function can be compiled after this call."""
     for function in _functions:
         for library in map(operator.attrgetter("library"), function.overloads.values()):
             library._shared_module = None
 
 
 def on_compile(listener: Callable[[str], None]) -> None:
-    """Call `listener` with the name of each uncached function before it is compiled, instead of any earlier one."""
+    """Set the listener, which is called with the name of each uncached function before the function is compiled.
+
+    A new listener replaces the previous listener.
+    """
     _listener[:] = [listener]
 
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold the lock of a cache folder. The kernel releases the lock if the process dies."""
+    """Lock a cache folder against other processes. If the process dies, the kernel releases the lock."""
     with contextlib.ExitStack() as held:
-        with contextlib.suppress(OSError):  # the folder belongs to another user: each process compiles for itself
+        with contextlib.suppress(OSError):  # without write access, processes compile without a lock
             folder.mkdir(parents=True, exist_ok=True)
             lock = held.enter_context((folder / "compiling.lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -63,10 +67,11 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _kept(dispatcher: Any) -> Any:
-    """Invalidate the cache of a function after every edit of any source file.
+    """Make the cache of a compiled function invalid after any edit in ROOMS.
 
-    numba checks only the file of the function itself, and would miss an edit of a function that it calls. The version
-    is stored where numba reads it first, because unpickling older code may refer to classes that no longer exist.
+    numba only checks the file that defines the function, and would miss edits of called functions in other files. The
+    fingerprint is part of the version that numba checks first. Otherwise, numba would unpickle outdated code, which may
+    refer to classes that no longer exist.
     """
     kept = dispatcher._cache._cache_file
     kept._version = (kept._version, FINGERPRINT)
@@ -75,26 +80,27 @@ def _kept(dispatcher: Any) -> Any:
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Inline a few lines of arithmetic into every compiled function that calls them (decorator).
+    """Inline a function into every compiled function that calls it (decorator).
 
-    Inlining everything takes three times as long to compile, and does not run faster.
+    Use this for a few lines of arithmetic. If all functions were inlined, compilation would take three times as long,
+    and the code would not run faster.
     """
     return _kept(njit(function, error_model="numpy", forceinline=True, cache=True))  # type: ignore[no-any-return]
 
 
 def compiled(*signatures: Any, releases: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Compile a function now for the given signatures or, if there are none, at its first call (decorator).
+    """Compile a function immediately for the given signatures or, without signatures, at its first call (decorator).
 
-    Division by zero gives an infinity or NaN, never an exception. Compiled code is cached beside the source, or in the
-    user's cache directory if the source folder cannot be written. Later starts load it from the cache. `releases`
-    releases the GIL during a call.
+    Division by zero gives an infinity or NaN, never an exception. Compiled code is cached in the folder of the source,
+    or in the user's cache directory if this folder is not writable. Later processes load the code from the cache. If
+    `releases` is set, the function releases the GIL during a call.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         dispatcher = _kept(njit(function, error_model="numpy", cache=True, nogil=releases))
         kept = dispatcher._cache._cache_file
         if signatures:
-            # If two processes start together, the second loads what the first has compiled and cached.
+            # If two processes start together, the second process loads the code that the first has compiled.
             with _alone(Path(kept._cache_path)):
                 if not kept._load_index():
                     for listener in _listener:

@@ -1,7 +1,7 @@
-"""Motions corrected for as-built errors: from the real pose to the pose for which the legs are solved, and back.
+"""Correction of motions for as-built errors: from the real pose to the pose for which the legs are solved, and back.
 
-The functions are compiled, and motions have the rows pose, velocity, acceleration. `legs` is Geometry.packed(); a
-trirail.kinematics.correction.Correction, if there is one, follows the legs.
+The functions are compiled. Motions have the rows pose, velocity, acceleration. `legs` is Geometry.packed(), which also
+contains the packed Correction of trirail.kinematics.correction if the robot has a correction.
 """
 
 from __future__ import annotations
@@ -16,15 +16,19 @@ from trirail.kinematics.correction import DEGREE, HEADER_LENGTH, LEG, LEGS
 __all__ = ["corrected_motion", "is_corrected", "real_motion"]
 
 MAX_ITERATIONS = 20
-"""Greatest number of iterations. With STEEPEST, twelve of them solve a correction of 20 mm to the last digit."""
+"""Greatest number of iterations. If the slope of the correction is below STEEPEST, twelve iterations solve a correction
+of 20 mm to the last digit."""
 CONVERGED = 1e-15
-"""Change in an iteration below which it has converged [m, rad, s]."""
+"""Change per iteration below which the iteration ends [m, rad, s]."""
 
 Four: TypeAlias = tuple[float, float, float, float]
 
 
 class SplineValues(NamedTuple):
-    """Four non-zero splines of one axis at a position, with their first and second derivatives with respect to time."""
+    """Values and first two time derivatives of the four splines of one axis that are not zero at a position.
+
+    `first` is the index of the first of these splines.
+    """
 
     first: int
     value: Four
@@ -36,10 +40,10 @@ class SplineValues(NamedTuple):
 def _along(
     low: float, per_length: float, cells: int, position: float, velocity: float, acceleration: float
 ) -> SplineValues:
-    """Return the splines at a position on an axis whose first cell begins at `low`."""
+    """Return the splines of an axis at a position. The first cell of the axis begins at `low`."""
     place = (position - low) * per_length
     rate, change = velocity * per_length, acceleration * per_length
-    if not 0.0 <= place <= cells:  # also true if it is NaN
+    if not 0.0 <= place <= cells:  # also True for NaN
         place = float(cells) if place > cells else 0.0
         rate = change = 0.0
     first = min(int(place), cells - 1)
@@ -64,7 +68,7 @@ def _along(
 
 @compiled()
 def _correction(legs: Array, motion: Matrix) -> Matrix:
-    """Return the correction c at a pose, and its first and second time derivatives as the pose moves."""
+    """Return the correction c at a pose, with its first and second time derivatives for a moving pose."""
     numbers = legs.reshape(-1)[LEGS * LEG :]
     pose, velocity, acceleration = motion
     of_x, of_y, of_z = int(numbers[6]), int(numbers[7]), int(numbers[8])
@@ -88,13 +92,13 @@ def _correction(legs: Array, motion: Matrix) -> Matrix:
 
 @compiled()
 def is_corrected(legs: Array) -> bool:
-    """Return whether the legs have a correction."""
+    """Return whether the packed legs contain a correction."""
     return len(legs) > LEGS
 
 
 @compiled()
 def corrected_motion(legs: Array, motion: Matrix) -> Matrix:
-    """Return the motion for which the legs are solved, given that of the platform: p + c(p), and its derivatives."""
+    """Return the motion for which the legs must be solved, p + c(p) with its derivatives, for a motion p."""
     more = _correction(legs, motion)
     return add(motion[0], more[0]), add(motion[1], more[1]), add(motion[2], more[2])
 
@@ -106,7 +110,10 @@ def _apart(a: Vector, b: Vector) -> float:
 
 @compiled()
 def real_motion(legs: Array, of_legs: Matrix) -> Matrix:
-    """Return the motion of the platform, given that of the legs: p = q - c(p) by iteration, and its derivatives."""
+    """Return the real motion p of the platform, given the motion q for which the legs were solved.
+
+    The equation p = q - c(p) and its derivatives are solved by iteration.
+    """
     motion = of_legs
     for _ in range(MAX_ITERATIONS):
         less = _correction(legs, motion)

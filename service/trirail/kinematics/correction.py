@@ -1,10 +1,11 @@
 """Smooth map of as-built errors, from the real pose of the platform to the pose for which the legs are solved.
 
-For a real pose p, the configured legs must be solved for q = p + c(p). The correction c is a tensor product of uniform
-cubic B-splines in x, y and phi. It is twice differentiable, so a continuous acceleration stays continuous, and its
-coefficients bound its slope. Outside its box, c has the value at the border.
+To bring the platform to the real pose p, the configured legs must be solved for q = p + c(p). The correction c is a
+tensor product of uniform cubic B-splines in x, y and phi. The splines are twice differentiable, so that accelerations
+remain continuous. Bounds on the slope of c follow from the coefficients. Outside its box, c has the value at the
+border.
 
-trirail.kinematics.corrected has compiled versions of these functions for motions.
+trirail.kinematics.corrected has compiled functions that apply a correction to motions.
 """
 
 from __future__ import annotations
@@ -23,22 +24,23 @@ from trirail.kinematics.arrays import Array
 __all__ = ["DEGREE", "HEADER_LENGTH", "LEG", "LEGS", "STEEPEST", "Correction", "splines"]
 
 DEGREE = 3
-"""Degree of the splines. Along each axis, the number of nodes exceeds that of the cells by the degree."""
+"""Degree of the splines. Along each axis, the number of nodes is the number of cells plus the degree."""
 STEEPEST = 0.05
-"""Share of a motion's velocity that a correction may add. real_motion then gains more than a digit per iteration."""
+"""Greatest velocity that a correction may add, as a fraction of the velocity of the motion. With this limit,
+real_motion gains more than one digit per iteration."""
 LEGS, LEG = 3, 4 * 13
-"""Number of legs before a packed correction, and the number of values of each leg."""
+"""Number of packed legs before a packed correction, and number of values per leg."""
 HEADER_LENGTH = 9
-"""Number of values before the nodes. For each axis they are the start of the first cell, the cells per metre or
-radian, and the number of nodes."""
+"""Number of values before the nodes in a packed correction: the starts of the first cells along x, y and phi, the cells
+per metre or radian, and the numbers of nodes."""
 
 
 def splines(
     poses: Array, low: Sequence[float], high: Sequence[float], cells: Sequence[int]
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the values of all splines at poses (N, 3) as (N, nodes), and the cells of the poses, (N, 3).
+    """Return the values of all splines at poses (N, 3) as (N, nodes), and the cell indices of the poses, (N, 3).
 
-    This function is for a few poses, or for many at a time. The cycle uses the compiled trirail.kinematics.corrected.
+    This function uses numpy and is not for use in the cycle, which uses the compiled trirail.kinematics.corrected.
     """
     rows, at = np.ones((len(poses), 1)), np.zeros((len(poses), 3), dtype=np.int64)
     for axis, (begin, end, number) in enumerate(zip(low, high, cells, strict=True)):
@@ -55,9 +57,10 @@ def splines(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """Correction map: its box in x, y [m] and phi [rad], and the coefficients of its splines [m, m, rad].
+    """Correction map for as-built errors.
 
-    `nodes` has shape (l + 3, m + 3, n + 3, 3) for l, m and n cells of equal size along x, y and phi. Raises
+    `low` and `high` are the limits of the box in x, y [m] and phi [rad]. `nodes` are the coefficients of the splines
+    [m, m, rad], with shape (l + 3, m + 3, n + 3, 3) for l, m and n cells of equal size along x, y and phi. Raises
     KinematicsError if there is no cell, if a number is not finite, or if the box is empty.
     """
 
@@ -77,12 +80,12 @@ class Correction:
         object.__setattr__(self, "nodes", nodes)
 
     def packed(self) -> Array:
-        """Return the correction in the form for compiled code, padded to the size of a whole number of legs."""
+        """Return the correction as an array for compiled code, padded to the size of a whole number of packed legs."""
         numbers = np.concatenate([self.low, 1.0 / self.size, self.nodes.shape[:3], self.nodes.ravel()])
         return np.concatenate([numbers, np.zeros(-len(numbers) % LEG)])
 
     def at(self, poses: Array) -> Array:
-        """Return the corrections c at poses; both are (N, 3) [m, m, rad]."""
+        """Return the corrections c at poses; the arrays are (N, 3) [m, m, rad]."""
         return splines(poses, self.low, self.high, self.cells)[0] @ self.nodes.reshape(-1, 3)
 
     @property
@@ -98,13 +101,13 @@ class Correction:
 
     @property
     def bound(self) -> Array:
-        """Upper bound of the correction in x, y and phi, (3,) [m, m, rad]."""
+        """Upper bound of the absolute correction in x, y and phi at any pose, (3,) [m, m, rad]."""
         bound: Array = np.abs(self.nodes).max(axis=(0, 1, 2))
         return bound
 
     @property
     def greatest(self) -> Array:
-        """Greatest correction in x, y and phi at the corners of the cells, (3,) [m, m, rad]."""
+        """Greatest absolute correction in x, y and phi at the corners of the cells, (3,) [m, m, rad]."""
         at = self.nodes
         for axis in range(3):
             before, here, after = (np.take(at, range(k, at.shape[axis] - 2 + k), axis) for k in range(3))
@@ -113,10 +116,11 @@ class Correction:
         return greatest
 
     def adds(self, velocity: Sequence[float]) -> Array:
-        """Return bounds on the velocity added in each cell, (l, m, n, 3), for pose velocities up to `velocity`.
+        """Return upper bounds of the velocity that the correction adds in each cell, (l, m, n, 3).
 
-        The derivative of a spline is a spline whose coefficients are differences of the original ones. In a cell, it
-        never exceeds the greatest of the coefficients that affect the cell.
+        `velocity` is the greatest velocity in x, y and phi. The derivative of a spline is again a spline. Its
+        coefficients are proportional to the differences of successive nodes. In a cell, the derivative never exceeds
+        the greatest of the coefficients that affect the cell.
         """
         total = np.zeros((*self.cells, 3))
         for axis, most in enumerate(velocity):

@@ -1,12 +1,12 @@
-"""Fit of a correction to measured poses: deviations from the geometry, modelled as geometry errors plus splines.
+"""Fit of a correction to measured poses. The deviations are modelled as errors of the geometry plus a smooth map.
 
-If the platform is at a measured pose p and the geometry gives the pose q for the same sliders, the correction is q - p.
-Near a singular angle, small errors of the geometry cause large errors of the pose within a short distance. A smooth map
-through measured poses alone cannot show this. The fit therefore first determines how much of the differences is
-explained by errors of the geometry, using the derivatives of trirail.kinematics.calibration written as splines.
-Penalised splines (P-splines) fit the rest. The weight of the second differences of the nodes is the one with which a
-fit to four fifths of the poses predicts the remaining poses best (Eilers and Marx, Flexible smoothing with B-splines
-and penalties, 1996, and cross-validation).
+If the measured pose is p, and the geometry gives the pose q for the same sliders, then the correction is q - p. Near a
+singular angle, small errors of the geometry cause errors of the pose that are large and change over a short distance. A
+smooth map through the measured poses cannot represent such errors. The first step therefore fits errors of the
+geometry, with the derivatives from trirail.kinematics.calibration written as splines. The second step fits the
+remaining differences with penalised splines (P-splines; Eilers and Marx, Flexible smoothing with B-splines and
+penalties, 1996). The penalty is a weight times the squared second differences of the nodes. Cross-validation selects
+the weight: a fit to four fifths of the poses must predict the remaining poses as accurately as possible.
 """
 
 from __future__ import annotations
@@ -28,43 +28,47 @@ from trirail.kinematics.robot import forward
 __all__ = ["MIN_POSES", "Fit", "fit"]
 
 MIN_POSES = 30
-"""Least number of poses: a grid of three in x, y and phi, and a few more."""
+"""Least number of poses: a grid with three values of x, y and phi, and a few more poses."""
 END_SHARE = 0.15
-"""Share of the robot's reach that may be without a measured pose at either end."""
+"""Fraction of the robot's range in x, y or phi that may have no measured pose at either end."""
 SAMPLES = 21
-"""Number of samples along each axis, for the reach of the robot and for the effects of geometry errors."""
+"""Number of samples along each axis when the reach of the robot and the effects of geometry errors are sampled."""
 TRAVEL_MARGIN_M = 0.02
-"""Distance beyond the sliders' travel that is also sampled [m], so that the effects are known up to its ends."""
+"""Distance beyond the sliders' travel at which effects of geometry errors are also sampled [m], so that the effects are
+accurate at the ends of the travel."""
 GEOMETRY_CURVATURE_WEIGHT = 2e-4
-"""Weight of curvature for the effects of geometry errors. It is large enough to continue them beyond the samples."""
+"""Weight of the penalty when the effects of geometry errors are written as splines. It is large enough to extrapolate
+the effects beyond the samples."""
 WEIGHTS = tuple(10.0**k for k in range(-6, 4))
-"""Weights of curvature from which one is chosen."""
+"""Weights of the penalty from which cross-validation selects."""
 FOLDS = 5
 SEED = 1
-"""Seed for choosing which poses are left out together."""
+"""Seed of the random partition of the poses for cross-validation."""
 NAMES = ("x", "y", "phi")
 
 
 class Fit(NamedTuple):
-    """Correction, and measures of its quality."""
+    """Fitted correction, with measures of its quality."""
 
     correction: Correction
     before: Array
-    """Pose errors that were measured (N, 3): measured minus computed x, y, phi [m, m, rad]."""
+    """Measured pose errors without a correction (N, 3): measured minus computed x, y, phi [m, m, rad]."""
     residuals: Array
     """Pose errors that remain with the correction."""
     predicted: Array
-    """Pose errors that remain with a correction fitted without the pose in question, as to be expected at other
-    poses."""
+    """Pose errors that remain at each pose with a correction that was fitted without this pose. Similar errors can be
+    expected at poses that were not measured."""
     empty: int
-    """Number of cells without a measured pose. They continue their neighbours."""
+    """Number of cells without a measured pose. In these cells, the correction is extrapolated from neighbouring
+    cells."""
 
 
 def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Sequence[int]) -> Fit:
     """Return the correction of a geometry from measured `poses` and `sliders`, both (N, 3) in m and rad.
 
-    The correction covers the whole room, with `cells` along x, y and phi. Raises CalibrationError if there are too few
-    poses, if they do not cover the robot's reach, or if the geometry has no pose near a measured one.
+    The correction covers the whole room, with the given numbers of cells along x, y and phi. Raises CalibrationError if
+    there are too few poses, if the poses do not cover the robot's reach, or if the geometry cannot reach a measured
+    pose.
     """
     low, high = room.low, room.high
     if len(poses) < MIN_POSES:
@@ -116,7 +120,7 @@ def fit(geometry: Geometry, poses: Array, sliders: Array, room: Room, cells: Seq
 
 
 def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
-    """Return poses spread over the room, (N, 3), within the sliders' travel or up to `beyond` [m] outside it."""
+    """Return poses on a grid over the room, (N, 3), with all joints at most `beyond` [m] outside their travel."""
     axes = [np.linspace(low, high, SAMPLES) for low, high in zip(room.low, room.high, strict=True)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     reached: Array = poses[room.holds(travels(geometry, poses), beyond)]
@@ -126,7 +130,7 @@ def _reached(geometry: Geometry, room: Room, beyond: float = 0.0) -> Array:
 
 
 def _curvature(shape: Sequence[int]) -> Array:
-    """Return the matrix of the quadratic form that sums the squared second differences of the nodes along all axes."""
+    """Return the matrix of the penalty, the sum of the squared second differences of the nodes along all axes."""
     total = np.zeros((math.prod(shape), math.prod(shape)))
     for axis, number in enumerate(shape):
         differences = np.diff(np.eye(number), 2, axis=0)
@@ -137,7 +141,7 @@ def _curvature(shape: Sequence[int]) -> Array:
 
 
 def _solve(rows: Array, wanted: Array, penalty: Array) -> Array:
-    """Return the nodes, (nodes, 3)."""
+    """Return the nodes (nodes, 3) of the penalised least-squares fit of the splines `rows` to the values `wanted`."""
     try:
         solution: Array = np.linalg.solve(rows.T @ rows + penalty, rows.T @ wanted).astype(np.float64)
     except np.linalg.LinAlgError as error:
@@ -146,7 +150,7 @@ def _solve(rows: Array, wanted: Array, penalty: Array) -> Array:
 
 
 def _by_geometry(geometry: Geometry, room: Room, cells: Sequence[int], curvature: Array) -> Array:
-    """Return the nodes of the effect of each calibration parameter on a pose, (nodes, 3, 15)."""
+    """Return the effect of each calibration parameter on the pose, written as nodes of splines, (nodes, 3, 15)."""
     reached = _reached(geometry, room, TRAVEL_MARGIN_M)
     moved = pose_derivatives(geometry, geometry, reached).reshape(len(reached), -1)
     rows, _ = splines(reached, room.low, room.high, cells)
@@ -154,7 +158,7 @@ def _by_geometry(geometry: Geometry, room: Room, cells: Sequence[int], curvature
 
 
 def _nodes(rows: Array, by_geometry: Array, wanted: Array, scale: Array, penalty: Array) -> Array:
-    """Return the nodes (nodes, 3), which are those of the geometry errors plus those of the remainder."""
+    """Return the nodes (nodes, 3) of the correction: the effects of geometry errors plus the penalised splines."""
     each = np.tensordot(rows, by_geometry, 1) / scale[:, None]
     parameters, *_ = np.linalg.lstsq(each.reshape(wanted.size, -1), (wanted / scale).ravel(), rcond=None)
     nodes: Array = by_geometry @ parameters.astype(np.float64)

@@ -1,7 +1,7 @@
-"""The three legs of a robot, symmetric or as built, and the platform angles at which they are singular.
+"""Geometry of a robot, symmetric or as built, and the platform angles at which the robot is singular.
 
-Lengths are in metres, angles in radians. This module uses only the interface of trirail.kinematics.leg; prp3.leg and
-ppr3.leg implement it.
+Lengths are in metres, angles in radians. The functions of this module work for every mechanism, because they use only
+the interface in trirail.kinematics.leg. This interface is implemented in prp3.leg and ppr3.leg.
 """
 
 from __future__ import annotations
@@ -39,19 +39,20 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Three legs A, B, C, and the correction for as-built errors, if there is one.
+    """Geometry of a robot: three legs A, B, C, and an optional correction for as-built errors.
 
     Raises KinematicsError if a number is not finite, if the legs belong to different mechanisms or do not match `kind`,
     or if the pose (0, 0, 0) is singular.
     """
 
     legs: tuple[Any, Any, Any]
-    """Legs of one mechanism: prp3.leg.Leg or ppr3.leg.CrossLeg. Code that works for every mechanism reads `each`."""
+    """Three legs of the same class, prp3.leg.Leg or ppr3.leg.CrossLeg. Code for any mechanism should use `each`."""
     correction: Correction | None = None
     labels: Labels = field(default=LEGS, compare=False)
     """Display names of the sliders."""
     kind: str = ""
-    """Mechanism as named by [geometry] kind, 3-PRP or 3-PPR. By default, it is the mechanism of the legs."""
+    """Name of the mechanism, 3-PRP or 3-PPR, as in the key kind of [geometry]. The default is the mechanism of the
+    legs."""
     _packed: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -68,7 +69,7 @@ class Geometry:
 
     @classmethod
     def symmetric(cls, l0: float = 0.3) -> Geometry:
-        """Return the paper's robot, (1) and (10), with its anchors at l0 [m] from the centre."""
+        """Return the symmetric robot of the paper, (1) and (10), with the anchors l0 [m] from the centre."""
         if not (math.isfinite(l0) and l0 > 0.0):
             raise KinematicsError(f"l0 is {l0} m: it must be finite and positive", value=l0, limit=0.0)
         alphas = (math.pi / 3, math.pi, -math.pi / 3)
@@ -79,7 +80,7 @@ class Geometry:
                 anchor=(x, y),
                 rail_angle=alpha,
                 home=home,
-                # in the central configuration, every slider reads zero and the edge point is at the pin
+                # at the pose (0, 0, 0), every slider reads zero, and the edge point is at the pin
                 edge_point=(x + home * math.cos(alpha), y + home * math.sin(alpha)),
                 edge_angle=alpha - math.pi / 3,
             )
@@ -88,17 +89,17 @@ class Geometry:
         return cls(legs=(legs[0], legs[1], legs[2]))
 
     def packed(self) -> Array:
-        """Return the three legs in the form for compiled code: float64, shape (3, 4, 13), read-only.
+        """Return the geometry as a read-only array for compiled code, float64 with shape (3, 4, 13).
 
-        The axes are: the leg; its three joints and the platform's centre; the columns described in
-        trirail.kinematics.recursion. A correction, if there is one, follows in as many additional rows of the first
-        axis as it needs. A single array is used because every further one would cost each call a microsecond.
+        The axes are the leg; the three joints of the leg and the platform's centre; and the columns described in
+        trirail.kinematics.recursion. A correction is stored in additional rows of the first axis. A single array is
+        used because each additional argument would make every call one microsecond slower.
         """
         return self._packed
 
     @property
     def each(self) -> tuple[AnyLeg, AnyLeg, AnyLeg]:
-        """Legs with the interface that all mechanisms share."""
+        """Legs A, B, C, with the interface that all mechanisms share."""
         return self.legs
 
     @property
@@ -108,26 +109,27 @@ class Geometry:
 
     @property
     def arm(self) -> float:
-        """Greatest distance from the platform's centre to a leg [m]: the travel for a rotation by one radian."""
+        """Greatest distance from the platform's centre to a leg [m], which is the travel per radian of rotation."""
         return max(leg.arm for leg in self.each)
 
 
 def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)) -> tuple[float, ...]:
     """Return every phi [rad] in (-pi, pi], in ascending order, at which J1 or J2 is singular with G at `centre` [m].
 
-    The nearest angles on both sides of zero bound the usable range. On the symmetric robot, they are -2 pi/3 and pi/3,
-    wherever G is. On a robot as built, the angles at which J1 is singular, where an edge is parallel to its rail, still
-    depend on nothing else. Those at which J2 is singular move with G, and can be several degrees closer to zero. A
-    3-PPR robot has two angles, pi apart, at which J2 is singular wherever G is.
+    The nearest angles below and above zero bound the usable range. For the symmetric robot, they are -2 pi/3 and pi/3,
+    independent of G. For a robot as built, the angles at which J1 is singular (an edge is parallel to its rail) are
+    also independent of G. The angles at which J2 is singular depend on G, and can be several degrees closer to zero. A
+    3-PPR robot has two angles, at a distance of pi, at which J2 is singular for any G.
     """
     of_j1 = _singular_angles_of_j1(geometry)
-    if not of_j1:  # then det J2 = A sin phi - B cos phi
+    if not of_j1:  # in this case, det J2 = A sin phi - B cos phi
         B, A = det_j2(geometry, centre, np.array([math.pi, math.pi / 2.0])).tolist()
         angle = math.atan2(B, A)
         return tuple(sorted((wrapped(angle), wrapped(angle + math.pi))))
     angles = [*of_j1]
     for low, high in zip(of_j1, [*of_j1[1:], of_j1[0] + 2.0 * math.pi], strict=True):
-        # det J2 is smooth between two singular angles of J1. Its zeros crowd at the ends, so the samples do too.
+        # det J2 is smooth between two singular angles of J1. Zeros are most likely near the ends of this interval, and
+        # the samples are therefore denser there.
         phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, 257)[1:-1])
         negative = det_j2(geometry, centre, phi) < 0.0
         changes = np.flatnonzero(negative[1:] != negative[:-1]).tolist()
@@ -136,16 +138,16 @@ def singular_angles(geometry: Geometry, centre: tuple[float, float] = (0.0, 0.0)
 
 
 class Room(NamedTuple):
-    """Allowed range of x, y [m] and phi [rad], and of sliders and cross slides [m]."""
+    """Permitted ranges of x, y [m] and phi [rad], and of the positions of sliders and cross slides [m]."""
 
     low: Sequence[float]
     high: Sequence[float]
     position: tuple[float, float] | tuple[tuple[float, float], ...]
-    """Travel of all sliders, or of each slider."""
+    """Ends of the travel of the sliders: one pair for all sliders, or one pair per slider."""
     passive: tuple[float, float]
 
     def holds(self, travelled: Array, spare: float = 0.0) -> NDArray[np.bool]:
-        """Return whether sliders and passive joints (2, ..., 3) are within their travel, give or take `spare` [m]."""
+        """Return whether sliders and cross slides (2, ..., 3) are at most `spare` [m] outside their travel."""
         both = np.stack([np.broadcast_to(ends, (3, 2)) for ends in (self.position, self.passive)])
         low, high = np.moveaxis(both, -1, 0).reshape(2, 2, *[1] * (travelled.ndim - 2), 3)
         within: NDArray[np.bool] = ((travelled >= low - spare) & (travelled <= high + spare)).all(axis=(0, -1))
@@ -153,10 +155,10 @@ class Room(NamedTuple):
 
 
 def travels(geometry: Geometry, poses: ArrayLike) -> Array:
-    """Return the positions of sliders and cross slides at poses (..., 3) of x, y [m], phi [rad]: (2, ..., 3) [m].
+    """Return the positions of sliders and cross slides, (2, ..., 3) [m], at poses x, y [m], phi [rad], (..., 3).
 
-    The positions follow from (11). This function is intended for a few poses and does not need the compiled
-    trirail.kinematics.robot.inverse. The result is not finite if a cross slide is parallel to its rail.
+    The positions follow from (11). This function is meant for a small number of poses, and does not need compiled code,
+    in contrast to trirail.kinematics.robot.inverse. If a cross slide is parallel to its rail, the result is not finite.
     """
     solved = np.array(poses, dtype=np.float64)
     if geometry.correction is not None:
@@ -166,10 +168,10 @@ def travels(geometry: Geometry, poses: ArrayLike) -> Array:
 
 
 def other_kind(geometry: Geometry) -> Geometry:
-    """Return the robot of the other mechanism with rails and cross slides in the same places at the pose (0, 0, 0).
+    """Return a robot of the other mechanism, with the same rails and cross slides at the pose (0, 0, 0).
 
-    This is the robot of an owner who mistakes one mechanism for the other. Raises KinematicsError if it is singular
-    there.
+    This is the robot that a user would configure who confuses the two mechanisms. Raises KinematicsError if this robot
+    is singular at the pose (0, 0, 0).
     """
     sliders = travels(geometry, (0.0, 0.0, 0.0))[0].tolist()
     legs = []
@@ -183,7 +185,7 @@ def other_kind(geometry: Geometry) -> Geometry:
 
 
 def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
-    """Return the change of x, y [m] and phi [rad] per metre of each slider at a pose: (3, 3), J2^-1 J1.
+    """Return J2^-1 J1 (3, 3) at a pose: the change of x, y [m] and phi [rad] per metre of travel of each slider.
 
     Raises LinAlgError if J2 is singular.
     """
@@ -193,17 +195,17 @@ def gains(geometry: Geometry, pose: tuple[float, float, float]) -> Array:
 
 
 def _singular_angles_of_j1(geometry: Geometry) -> list[float]:
-    """Return each phi in (-pi, pi], ascending, at which the cross slide of some leg is parallel to its rail."""
+    """Return each phi in (-pi, pi], in ascending order, at which the cross slide of a leg is parallel to its rail."""
     parallel = [leg.parallel_angle for leg in geometry.each]
     angles = sorted(wrapped(phi + turn) for phi in parallel if phi is not None for turn in (0.0, math.pi))
     return [phi for k, phi in enumerate(angles) if k == 0 or phi - angles[k - 1] > PARALLEL]
 
 
 def det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Array:
-    """Return det J2 [m] for poses with G at `centre` and any angles `phi`.
+    """Return det J2 [m] for poses with G at `centre` and with angles `phi`.
 
-    The cofactors w of its third column are the sines between the cross slides, which are constant. Therefore det J2 =
-    sum w_i beta_3^i.
+    The cofactors w_i of the third column of J2 are the sines of the angles between cross slides, which are constant.
+    Therefore det J2 = sum w_i beta_3^i.
     """
     a, b, c = (leg.cross_angle for leg in geometry.each)
     cofactors = math.sin(c - b), math.sin(a - c), math.sin(b - a)
@@ -214,7 +216,7 @@ def det_j2(geometry: Geometry, centre: tuple[float, float], phi: Array) -> Array
 
 
 def _bisect(geometry: Geometry, centre: tuple[float, float], low: float, high: float) -> float:
-    """Return the zero of det J2 between the angles `low` and `high`, at which its signs differ."""
+    """Return the zero of det J2 between two angles at which det J2 has different signs."""
     negative = det_j2(geometry, centre, np.array([low]))[0] < 0.0
     while low < (middle := (low + high) / 2.0) < high:
         if (det_j2(geometry, centre, np.array([middle]))[0] < 0.0) == negative:
@@ -225,7 +227,10 @@ def _bisect(geometry: Geometry, centre: tuple[float, float], low: float, high: f
 
 
 def _check(geometry: Geometry) -> None:
-    """Refuse a geometry that is not finite, or is singular at (0, 0, 0), the pose by which forward selects branches."""
+    """Raise KinematicsError if the legs have different mechanisms, are not finite, or are singular at (0, 0, 0).
+
+    The function `forward` selects its branch by the pose (0, 0, 0), which must therefore be regular.
+    """
     if len({leg.KIND for leg in geometry.each}) > 1:
         kinds = ", ".join(leg.KIND for leg in geometry.each)
         raise KinematicsError(f"the legs are of different mechanisms: {kinds}")

@@ -1,4 +1,4 @@
-"""Planar serial leg described by its joints, packed in the form of trirail.kinematics.recursion."""
+"""Description of a planar serial leg by its joints, and conversion to the array of trirail.kinematics.recursion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Joint", "serial_leg"]
 
 
 class Joint(NamedTuple):
-    """Joint of a leg: its kind and the constant parts of q_{k,k-1} (3, 3) and of r_{k,k-1} (3,) [m]."""
+    """Joint k of a leg. `constant` (3, 3) and `offset` (3,) [m] are the constant parts of q_{k,k-1} and r_{k,k-1}."""
 
     kind: Literal["prismatic", "revolute"]
     constant: ArrayLike
@@ -22,9 +22,12 @@ class Joint(NamedTuple):
 
 
 def serial_leg(joints: Sequence[Joint], tip: ArrayLike) -> Array:
-    """Return the leg (n + 1, 13) with n joints and r_n^G = tip [m]. Raises ValueError if the leg leaves the plane."""
+    """Return the packed leg (n + 1, 13) with n joints and r_n^G = tip [m].
+
+    Raises ValueError if a constant matrix is not orthogonal or the motion of the leg is not planar.
+    """
     leg = np.zeros((len(joints) + 1, 13))
-    q_k0 = np.eye(3)  # with all variables at zero, which does not affect which axes are normal to the plane
+    q_k0 = np.eye(3)  # for joint variables of zero: the variables do not change which axes are normal to the plane
     for k, (kind, constant, offset) in enumerate(joints):
         leg[k, 0] = kind == "revolute"
         leg[k, 1:4] = offset

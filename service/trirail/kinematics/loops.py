@@ -1,4 +1,4 @@
-"""Results of the compiled mechanisms: a closed leg, and the line of a leg before the platform turns."""
+"""Results of the compiled functions of the mechanisms."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ __all__ = ["ClosedLeg", "SlideLine"]
 
 
 class ClosedLeg(NamedTuple):
-    """Leg that is closed by the pose of the platform."""
+    """Joint positions and directions of a leg for a given pose of the platform."""
 
     slider: float  # lambda_10
     passive: float  # position of the cross slide
-    delta: float  # delta_i of (18), the sine of the angle from rail to cross slide
+    delta: float  # delta_i of (18), the sine of the angle from the rail to the cross slide
     cross: Vector  # direction of the cross slide, in T_0
-    to_centre: Vector  # from the pivot to G, in T_0
+    to_centre: Vector  # vector from the pivot to G, in T_0
 
 
 class SlideLine(NamedTuple):
-    """Line along which the cross slide lets the platform move while the slider is fixed, at phi = 0.
+    """Line along which the platform can move at phi = 0 while the slider of the leg is fixed.
 
-    With n as the normal of the cross slide, and with either n or the arm of the platform turning with phi, the leg
-    requires n . G = a cos phi + b sin phi - c.
+    If n is the normal of the cross slide, the leg requires n . G = a cos phi + b sin phi - c. Depending on the
+    mechanism, either n rotates with phi, or the arm of the platform.
     """
 
     rail: Vector  # direction of the rail
     u: Vector  # direction of the cross slide
-    n: Vector  # its normal, (beta_1, beta_2, 0) of (18)
-    point: Vector  # a point of the line: the slider's pivot, or its carriage
+    n: Vector  # normal of the cross slide, (beta_1, beta_2, 0) of (18)
+    point: Vector  # a point of the line: the pivot of the slider, or the carriage
     a: float
     b: float
     c: float

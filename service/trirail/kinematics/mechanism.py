@@ -1,6 +1,6 @@
-"""Dispatch of compiled calls to the mechanism of a packed leg.
+"""Dispatch of compiled calls to the functions of the mechanism to which a packed leg belongs.
 
-The array itself shows the mechanism: the second joint is revolute in a 3-PRP leg, and prismatic in a 3-PPR leg.
+The mechanism is known from the second joint, which is revolute in a 3-PRP leg and prismatic in a 3-PPR leg.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ _close_ppr3, _line_ppr3, _demand_ppr3 = ppr3.close, ppr3.line, ppr3.demand
 
 
 class MovingLeg(NamedTuple):
-    """Closed leg of a moving platform."""
+    """Positions, velocities and accelerations of the joints of a leg for a motion of the platform."""
 
     closed: ClosedLeg
     rate: float  # of the slider
-    acceleration: float
+    acceleration: float  # of the slider
     passive_rate: float  # of the cross slide
-    passive_acceleration: float
-    regular: bool  # else the leg is singular, or a number is not finite
+    passive_acceleration: float  # of the cross slide
+    regular: bool  # False if the leg is singular or a number is not finite
 
 
 @inlined
 def _turns_second(leg: Array) -> bool:
-    """Return whether the pivot is on the carriage, as in a 3-PRP leg."""
+    """Return whether the second joint is revolute, that is, the pivot is on the carriage, as in a 3-PRP leg."""
     return bool(leg[1, 0] != 0.0)
 
 
@@ -48,20 +48,20 @@ def close(leg: Array, pose: Vector) -> ClosedLeg:
 
 @compiled()
 def line(leg: Array, slider: float) -> SlideLine:
-    """Return the line along which a leg lets the platform move while its slider is fixed."""
+    """Return the line along which a leg allows the platform to move while its slider is fixed."""
     return _line_prp3(leg, slider) if _turns_second(leg) else _line_ppr3(leg, slider)
 
 
 @compiled()
 def demand(leg: Array, line: SlideLine, cosine: float, sine: float) -> tuple[Vector, Vector, float]:
-    """Return normal n and direction of a leg's cross slide at phi, and the n . G that the leg requires there."""
+    """Return the normal n and the direction of a cross slide at phi, and the value that the leg requires for n . G."""
     return _demand_prp3(line, cosine, sine) if _turns_second(leg) else _demand_ppr3(line, cosine, sine)
 
 
 @compiled()
 def move(leg: Array, pose: Vector, velocity: Vector, acceleration: Vector) -> MovingLeg:
-    """Solve a leg for the motion of the platform."""
-    if _turns_second(leg):  # decided once: merging the results of two branches takes a tenth more time
+    """Return the motion of the joints of a leg for a motion of the platform."""
+    if _turns_second(leg):  # a single branch with two returns: merging the results would take 10 % more time
         closed = _close_prp3(leg, pose)
         rates, changes = joint_motion(leg, (closed.slider, pose[2], closed.passive), velocity, acceleration)
         return _moving(closed, rates[0], changes[0], rates[2], changes[2])
@@ -79,5 +79,5 @@ def _moving(closed: ClosedLeg, rate: float, change: float, passive_rate: float, 
 
 @compiled()
 def beta(closed: ClosedLeg) -> Vector:
-    """Return the leg's row of J2, (18)."""
+    """Return the row of J2 that belongs to a leg, (18)."""
     return closed.cross[1], -closed.cross[0], dot(closed.cross, closed.to_centre)

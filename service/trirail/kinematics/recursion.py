@@ -1,20 +1,22 @@
-"""The matrix recursion of a planar serial leg of prismatic and revolute joints: the paper's (2) to (20).
+"""Matrix recursion for a planar serial leg with prismatic and revolute joints: equations (2) to (20) of the paper.
 
-Frames and symbols are the paper's, with q for any leg's matrices (a on its leg A). T_0 is the base. Link T_k,
-k = 1 ... n, has its frame at A_k, with the z axis along joint k: a prismatic joint moves along it by
-lambda_{k,k-1} [m], a revolute joint turns about it by phi_{k,k-1} [rad]. The matrix q_{k,k-1} takes
-components from T_{k-1} to T_k, its transpose takes them back. Motion is in the plane x_0 y_0: prismatic axes
-lie in it, revolute axes are normal to it. The last link is the platform or fixed to it; r_n^G leads from A_n
-to its centre G.
+Frames and symbols are those of the paper, except that q denotes the matrices of any leg (the paper uses a for leg A).
+T_0 is the base. The frame of link T_k, k = 1 ... n, has its origin at A_k and its z axis along joint k. A prismatic
+joint moves along this axis by lambda_{k,k-1} [m], and a revolute joint rotates about this axis by phi_{k,k-1} [rad].
+The matrix q_{k,k-1} transforms components from T_{k-1} to T_k, and its transpose transforms them back. The leg moves in
+the plane x_0 y_0: prismatic axes are in this plane, and revolute axes are normal to it. The last link is the platform,
+or is fixed to the platform. The vector r_n^G leads from A_n to the centre G of the platform.
 
-A leg is a float64 array of shape (n + 1, 13), made by `joints.serial_leg`, with a row for each joint and one for G:
+A leg is a float64 array of shape (n + 1, 13), created by `joints.serial_leg`. It has one row per joint, and a last row
+for G:
 
-    column  0        1 for a revolute joint, 0 for a prismatic one
+    column  0        1 for a revolute joint, 0 for a prismatic joint
     columns 1 to 3   the constant part of r_{k,k-1}, in T_{k-1} [m]; in the last row r_n^G, in T_n
     columns 4 to 12  the constant part of q_{k,k-1}, row by row
 
-A platform moves in (x, y, phi): G in T_0 [m], the turning about z_0 [rad], and their time derivatives.
-A singular or non-finite result is an infinity or NaN; the loop closure checks for it.
+The motion of the platform is described by x, y, phi (position of G in T_0 [m] and rotation about z_0 [rad]) and their
+time derivatives. The functions do not check for singular or non-finite values, and return infinity or NaN. The loop
+closure checks the results.
 """
 
 from __future__ import annotations
@@ -89,7 +91,10 @@ def _constant_matrix(leg: Array, k: int) -> Matrix:
 
 @inlined
 def link(base: Link, leg: Array, k: int, variable: float) -> Link:
-    """Return the link that row k of a leg joins to `base`, with the joint at `variable` [m or rad]."""
+    """Return the link after the joint in row k of a leg, given the link `base` before the joint.
+
+    `variable` is the position of the joint [m or rad].
+    """
     revolute = leg[k, 0] != 0.0
     a = _constant_matrix(leg, k)
     r = _constant_vector(leg, k)
@@ -104,7 +109,7 @@ def link(base: Link, leg: Array, k: int, variable: float) -> Link:
 
 @inlined
 def platform_centre(leg: Array, last: Link) -> Vector:
-    """Return G in T_0: the whole left side of (9)."""
+    """Return the position of G in T_0, which is the complete left side of (9)."""
     return add(last.p, transposed_times(last.q, _constant_vector(leg, len(leg) - 1)))
 
 
@@ -116,20 +121,20 @@ def _spin(omega: Vector, epsilon: Vector, r: Vector) -> Vector:
 
 @inlined
 def link_motion(base: LinkMotion, link: Link, rate: float, acceleration: float) -> LinkMotion:
-    """Return the motion of a link on a moving base, given the rate and the acceleration of its joint."""
+    """Return the motion of a link, given the motion of the link before and the rate and acceleration of the joint."""
     omega_k, v_k = (rate, 0.0) if link.revolute else (0.0, rate)
     epsilon_k, gamma_k = (acceleration, 0.0) if link.revolute else (0.0, acceleration)
     a, r = link.a, link.r
     carried = times(a, base.omega)  # the vector of a ω̃_{k-1,0} aᵀ
     carried_u3 = (carried[1], -carried[0], 0.0)  # a ω̃_{k-1,0} aᵀ u3
 
-    # (13): the vectors of (12)
+    # (13), which has the vectors of the matrices in (12)
     omega = plus_u3(carried, omega_k)
     # (14)
     v = plus_u3(times(a, add(base.v, cross(base.omega, r))), v_k)
-    # (20), first line; the second, for ω̃ ω̃ + ε̃, follows from it and (12)
+    # (20), first line. The second line, for ω̃ ω̃ + ε̃, follows from the first line and (12).
     epsilon = plus_u3(add(times(a, base.epsilon), scale(omega_k, carried_u3)), epsilon_k)
-    # (20), last line; its Coriolis term ends in the vector u3, where the paper prints the matrix ũ3
+    # (20), last line. The Coriolis term ends in the vector u3. The paper misprints it as the matrix ũ3.
     gamma = times(a, add(base.gamma, _spin(base.omega, base.epsilon, r)))
     gamma = plus_u3(add(gamma, scale(2.0 * v_k, carried_u3)), gamma_k)
     return LinkMotion(omega, v, epsilon, gamma)
@@ -137,7 +142,7 @@ def link_motion(base: LinkMotion, link: Link, rate: float, acceleration: float) 
 
 @inlined
 def platform_motion(leg: Array, last: Link, motion: LinkMotion) -> tuple[Vector, Vector]:
-    """Return velocity and acceleration (x, y, phi) of the platform, which is carried by the last link of a leg."""
+    """Return velocity and acceleration (x, y, phi) of the platform, given the motion of the last link of a leg."""
     r = _constant_vector(leg, len(leg) - 1)
     vx, vy, _ = transposed_times(last.q, add(motion.v, cross(motion.omega, r)))
     ax, ay, _ = transposed_times(last.q, add(motion.gamma, _spin(motion.omega, motion.epsilon, r)))
@@ -148,7 +153,10 @@ def platform_motion(leg: Array, last: Link, motion: LinkMotion) -> tuple[Vector,
 
 @inlined
 def follow(leg: Array, joints: Array) -> tuple[Link, LinkMotion]:
-    """Return position and motion of link T_k, given rows (variable, rate, acceleration) for the joints 1 to k."""
+    """Return position and motion of link T_k, given the motion of the joints 1 to k.
+
+    The columns of `joints` are position, rate and acceleration.
+    """
     place, motion = BASE, AT_REST
     for k in range(len(joints)):
         place = link(place, leg, k, joints[k, 0])
@@ -158,7 +166,7 @@ def follow(leg: Array, joints: Array) -> tuple[Link, LinkMotion]:
 
 @inlined
 def _unit_velocity(link: Link, centre: Vector) -> Vector:
-    """Return the platform velocity (x, y, phi) for a unit rate of this joint, which are its factors in (15)."""
+    """Return the velocity (x, y, phi) of the platform for a unit rate of a joint: its factors in (15)."""
     axis = link.q[2]  # q_k0ᵀ u3
     if link.revolute:
         x, y, _ = cross(axis, subtract(centre, link.p))
@@ -168,12 +176,12 @@ def _unit_velocity(link: Link, centre: Vector) -> Vector:
 
 @inlined
 def joint_motion(leg: Array, variables: Vector, velocity: Vector, acceleration: Vector) -> tuple[Vector, Vector]:
-    """Return rates and accelerations of a leg's three joints from the motion of its platform: (15) and (19).
+    """Return rates and accelerations of the three joints of a leg for a motion of the platform, by (15) and (19).
 
-    Three joints are enough to follow any planar motion. The unknowns of (15) and of (19) have the same factors, the
-    unit velocities j. The right side of (19) is the platform's acceleration minus the part that (20) gives for joints
-    at constant rates. For a PRP leg, these are the paper's equations, but with the factor lambda_32 that is missing
-    from the omega_21² term of its (19), and with epsilon_21 = d²phi/dt².
+    With three joints, a leg can follow any planar motion. The unknowns of (15) and of (19) have the same factors, the
+    unit velocities j. The right side of (19) is the acceleration of the platform minus the acceleration that (20) gives
+    for joints with constant rates. For a PRP leg, the equations are those of the paper, with two differences: the
+    factor lambda_32, which is missing in the omega_21² term of (19) in the paper, and epsilon_21 = d²phi/dt².
     """
     first = link(BASE, leg, 0, variables[0])
     second = link(first, leg, 1, variables[1])

@@ -1,8 +1,8 @@
-"""The 3-PRP robot: inverse and forward kinematics, and both Jacobians.
+"""Inverse and forward kinematics, and both Jacobians, for arrays of poses, with exceptions for invalid values.
 
-A pose is (x, y, phi): the platform's centre G in the base frame [m], and its angle [rad]. The sliders are lambda_10 of
-the legs A, B, C [m]. The passive joints are lambda_32 of the same legs [m], and phi_21 = phi, (8). An array holds
-either one pose, with shape (3,), or N poses, with shape (N, 3).
+A pose is (x, y, phi): the platform's centre G in the base frame [m], and the angle of the platform [rad]. The positions
+of the sliders are lambda_10 of the legs A, B, C [m]. For a 3-PRP robot, the passive joints are lambda_32 of the same
+legs [m], and phi_21 = phi, (8). An array holds either one pose, with shape (3,), or N poses, with shape (N, 3).
 """
 
 from __future__ import annotations
@@ -36,13 +36,14 @@ class Motion(NamedTuple):
     """Motion of the joints of legs A, B, C. Each field has shape (3,) or (N, 3), in m, m/s or m/s²."""
 
     position: Array
-    """lambda_10, the positions of the sliders on their rails, counted from where they read zero [m]."""
+    """lambda_10, the positions of the sliders on their rails [m]."""
     velocity: Array
     """v_10 [m/s]."""
     acceleration: Array
     """gamma_10 [m/s²]."""
     passive_position: Array
-    """lambda_32, the positions of the sliders' pins along the platform's edges [m]."""
+    """lambda_32, the positions of the pins along the edges of the platform; lambda_21 of the cross slides of a 3-PPR
+    robot [m]."""
     passive_velocity: Array
     """v_32 [m/s]."""
     passive_acceleration: Array
@@ -53,10 +54,10 @@ def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acce
     """Return the motion of all joints for a motion of the platform, by (9) to (19).
 
     `pose` is x, y [m] and phi [rad] in the base frame, (3,) or (N, 3). `velocity` [m/s, m/s, rad/s] and `acceleration`
-    [m/s², m/s², rad/s²] are its time derivatives. They have the shape of `pose`, or (3,) to apply to all rows; by
-    default the platform is at rest. Limits of travel are not checked. Raises KinematicsError, with leg, value and
-    limit, if a number is not finite, or if the edge of a leg is parallel to its rail, sin(phi + edge_angle -
-    rail_angle) = 0.
+    [m/s², m/s², rad/s²] are its time derivatives. They have the shape of `pose`, or the shape (3,) if they apply to all
+    rows. By default, the platform is at rest. The travel of the joints is not checked. Raises KinematicsError, with
+    leg, value and limit, if a number is not finite, or if the edge of a leg is parallel to its rail, sin(phi +
+    edge_angle - rail_angle) = 0.
     """
     pose = np.asarray(pose, dtype=np.float64)
     rows = _rows("pose", pose)
@@ -75,10 +76,10 @@ def inverse(geometry: Geometry, pose: ArrayLike, velocity: ArrayLike = 0.0, acce
 def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = None) -> Array:
     """Return the pose, x, y [m] and phi in (-pi, pi], for given positions of the sliders A, B, C [m], by (11).
 
-    Two poses close the loops. The function returns the one that can be reached from the pose `near` without passing a
-    singularity of J2. `near` has the shape of `sliders`, or (3,) to apply to all rows; the default is (0, 0, 0). The
-    symmetric robot does not need it in its usable range, -2 pi/3 < phi < pi/3. Raises KinematicsError if a number is
-    not finite, if no pose closes the loops, or if that pose or `near` is singular.
+    Two poses close the loops. The function returns the pose that can be reached from the pose `near` without passing a
+    singularity of J2. `near` has the shape of `sliders`, or the shape (3,) if it applies to all rows. The default, (0,
+    0, 0), is always sufficient for the symmetric robot in its usable range, -2 pi/3 < phi < pi/3. Raises
+    KinematicsError if a number is not finite, if no pose closes the loops, or if the result or `near` is singular.
     """
     sliders = np.asarray(sliders, dtype=np.float64)
     rows, start, pose = np.empty((3, _rows("sliders", sliders), 3))
@@ -94,11 +95,10 @@ def forward(geometry: Geometry, sliders: ArrayLike, near: ArrayLike | None = Non
 
 
 def jacobians(geometry: Geometry, pose: ArrayLike) -> tuple[Array, Array]:
-    """Return J1 and J2 of (16) to (18), (3, 3) or (N, 3, 3): J1 @ slider velocity = J2 @ platform velocity.
+    """Return J1 and J2 of (16) to (18), (3, 3) or (N, 3, 3), with J1 @ slider velocity = J2 @ platform velocity.
 
-    `pose` has the form that inverse takes. J1 is diagonal. The last column of J2 is in metres, and the other columns
-    have no unit. The function inverts neither matrix, so J2 may be singular. Raises KinematicsError like inverse if J1
-    is singular.
+    `pose` has the same form as for inverse. J1 is diagonal. The last column of J2 is in metres, and the other columns
+    have no unit. J2 may be singular. Raises KinematicsError if a number is not finite or J1 is singular.
     """
     pose = np.asarray(pose, dtype=np.float64)
     rows = np.empty((_rows("pose", pose), 3))
@@ -112,7 +112,7 @@ def jacobians(geometry: Geometry, pose: ArrayLike) -> tuple[Array, Array]:
 
 
 def warm_up() -> None:
-    """Run all functions that this module has compiled or loaded once, so that no later call is the first."""
+    """Call each function of this module once, because the first call of a compiled function is slow."""
     geometry = Geometry.symmetric()
     legs, pose = geometry.packed(), np.zeros(3)
     inverse_into(legs, np.zeros((3, 3)), np.empty((6, 3)))
@@ -122,7 +122,7 @@ def warm_up() -> None:
 
 
 def _rows(name: str, array: Array) -> int:
-    """Return the number of rows of an array; 1 if the array is a single row."""
+    """Return the number of poses in an array of shape (3,) or (N, 3)."""
     if array.ndim not in {1, 2} or array.shape[-1] != 3:
         raise KinematicsError(f"{name} has shape {array.shape}: expected (3,) or (N, 3)")
     return len(array) if array.ndim == 2 else 1
@@ -151,7 +151,7 @@ def _refuse_pose(geometry: Geometry, motion: Array, leg: int, place: str) -> NoR
 
 
 def _refuse_slider(geometry: Geometry, sliders: Array, pose: Array, leg: int, place: str) -> NoReturn:
-    """Raise the error for a bad slider position, or for the angle to which the sliders bring the edge of the leg."""
+    """Raise the error for an invalid slider position, or for a pose at which the edge of the leg is singular."""
     slider = float(sliders[leg])
     if not math.isfinite(slider):
         message = f"{place}slider {geometry.labels[leg]} is {slider}: it must be finite"
@@ -160,7 +160,7 @@ def _refuse_slider(geometry: Geometry, sliders: Array, pose: Array, leg: int, pl
 
 
 def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoReturn:
-    """Raise the error that states where the edge of a leg is parallel to its rail."""
+    """Raise the error that states at which angle the edge of a leg is parallel to its rail."""
     built, at, where = geometry.each[leg], worded(phi, "rad"), f"{place}leg {geometry.labels[leg]}"
     parallel = built.parallel_angle
     if parallel is None:
@@ -176,7 +176,7 @@ def _refuse_angle(geometry: Geometry, leg: int, phi: float, place: str) -> NoRet
 
 
 def _refuse_loops(geometry: Geometry, sliders: Array, near: Array, place: str) -> NoReturn:
-    """Raise the error that states by how much the loops fail to close, or that they close at a singular pose."""
+    """Raise the error that states by how much the loops fail to close, or that the pose or `near` is singular."""
     A, B, C = loop_equation(geometry.packed(), sliders)
     reach, needed = math.hypot(A, B), abs(C)
     readings = "{}sliders ({}, {}, {})".format(place, *(worded(slider, "m") for slider in sliders))

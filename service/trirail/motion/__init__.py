@@ -1,1 +1,1 @@
-"""Motion planning: from a goal to a path in time that keeps every limit."""
+"""Motion planning: computation of paths that lead to goals and stay within all limits."""

@@ -1,7 +1,7 @@
-"""Share of the sliders' limits that is reserved for taking up backlash.
+"""Part of the sliders' limits that is reserved for backlash compensation.
 
-When a slider reverses, its motor also crosses the backlash, on a quintic from rest to rest. The duration depends only
-on the widest backlash.
+When a slider reverses, its motor must also cross the backlash. This extra motion, the take-up, is a quintic from rest
+to rest. The duration of the take-up depends only on the widest backlash.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ import msgspec
 from trirail.config import Limits, SliderLimits
 
 SHARE = 0.1
-"""Share of the sliders' velocity, acceleration and jerk limits that is reserved for backlash."""
+"""Fraction of the sliders' velocity, acceleration and jerk limits that is reserved for the take-up."""
 PEAKS = (15.0 / 8.0, 10.0 / math.sqrt(3.0), 60.0)
 """Peak velocity, acceleration and jerk of a quintic that covers unit distance in unit time."""
 
 
 class TakeUp(NamedTuple):
-    """Widths of the backlash, and the motion that takes it up."""
+    """Motion with which the motors cross the backlash after a reversal."""
 
     widths: Sequence[float]
     """Backlash of the sliders A, B, C [m]."""
     duration: float
-    """Duration of the take-up [s]; zero without backlash."""
+    """Duration of the take-up [s]; zero if no slider has backlash."""
     velocity: float
-    """Peak velocity of the slider with the widest backlash [m/s]."""
+    """Peak velocity of the take-up for the widest backlash [m/s]."""
     acceleration: float
-    """Peak acceleration of that slider [m/s²]."""
+    """Peak acceleration of the take-up for the widest backlash [m/s²]."""
     jerk: float
-    """Peak jerk of that slider [m/s³]."""
+    """Peak jerk of the take-up for the widest backlash [m/s³]."""
 
 
 NO_BACKLASH = TakeUp((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
 
 
 def reserve_for_backlash(widths: Sequence[float], slider: SliderLimits) -> TakeUp:
-    """Return the fastest take-up of the given widths [m] within the reserved share of the limits."""
+    """Return the fastest take-up for backlash of the given widths [m] within the reserved part of the limits."""
     widest = max(widths)
     limits = min(slider.velocities), min(slider.accelerations), min(slider.jerks)
     powers = (1, 2, 3)
@@ -54,9 +54,10 @@ def reserve_for_backlash(widths: Sequence[float], slider: SliderLimits) -> TakeU
 
 
 def planned_limits(limits: Limits, widths: Sequence[float]) -> Limits:
-    """Return the limits for planning, which are the robot's limits minus the share reserved for backlash.
+    """Return the limits for planning, which are the robot's limits minus the part reserved for backlash.
 
-    The in-position windows of the sliders are enlarged by the backlash, because a position is uncertain by that amount.
+    The in-position windows of the sliders are enlarged by the backlash, because the position of a slider is uncertain
+    by this amount.
     """
     if not any(widths):
         return limits

@@ -1,4 +1,4 @@
-"""Feasibility of a path: how much it uses of the limits of sliders and platform, and when it leaves the workspace."""
+"""Feasibility of a path: its rates are compared with the limits of the robot, and its poses with the workspace."""
 
 from __future__ import annotations
 
@@ -20,69 +20,76 @@ from trirail.motion.paths import ROUNDING, Path, constant_law, evaluate, law_fal
 from trirail.motion.runs import ZERO_RATES
 
 SLIDER_PLAN_SHARES = (0.98, 0.98, 0.93)
-"""Shares of the sliders' velocity, acceleration and jerk limits that plans use. The rest covers peaks between
-samples, which are highest for the jerk."""
+"""Fractions of the sliders' velocity, acceleration and jerk limits that planned paths may use. The margin covers peaks
+between samples, which are highest for the jerk."""
 SLIDER_LAW_SHARES = (0.99, 0.99, 0.98)
-"""Shares of the same limits that a path and a change of its rate may use together."""
+"""Fractions of the sliders' limits that a path may use while its rate is changing."""
 PLATFORM_PLAN_SHARES = (0.995, 0.98, 0.957)
-"""Shares of the platform's velocity, acceleration and jerk limits that plans use. They are higher than those of the
-sliders, because the platform's rates vary less between samples, and because a change of rate adds no velocity."""
+"""Fractions of the platform's velocity, acceleration and jerk limits that planned paths may use. They are higher than
+the fractions for the sliders, because the platform's rates vary less between samples, and because a change of rate adds
+no velocity."""
 PLATFORM_LAW_SHARES = (0.997, 0.99, 0.985)
-"""Shares of the same limits that a change of rate may use. The margin allows a robot at its limits to brake."""
+"""Fractions of the platform's limits that a path may use while its rate is changing. They are higher than
+PLATFORM_PLAN_SHARES, so that a robot at its limits can brake."""
 ROUNDING_FACTOR = 1.0 + 1e-6
-"""Factor by which a share may be exceeded because of rounding."""
+"""Factor by which the permitted fraction of a limit may be exceeded because of rounding."""
 SUBJECTS = ("a slider", *(f"the platform's {name}" for name in (*COORDINATES, "centre in x", "centre in y")))
-"""Names of the rows of SampleResult.worst. The centre has rows of its own for a path of another point, because the
-limits apply to both points."""
+"""Names of the rows of SampleResult.worst. If a path moves another point than the centre, the limits also apply to the
+centre, and the last two rows are used."""
 SAMPLE_INTERVAL_S = 0.005
-"""Interval between the samples of a path, in addition to its knots [s]. With samples 20 ms apart, an acceleration
-between two samples was once 1.4 % above both of them while the rate was changing as well."""
+"""Interval of the evenly spaced samples of a path, which are added to samples at its knots [s]. With an interval of
+20 ms, an acceleration between two samples was once 1.4 % higher than at both samples, during a change of rate."""
 MIN_SAMPLES, MAX_SAMPLES = 16, 64
-"""Least and greatest number of these samples, for short and long paths."""
+"""Least and greatest number of evenly spaced samples per call."""
 KNOTS_PER_PART = 48
-"""Number of knots of a planned path that are sampled together. Each part has at least MIN_SAMPLES samples."""
+"""Number of knots of a path that are sampled in one call. Each call takes at least MIN_SAMPLES samples."""
 SLOWDOWN_EXPONENTS = 1.0 / np.arange(1.0, 4.0)
-"""Exponents that convert excess velocity, acceleration and jerk into a factor of time."""
+"""Exponents that convert factors of velocity, acceleration and jerk into a factor of time."""
 MAX_SAMPLED_S = 600.0
 """Longest part of a path that is sampled in one call [s]."""
 
 
 class SampleResult(NamedTuple):
-    """Use of the limits by a path, and the time at which the path leaves the workspace."""
+    """Result of sampling a path under a law."""
 
     worst: Array
-    """Greatest velocity, acceleration and jerk of each of SUBJECTS, (6, 3), as shares of the limits that plans use."""
+    """Greatest velocity, acceleration and jerk of each of SUBJECTS, (6, 3), divided by the limits for planned paths."""
     within_limits: bool
-    """Whether the motion stays within the limits for changes of rate, and the time along the path never decreases."""
+    """Whether the motion stays in the workspace and within the limits for changes of rate, with a law that never lets
+    the time along the path decrease."""
     leaves_at: float
-    """Time at which the path leaves the workspace [s]; NaN if it never does."""
+    """Time at which the path leaves the workspace [s]; NaN if the path stays in the workspace."""
 
     @property
     def slowdown_factor(self) -> float:
-        """Factor by which the path must be slowed to fit; at most 1 if it fits already."""
+        """Factor by which the path must be slowed to fit the limits for planned paths; at most 1 if it already fits."""
         return slowdown_factor(self.worst)
 
     @property
     def fits(self) -> bool:
-        """Whether the path keeps the limits of plans and stays in the workspace."""
+        """Whether the path stays in the workspace and within the limits for planned paths."""
         return math.isnan(self.leaves_at) and self.slowdown_factor <= 1.0
 
 
 def slowdown_factor(worst: Array) -> float:
-    """Return the factor by which a motion must be slowed to fit, given its shares (…, 3) of the limits.
+    """Return the factor by which a motion must be slowed to fit its limits.
 
-    If a path is slowed k times, its velocity is 1/k, its acceleration 1/k² and its jerk 1/k³ of the original.
+    `worst` (…, 3) holds velocity, acceleration and jerk, divided by their limits. If a path is slowed by a factor k,
+    its velocity is divided by k, its acceleration by k² and its jerk by k³.
     """
     return float((worst**SLOWDOWN_EXPONENTS).max())
 
 
 def most_exceeded(worst: Array) -> str:
-    """Return the name of the subject that requires the greatest slowdown."""
+    """Return the name in SUBJECTS of the row that requires the greatest slowdown."""
     return SUBJECTS[int((worst**SLOWDOWN_EXPONENTS).max(axis=1).argmax())]
 
 
 def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list[tuple[float, float]]:
-    """Divide a law's time [s] into parts with at most `knots` knots of the path each. Return their starts and ends."""
+    """Divide an interval of a law's time into parts, each with at most `knots` knots of the path.
+
+    Returns the start and the end of each part [s].
+    """
     at = np.zeros((3, 1))
     evaluate(law.knots, law.pieces, first, at)
     begin = int(np.searchsorted(path.knots, at[0, 0], side="right"))
@@ -94,7 +101,7 @@ def parts(path: Path, law: Path, first: float, until: float, knots: int) -> list
 
 
 def _positions(motion: Array, rows: Array) -> Array:
-    """Return the nine positions that have limits: x, y, phi, the sliders and the cross slides."""
+    """Return the nine positions that have limits: x, y, phi, three sliders and three cross slides."""
     return np.concatenate([motion[0], rows[0], rows[3]])
 
 
@@ -104,15 +111,15 @@ class Checker:
     Parameters
     ----------
     geometry : Geometry
-        Geometry of the robot as built.
+        Geometry of the robot, including the correction.
     limits : Limits
         Limits for planning, from backlash_reserve.planned_limits.
     bounds : Bounds
-        The same limits, for messages.
+        The same limits, used to describe violations in messages.
     period : float
         Cycle time of the loop [s].
     beat : Callable[[], None]
-        Function called once per sampled path as a sign of life.
+        Function that is called once per sampled path, to show that the planner is alive.
     """
 
     def __init__(
@@ -132,15 +139,16 @@ class Checker:
         each = np.array([most, x, y, phi, x, y])
         planned = each * [SLIDER_PLAN_SHARES, *[PLATFORM_PLAN_SHARES] * 5]
         self.slider_limits = planned[0]
-        """Velocity, acceleration and jerk limits (3,) that plans use for the slider with the highest limits."""
+        """Velocity, acceleration and jerk limits (3,) for planned paths, each for the slider with the highest limit."""
         self.each_slider_limits = self.slider_limits[:, None] / self._shares
-        """Limits that plans use for each slider; rows are velocity, acceleration, jerk (3, 3)."""
+        """Limits of each slider for planned paths; rows are velocity, acceleration, jerk (3, 3)."""
         self.platform_limits = planned[1:4]
-        """Limits that plans use for the platform; rows are x, y, phi (3, 3)."""
+        """Limits of the platform for planned paths; rows are x, y, phi (3, 3)."""
         self.centre_limits = planned[4:]
-        """Limits that plans use for x and y of the platform's centre if the path is that of another point (2, 3)."""
+        """Limits of the platform's centre in x and y for planned paths that move another point of the platform (2,
+        3)."""
         self.law_limits = each[1:4] * PLATFORM_LAW_SHARES
-        """Limits that changes of rate use for the platform; rows are x, y, phi (3, 3)."""
+        """Limits of the platform during a change of the rate; rows are x, y, phi (3, 3)."""
         self._planned = planned * ROUNDING_FACTOR
         self._laws = each * [SLIDER_LAW_SHARES, *[PLATFORM_LAW_SHARES] * 5] / planned
         self._legs = geometry.packed()
@@ -152,12 +160,12 @@ class Checker:
     def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
         """Sample a path under a law between two times of the law [s].
 
-        `pose` selects the branch of the first sample. Each call gives a sign of life, because every loop of the planner
-        samples a path in each iteration.
+        `pose` selects the branch of the forward kinematics for the first sample. Each call also calls `beat`, because
+        every loop in the planner samples a path in each iteration.
         """
         self._beat()
         until = max(first, min(until, first + MAX_SAMPLED_S))
-        # A path from standstill may begin with an acceleration. The step into it counts, as does the step at the end.
+        # A path from standstill may begin with an acceleration. The jerk of this step must be included, as at the end.
         if first == 0.0 and law.pieces[0, 0, 0] == 0.0 and not path.pieces[0, :, 1].any():
             first = -self._period
         even = min(max(MIN_SAMPLES, int((until - first) / SAMPLE_INTERVAL_S)), MAX_SAMPLES)
@@ -181,11 +189,11 @@ class Checker:
         return SampleResult(worst, within_limits, leaves_at)
 
     def keeps_limits(self, worst: Array) -> bool:
-        """Return whether shares (6, 3) of the plan limits stay within the limits for changes of rate."""
+        """Return whether rates, given like SampleResult.worst, stay within the limits for changes of rate."""
         return bool((worst <= self._laws).all())
 
     def worst_shares(self, path: Path, pose: Sequence[float]) -> Array:
-        """Return SampleResult.worst for a whole path.
+        """Return SampleResult.worst for a whole path at full speed.
 
         Raises
         ------
@@ -201,7 +209,7 @@ class Checker:
         return worst
 
     def refusal(self, path: Path, time: float, pose: Sequence[float]) -> RefusedError:
-        """Return the error that refuses a path because it leaves the workspace at a time along it [s]."""
+        """Return the error that refuses a path that leaves the workspace at the time `time` along the path [s]."""
         where = f"the path leads out of the workspace after {max(0.0, time) / path.duration:.0%} of its time"
         rows = self._rows(path, time, pose)
         if rows is None:
@@ -218,13 +226,13 @@ class Checker:
         )
 
     def bound(self, path: Path, time: float, pose: Sequence[float]) -> str:
-        """Return the name of the limit at which a path leaves the workspace at a time along it [s]."""
+        """Return the name of the limit that a path exceeds at the time `time` along the path [s]."""
         rows = self._rows(path, time, pose)
         violation = self._farther_out(path, rows, pose) if rows is not None else None
         return violation.bound if violation is not None else "the workspace"
 
     def exceeded_bound(self, pose: Sequence[float]) -> str | None:
-        """Return the name of the limit that a pose exceeds; None if the robot can be at that pose."""
+        """Return the name of the limit that a pose exceeds; None if the pose is in the workspace."""
         motion, rows = np.array((pose, ZERO_RATES, ZERO_RATES)), np.zeros((6, 3))
         if inverse_into(self._legs, motion, rows):
             return "the workspace"
@@ -232,7 +240,7 @@ class Checker:
         return violation.bound if violation is not None else None
 
     def _rows(self, path: Path, time: float, pose: Sequence[float]) -> tuple[Array, Array] | None:
-        """Return the platform's motion (3, 3) and the sliders' rows (6, 3) at a time along a path; None if singular."""
+        """Return the motion of platform (3, 3) and sliders (6, 3) at a time along a path; None if singular."""
         rows, near, law = np.zeros((6, 3)), np.array(pose, dtype=np.float64), constant_law(1.0)
         motion = np.zeros((3, 3))
         if platform_at_law_time(self._legs, *path, *law[:2], time, near, motion) or inverse_into(
@@ -242,7 +250,7 @@ class Checker:
         return motion, rows
 
     def _farther_out(self, path: Path, rows: tuple[Array, Array], pose: Sequence[float]) -> Violation | None:
-        """Return the first position that is beyond its limit and farther out than it was at the start of the path."""
+        """Return the first violation by a position that is farther outside its limit than at the start of the path."""
         begin = self._rows(path, 0.0, pose)
         return self._violation(_positions(*rows), _positions(*begin) if begin is not None else None)
 

@@ -1,4 +1,4 @@
-"""Interface between kinds of goals and the planner: resolve names and frames, check the request, and plan the path."""
+"""Interface that each kind of goal implements for the planner: resolve names, check the goal, and plan its path."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from trirail.wire.goal_kind import GoalKind
 
 G = TypeVar("G", bound=GoalKind)
 PoseSource = Callable[[Literal["commanded", "measured"]], Sequence[float]]
-"""Function that returns the pose of the platform's centre from which a relative move is counted."""
+"""Function that returns the commanded or the measured pose of the platform's centre, from which a relative move
+starts."""
 
 
 class GoalMotion(Generic[G]):
@@ -20,14 +21,14 @@ class GoalMotion(Generic[G]):
 
     kind: ClassVar[type[GoalKind]]
     examples: ClassVar[tuple[GoalKind, ...]] = ()
-    """Goals that the warm-up plans from the middle of the workspace, because the first plan of a kind is slow."""
+    """Goals that are planned once when the planner starts, because the first plan of each kind is slow."""
 
     def __init__(self, planner: PathPlanner) -> None:
         self._planner = planner
 
     @staticmethod
     def resolve(goal: G, frames: NamedFrames, source: PoseSource) -> GoalKind:
-        """Return the goal in the base frame, with names replaced by their values.
+        """Return the goal with its pose in the base frame, and with the values of named tools, frames and poses.
 
         Raises
         ------
@@ -38,7 +39,7 @@ class GoalMotion(Generic[G]):
         return goal
 
     def check(self, goal: G) -> None:
-        """Raise RefusedError if the goal cannot be reached from any start."""
+        """Raise RefusedError if the goal is impossible, independently of the start of the motion."""
 
     def plan(self, goal: G, start: MotionState, rate: float, begins: float) -> Plan:
         """Return a path to the goal.
@@ -50,9 +51,9 @@ class GoalMotion(Generic[G]):
         start : MotionState
             State of the platform's centre at the start of the path.
         rate : float
-            Rate at which time runs along the path.
+            Rate of the time along the path, relative to real time.
         begins : float
-            Loop time at which the path begins [s].
+            Time of the schedule at which the path begins [s].
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Planner that plans a motion to a goal of any kind, starting from the motion under way."""
+"""Planner of motions to goals of any kind. The robot may be at rest or in motion."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from trirail.wire.goals import Goal
 from trirail.wire.messages import GoalReply
 
 MIN_REPLAN_RATE = 0.05
-"""Lowest rate at which a new goal is planned from motion. Below it, the goal is planned from a standstill."""
+"""Lowest rate of the current motion at which a new goal is planned without a stop. At lower rates, the robot first
+stops."""
 STOP_SHARES = tuple(0.5**k for k in range(5))
-"""Shares of the quickest stop that are tried if the robot must stop before it moves to a goal."""
+"""Fractions of the greatest deceleration that are tried in turn if the robot must stop before it moves to a goal."""
 SLOWDOWN_STEP = 1.3
-"""Factor by which a path is slowed if the override makes it too fast."""
+"""Factor by which a path is slowed in each attempt if the override makes the path too fast."""
 MAX_SLOWDOWNS = 12
-"""Greatest number of such slowdowns; 1.3 to the power of 12 is a factor of 23."""
+"""Greatest number of slowdowns by SLOWDOWN_STEP. Twelve slowdowns make a path 23 times slower."""
 
 import_all(kinds)
 MOTIONS: dict[type[Goal], type[GoalMotion[Any]]] = {made.kind: made for made in GoalMotion.__subclasses__()}
@@ -40,46 +41,46 @@ MOTIONS: dict[type[Goal], type[GoalMotion[Any]]] = {made.kind: made for made in 
 
 
 def resolve_goal(goal: Goal, frames: NamedFrames, source: PoseSource) -> Goal:
-    """Return the goal in the base frame, as the planner requires it. Raises RefusedError for an unknown name."""
+    """Return the goal in the form that the planner requires; see GoalMotion.resolve."""
     return MOTIONS[type(goal)].resolve(goal, frames, source)
 
 
 class PlannedMotion(NamedTuple):
-    """Motion that has been planned to a goal."""
+    """Result of planning: a motion to a goal, with information for its execution."""
 
     run: Run
     reply: GoalReply
     """Reply to the sender of the goal, without the goal's id."""
     bound: str | None
-    """Limit before which a jog brakes, or which the target of a track exceeds."""
+    """Name of the limit before which a jog brakes, or which the target of a track exceeds."""
     stop: Path | None = None
-    """Law that stops the current motion first; None if its present law already leads to a standstill."""
+    """Law that stops the current motion first; None if the present law of the current motion need not change."""
     first: int | None = None
-    """Cycle of the schedule in which the motion begins. None if the robot is at rest, so it may begin in any cycle."""
+    """Cycle of the schedule in which the motion begins; None if the robot is at rest, and any cycle is possible."""
 
     @property
     def duration(self) -> float:
-        """Time from the start of the motion to the arrival [s]; infinite if it never arrives."""
+        """Time from the start of the motion to the arrival [s]; infinite if the motion has no planned end."""
         return math.inf if self.reply.duration is None else self.reply.duration
 
 
 class Extension(NamedTuple):
-    """Path planned for a goal that follows the goals before it."""
+    """Path of a queued goal, which extends the path of the goals before it."""
 
     s: float
-    """Time along the path of the earlier goals at which this path begins [s]."""
+    """Time along the path of the earlier goals at which the extension begins [s]."""
     path: Path
     reply: GoalReply
-    """Reply to the sender of the goal, without the goal's id and the duration."""
+    """Reply to the sender of the goal, without the goal's id and without the duration."""
 
     @classmethod
     def from_plan(cls, s: float, plan: Plan) -> Extension:
-        """Return a plan as an extension that begins at a time along the earlier path [s]."""
+        """Create an extension from a plan. `s` is the time along the earlier path at which the extension begins [s]."""
         return cls(s, plan.path, structs.replace(plan.reply, queued=True))
 
 
 class GoalPlanner:
-    """Planner of the goals of one robot. It calls `beat` for each path that it samples."""
+    """Planner of motions to the goals of one robot. The function `beat` is called for each sampled path."""
 
     def __init__(
         self, geometry: Geometry, limits: Limits, period: float, beat: Callable[[], None] = lambda: None
@@ -95,18 +96,18 @@ class GoalPlanner:
     def plan(self, goal: Goal, schedule: Schedule, rate: float, lead: int) -> PlannedMotion:
         """Return the motion to a goal, starting from the commanded state.
 
-        If the robot moves, the new motion begins `lead` cycles later. If the motion does not fit as requested, the
-        planner compares a motion at a lower speed with one after a stop on the old path, and returns the one that
-        arrives sooner.
+        If the robot is moving, the new motion begins `lead` cycles later. If the robot cannot reach the goal at the
+        requested speed without a stop, the planner compares two motions: a slower motion without a stop, and a motion
+        after a stop on the old path. The planner returns the motion that arrives earlier.
 
         Parameters
         ----------
         goal : Goal
             Goal that has been resolved.
         schedule : Schedule
-            Schedule with the motion under way.
+            Schedule with the current motion.
         rate : float
-            Rate at which time runs along the new path.
+            Rate of the time along the new path.
         lead : int
             Number of cycles until the new motion may begin.
 
@@ -137,9 +138,11 @@ class GoalPlanner:
         return best._replace(first=first)
 
     def append(self, goal: Goal, run: Run, blend: float, lead: int) -> Extension:
-        """Return the path of a goal that follows a run. It begins within `blend` [m] of the end of the run's path.
+        """Return the path of a goal that follows a run.
 
-        The path begins in motion if the limits allow it, and otherwise at rest at the end. Raises RefusedError.
+        If the limits allow it, the path begins in motion, at a distance of `blend` [m] or less from the end of the
+        run's path. Otherwise, the path begins at rest at the end of the run's path. Raises RefusedError if no path is
+        possible.
         """
         self._motions[type(goal)].check(goal)
         at, end = self._blend_start(run, blend, lead), run.path.duration
@@ -154,7 +157,7 @@ class GoalPlanner:
         for _ in range(MAX_SLOWDOWNS):
             if self._fits(run, end, plan.path):
                 return Extension.from_plan(end, plan)
-            # An override runs the path faster than it was planned.
+            # With an override above 100 %, the path runs faster than planned, and must be planned more slowly.
             slower = structs.replace(plan.reply, slowed=SLOWDOWN_STEP * plan.reply.slowed)
             plan = Plan(stretched(plan.path, SLOWDOWN_STEP), slower)
         raise RefusedError(
@@ -162,7 +165,7 @@ class GoalPlanner:
         )
 
     def _plan_from_motion(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
-        """Plan from the commanded state, without a stop."""
+        """Plan a motion to the goal from the commanded state, without a stop."""
         start, begins = schedule.commanded, schedule.cycle * self._period
         if start.at_rest:
             plan = self._plan(goal, start, rate, begins)
@@ -173,8 +176,9 @@ class GoalPlanner:
         for now in (
             schedule.runs[0].law_state.rate,
             1.0,
-        ):  # the new path may not allow an override that the old path allowed
-            # Time along the new path runs at the rate of the old path, so the motion is slower in the path's own time.
+        ):  # the old path may allow a higher override than the new path
+            # The new path begins at the rate of the old path. In the time along the path, all velocities are therefore
+            # divided by this rate.
             velocity = [value / now for value in start.velocity]
             acceleration = [value / now**2 for value in start.acceleration]
             plan = self._plan(goal, MotionState(start.pose, velocity, acceleration), now, begins)
@@ -186,11 +190,11 @@ class GoalPlanner:
         raise TOO_FAST_IN_MOTION
 
     def _plan_after_stop(self, goal: Goal, schedule: Schedule, rate: float) -> PlannedMotion:
-        """Plan from the pose at which the current motion can stop."""
+        """Plan a motion that first stops on the old path, and then begins at rest."""
         stop, law = schedule.runs[0].copy(), None
         if stop.target != 0.0:
             law = self.time_scaling.stop(stop, schedule.commanded.pose, STOP_SHARES)
-            if law is not None:  # without a law, it runs to the end of its path
+            if law is not None:  # otherwise, the current motion runs to the end of its path
                 stop.change_law(law, 0.0)
         left = stop.end_time - stop.time
         end = stop.state(left, schedule.commanded.pose).pose
@@ -201,14 +205,18 @@ class GoalPlanner:
         return PlannedMotion(run, reply, plan.bound, stop=law)
 
     def _plan(self, goal: Goal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Return a path to the goal, planned by GoalMotion.plan."""
+        """Return a path to the goal; see GoalMotion.plan."""
         return self._motions[type(goal)].plan(goal, start, rate, begins)
 
     def _blend_start(self, run: Run, blend: float, lead: int) -> float:
-        """Return the time along a path [s], at least `lead` cycles ahead, that is within `blend` [m] of its end."""
+        """Return the time along a run's path at which a following goal may begin [s].
+
+        At this time, the platform is at most `blend` [m] away from the end of the path. The time is at least `lead`
+        cycles in the future.
+        """
         end = run.path.duration
         target = nominal_motion(run.path, end).pose
-        # Stay strictly ahead even at override 0, because the override may rise at any time.
+        # Assume a rate of at least 1, even at override 0, because the override may rise at any time.
         soonest = run.law_state.s + lead * self._period * max(run.law_state.rate, run.target, 1.0)
         low, high = max(soonest, run.seams[-1].s if run.seams else 0.0), end
         if low >= end or self._planner.distance(nominal_motion(run.path, low).pose, target) <= blend:
@@ -227,6 +235,7 @@ class GoalPlanner:
         longer.append(s, path)
         law, first = longer.law, longer.arrival_at(s)
         last = longer.arrival_at(longer.path.duration)
-        if not math.isfinite(last):  # it stops before that; later it runs at most at full speed, or is sampled again
+        # If the law stops before the end, check the rest at full speed. A faster law would be sampled again later.
+        if not math.isfinite(last):
             law, first, last = constant_law(1.0), s, longer.path.duration
         return self._checker.sample(longer.path, law, first, last, nominal_motion(run.path, s).pose).within_limits

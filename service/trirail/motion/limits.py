@@ -1,4 +1,4 @@
-"""Limits of sliders and platform. Paths are checked before they start, and every setpoint before it is sent."""
+"""Checks of paths, poses and setpoints against the limits of sliders and platform, including the last gate."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ COORDINATES = ("x", "y", "phi")
 UNITS = ("m", "m", "rad")
 
 SETPOINT_TOLERANCE = 1e-6
-"""Distance by which a setpoint may exceed the position limit that its path was checked against [m, rad]."""
+"""Distance by which a setpoint may exceed a position limit that was used for planning [m, rad]."""
 OUTWARD_ROUNDING = 1e-12
-"""Increase of a limit excess per cycle that is treated as rounding [m, rad]."""
+"""Outward motion per cycle, beyond a limit, that is treated as rounding [m, rad]."""
 MAX_RELATIVE_EXCESS = 1e-3
-"""Relative amount by which a setpoint may exceed the velocity, acceleration and jerk limits that its path was
-checked against."""
+"""Relative amount by which a setpoint may exceed the velocity, acceleration and jerk limits that were used for
+planning."""
 
 
 class AllowedMotion(IntEnum):
-    """Platform motion that a mode allows. The last gate refuses a setpoint that goes beyond it."""
+    """Motion of the platform that the current mode allows. The last gate refuses all other motion."""
 
     ANY = 0
     """Any motion within the limits."""
     BRAKING = 1
-    """Any motion until its law leads to a standstill. The limits may delay such a law."""
+    """Any motion until the law leads to a standstill. The limits may delay the change to a law that brakes."""
     BRAKED = 2
-    """Only a motion whose law leads to a standstill."""
+    """Only a motion with a law that leads to a standstill."""
     NONE = 3
-    """No motion, except that the sliders may take up backlash."""
+    """No motion of the platform. The sliders may still move to compensate backlash."""
 
 
 BOUNDS = np.dtype(
     [
-        ("rows", "f8", (4, 3, 3)),  # position, velocity, acceleration, cross slide; for each leg: low, high, slack
+        ("rows", "f8", (4, 3, 3)),  # position, velocity, acceleration, cross slide; for each leg: low, high, tolerance
         ("pose", "f8", (3, 2)),  # x, y, phi: low, high
-        ("edge", "f8"),  # slack of the pose limits [m, rad]
+        ("edge", "f8"),  # tolerance of the pose limits [m, rad]
         ("step", "f8", 3),  # greatest travel of each slider in one cycle [m]
         ("slider_jerk", "f8", 3),
         ("platform", "f8", (3, 3)),  # velocity, acceleration and jerk of x, y, phi
@@ -69,12 +69,12 @@ _CHECKS = (
     ("platform", "acceleration", "/s²"),
     ("platform", "jerk", "/s³"),
 )
-"""Subject, quantity and unit of each check. For the platform, the unit is appended to that of the coordinate."""
+"""Subject, quantity and unit of each check. For the platform, the unit is appended to the unit of the coordinate."""
 _PASSIVE, _POSE, _STEP, _JERK, _PLATFORM = 3, 4, 5, 6, 7  # indices of _CHECKS; 0 to 3 are the sliders' rows
 
 
 class Violation(NamedTuple):
-    """Quantity that exceeds its limit, with the value and the limit."""
+    """Description of a quantity that exceeds its limit."""
 
     axis: str
     """Slider (A, B, C) or platform coordinate (x, y, phi)."""
@@ -83,29 +83,29 @@ class Violation(NamedTuple):
     limit: float
     unit: str
     label: str = ""
-    """Label of the slider, from [geometry] labels."""
+    """Label of the slider, from the key labels in [geometry]; empty for the platform."""
 
     def __str__(self) -> str:
         return beyond(f"{self.subject}: {self.quantity}", self.value, self.limit, self.unit)
 
     @property
     def subject(self) -> str:
-        """Slider or platform coordinate, as used in messages."""
+        """Text for messages that names the slider or the coordinate, with the word "slider" or "platform"."""
         return f"{self.part} {self.name}"
 
     @property
     def part(self) -> str:
-        """Part of the robot that exceeds its limit: slider or platform."""
+        """Part of the robot that exceeds its limit: "slider" or "platform"."""
         return "slider" if self.axis in LEGS else "platform"
 
     @property
     def name(self) -> str:
-        """Name of the slider or coordinate, as used in messages."""
+        """Name of the slider or of the coordinate for messages."""
         return self.label or self.axis
 
     @property
     def bound(self) -> str:
-        """Quantity and its limit, as used in messages."""
+        """Text for messages that names the quantity and its limit."""
         return f"{self.subject} ({self.quantity} {worded(self.limit, self.unit)})"
 
 
@@ -114,18 +114,18 @@ _BOUNDS, _ROWS, _ROW = from_dtype(BOUNDS)[::1], f8[:, ::1], f8[::1]
 
 @compiled()
 def _store_violation(check: int, n: int, value: float, limit: float, violation: Array) -> int:
-    """Store the value and the limit. Return the code of the violation, 1 + 3 * check + leg or coordinate."""
+    """Store the value and the limit. Return the code of the violation, 1 + 3 * check + index of leg or coordinate."""
     violation[0], violation[1] = value, limit
     return 1 + 3 * check + n
 
 
 @compiled()
 def _least_jerk(now: Array, before: Array, n: int, period: float) -> float:
-    """Return the least jerk that explains two successive rows of position, velocity and acceleration.
+    """Return the smallest jerk with which the motion of one cycle can lead from state `before` to state `now`.
 
     The jerk may switch between ±j at any time within the cycle T. The acceleration then changes by at most j T, the
-    velocity differs by at most j T² / 2 from the mean acceleration times T, and the position differs by at most j T³ /
-    4 from the mean velocity times T.
+    change of velocity differs by at most j T² / 2 from the mean acceleration times T, and the change of position
+    differs by at most j T³ / 4 from the mean velocity times T.
     """
     half = period / 2.0
     p, v, a = now[0, n], now[1, n], now[2, n]
@@ -138,7 +138,7 @@ def _least_jerk(now: Array, before: Array, n: int, period: float) -> float:
 
 @compiled()
 def _check_row(bounds: NDArray[np.void], rows: Array, row: int, violation: Array) -> int:
-    """Check one row of solved sliders."""
+    """Check one row of the sliders' motion against its limits. Return 0 or the code of the first violation."""
     for n in range(3):
         limits = bounds[0].rows[row, n]
         low, high, slack = limits[0], limits[1], limits[2]
@@ -150,9 +150,9 @@ def _check_row(bounds: NDArray[np.void], rows: Array, row: int, violation: Array
 
 @compiled(i8(_BOUNDS, _ROWS, _ROW))
 def check_setpoint(bounds: NDArray[np.void], rows: Array, violation: Array) -> int:
-    """Check rows of solved sliders [m, s]: position, velocity, acceleration, cross slide, or only the first of these.
+    """Check the sliders of a setpoint. The rows are position, velocity, acceleration and cross slide [m, s].
 
-    NaN violates every limit. Returns 0, or a code for Bounds.violation.
+    Later rows may be missing. NaN violates every limit. Returns 0, or a code for Bounds.violation.
     """
     for row in range(min(len(rows), 4)):
         code = _check_row(bounds, rows, row, violation)
@@ -163,7 +163,7 @@ def check_setpoint(bounds: NDArray[np.void], rows: Array, violation: Array) -> i
 
 @compiled()
 def _check_rates(bounds: NDArray[np.void], rows: Array, violation: Array) -> int:
-    """Check the velocities and accelerations of solved sliders."""
+    """Check only the velocities and accelerations of the sliders."""
     for row in (1, 2):
         code = _check_row(bounds, rows, row, violation)
         if code:
@@ -173,7 +173,7 @@ def _check_rates(bounds: NDArray[np.void], rows: Array, violation: Array) -> int
 
 @compiled(i8(_BOUNDS, _ROW, _ROW))
 def check_pose(bounds: NDArray[np.void], pose: Array, violation: Array) -> int:
-    """Check only a pose: x, y [m], phi [rad]."""
+    """Check a pose x, y [m], phi [rad] against the platform's limits. Returns 0, or a code for Bounds.violation."""
     edge = bounds[0].edge
     for n in range(3):
         low, high = bounds[0].pose[n, 0], bounds[0].pose[n, 1]
@@ -215,7 +215,7 @@ def _check_platform(bounds: NDArray[np.void], motion: Array, before: Array, viol
 def _check_positions(
     bounds: NDArray[np.void], rows: Array, before: Array, pose: Array, pose_before: Array, violation: Array
 ) -> int:
-    """Check that each position is within its limits, or no farther beyond them than in the previous cycle."""
+    """Check that each position is within its limits, or at least not farther outside than in the previous cycle."""
     for row in (0, 3):
         for n in range(3):
             limits = bounds[0].rows[row, n]
@@ -239,20 +239,21 @@ def _check_positions(
 def gate(
     bounds: NDArray[np.void], rows: Array, rows_before: Array, motion: Array, motion_before: Array, violation: Array
 ) -> int:
-    """Check sliders and platform against the limits and against the previous cycle.
+    """Check a setpoint and the commanded motion of the platform. This is the last gate.
 
-    A position beyond its limit may return towards the limit, but must not move farther out.
+    A position beyond its limit may return towards the limit, but must not move farther out. Steps and jerks are
+    computed from the difference to the previous cycle.
 
     Parameters
     ----------
     bounds : (1,) of BOUNDS
         Limits of the robot.
     rows, rows_before : (4, 3)
-        Sliders now and in the previous cycle, with the rows of check_setpoint.
+        Motion of the sliders now and in the previous cycle, with the rows of check_setpoint.
     motion, motion_before : (3, 3)
         Pose, velocity and acceleration of the platform now and in the previous cycle.
     violation : (2,)
-        Output: the value that violates its limit, and that limit.
+        Output: the value that violates its limit, and the limit.
 
     Returns
     -------
@@ -270,10 +271,11 @@ def gate(
 
 
 def standing_tolerance(limits: Limits, arm: float) -> Array:
-    """Return how far beyond its limits a robot at rest may be measured, (9,) [m, m, rad, m …].
+    """Return tolerances for the measured positions of a robot that rests at its limits, (9,) [m, m, rad, m …].
 
-    The distances are the in-position windows of x, y, phi, the sliders and the cross slides, but at least three counts
-    of the drive. `limits` are those of backlash_reserve.planned_limits, and `arm` is Geometry.arm [m].
+    The tolerances of x, y, phi and the sliders are the in-position windows. The tolerance of the cross slides is the
+    sum of the windows that affect a cross slide. `limits` come from backlash_reserve.planned_limits, and `arm` is
+    Geometry.arm [m].
     """
     x, y, phi = limits.in_position.pose
     sliders = limits.in_position.sliders
@@ -281,9 +283,9 @@ def standing_tolerance(limits: Limits, arm: float) -> Array:
 
 
 class Bounds:
-    """Limits of one robot, packed for compiled checks, and descriptions of violations for the user.
+    """Limits of one robot in the layout that compiled checks need, and conversion of violations to messages.
 
-    `edge` is the tolerance of positions [m, rad]; `labels` names the sliders in messages.
+    `edge` is the tolerance of positions [m, rad]. `labels` are the names of the sliders in messages.
     """
 
     def __init__(self, limits: Limits, period: float, edge: float = ROUNDING, labels: Labels = LEGS) -> None:
@@ -292,7 +294,7 @@ class Bounds:
         self.packed = np.zeros(1, BOUNDS)
         """Limits for compiled code, (1,) of dtype BOUNDS."""
         self.last_violation = np.zeros(2)
-        """Last value that violated its limit, and that limit."""
+        """Last value that violated its limit, and the limit."""
         bounds = self.packed[0]
         bounds["rows"] = (
             [(*ends, edge) for ends in slider.positions],
@@ -317,11 +319,11 @@ class Bounds:
         return box
 
     def pose_violation(self, pose: ArrayLike) -> Violation | None:
-        """Return the violation of the position limits at a platform pose x, y [m], phi [rad]; None if there is none."""
+        """Return the first violation of the platform's position limits by a pose x, y [m], phi [rad]; None if valid."""
         return self.violation(check_pose(self.packed, np.array(pose, dtype=np.float64), self.last_violation))
 
     def pose_violation_from(self, pose: ArrayLike, start: Sequence[float]) -> Violation | None:
-        """Return the violation at a pose; None if the pose is no farther beyond that limit than the pose `start`."""
+        """Return the first violation by a pose, but accept a coordinate that is no farther outside than at `start`."""
         values = np.array(pose, dtype=np.float64)
         low, high = self.box
         edge = float(self.packed[0]["edge"])
@@ -331,18 +333,18 @@ class Bounds:
         return self.position_violation(int(np.argmax(outside)), float(values[outside][0])) if outside.any() else None
 
     def standing_violation(self, positions: Array, tolerance: Array) -> Violation | None:
-        """Return the first violation of the nine positions of a robot at rest, given a tolerance for each (9,)."""
+        """Return the first violation by the nine positions of a robot at rest, given their tolerances (9,)."""
         low, high = np.vstack([self.packed[0]["pose"], *self.packed[0]["rows"][(0, 3), :, :2]]).T
         outside = (positions < low - tolerance) | (positions > high + tolerance)
         number = int(np.argmax(outside))
         return self.position_violation(number, float(positions[number])) if outside.any() else None
 
     def setpoint_violation(self, rows: ArrayLike) -> Violation | None:
-        """Return the violation of solved sliders, with the rows of check_setpoint [m, s]; None if there is none."""
+        """Return the first violation by the sliders, with the rows of check_setpoint [m, s]; None if there is none."""
         return self.violation(check_setpoint(self.packed, np.array(rows, dtype=np.float64), self.last_violation))
 
     def position_violation(self, number: int, value: float) -> Violation | None:
-        """Return the violation of one of the nine positions: x, y, phi, sliders A to C, cross slides A to C."""
+        """Describe the violation by position `number` of nine: x, y, phi, sliders A to C, cross slides A to C."""
         check, n = (_POSE, 0, _PASSIVE)[number // 3], number % 3
         bounds = self.packed[0]
         low, high = bounds["pose"][n] if check == _POSE else bounds["rows"][check, n, :2]
@@ -350,7 +352,7 @@ class Bounds:
         return self.violation(1 + 3 * check + n)
 
     def violation(self, code: int) -> Violation | None:
-        """Return the violation for a code, with the values of last_violation; None for code 0."""
+        """Describe the violation that a check has reported by `code` and stored in last_violation; None for 0."""
         if code == 0:
             return None
         check, n = divmod(code - 1, 3)

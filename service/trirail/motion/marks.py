@@ -1,4 +1,4 @@
-"""Times along a planned path at which its marks are reached and outputs switch."""
+"""Location of marks on a planned path. The result is the times along the path at which outputs switch."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from trirail.motion.paths import Path, constant_law, path_motion, platform_at_la
 from trirail.wire.marks import Mark, PlacedMark
 
 SWITCH: Final = np.dtype([("s", "<f8"), ("width", "<f8"), ("mark", "<i4"), ("on", "<i4")], align=True)
-"""A switch: time along the path [s], duration of the pulse [s] (NaN if the value stays), index of the mark in its
-goal, and the new value of the output."""
+"""Layout of a switch: time along the path [s], duration of the pulse [s] (NaN if the switch is not a pulse), index of
+the mark in the goal, and new value of the output."""
 MAX_SWITCHES = 10_000
 """Greatest number of switches of one goal."""
 SAMPLES = 24
-"""Number of samples per piece of a path. The length of the path is integrated between samples."""
+"""Number of samples per piece of a path, between which the length of the path is integrated."""
 BISECTIONS = 50
 """Number of bisection steps after which an interval between samples is narrower than the resolution of a float."""
 LEAST_LENGTH = 1e-9
-"""Length below which a tool does not count as travelling [m]."""
+"""Length of a path below which the tool counts as stationary [m]."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 class Placed(NamedTuple):
-    """Marks of a goal, located on its path."""
+    """Switches and positions of a goal's marks on the path."""
 
     switches: NDArray[np.void]
     """Switches, (n,) of dtype SWITCH, in the order of the time along the path."""
@@ -43,9 +43,9 @@ def place_marks(marks: Sequence[Mark], path: Path, legs: Array, start: Sequence[
     marks
         Marks of the goal.
     path
-        Path of this goal only.
+        Path of this goal, without the paths of other goals.
     legs
-        Geometry.packed(), needed for a path in slider space.
+        Geometry.packed(), which is only used for a path in slider space.
     start
         Pose of the platform's centre at the start of the path: x, y [m], phi [rad].
     period
@@ -83,11 +83,11 @@ class GoalMarks:
     """Marks of a goal on the path of a run, and a record of the switches that have taken place."""
 
     def __init__(self, goal: str = "", marks: Sequence[Mark] = (), switches: bytes = b"") -> None:
-        """Create the marks. `switches` is packed rows of SWITCH; raises ValueError if they do not match the marks."""
+        """Create the marks from the packed rows of SWITCH. Raises ValueError if `switches` do not match the marks."""
         self.goal = goal
         """Id of the goal."""
         self.begin = 0.0
-        """Time along the path of the run at which the goal's own path begins [s]."""
+        """Time along the path of the run at which the path of this goal begins [s]."""
         self._marks = tuple(marks)
         self._rows = np.frombuffer(switches, SWITCH)
         self._passed = np.zeros(len(self._rows), np.bool)
@@ -96,14 +96,14 @@ class GoalMarks:
 
     @property
     def has_switches(self) -> bool:
-        """Whether the goal has marks."""
+        """Whether the goal switches outputs."""
         return len(self._rows) > 0
 
     def pending(self, output: str, end: float) -> Iterator[tuple[float, int, float, bool, int]]:
         """Yield the remaining switches of an output, up to the time `end` along the path of the run.
 
-        Each switch has its time along that path [s], its value, the duration of its pulse [s] (NaN for none), whether
-        something later switches it back, and the index of its mark.
+        Each tuple holds the time along the path of the run [s], the new value, the duration of the pulse [s] (NaN if
+        the switch is not a pulse), True if the goal later switches the output back, and the index of the mark.
         """
         for k in self._pending_rows(output):
             s, width, mark, on = self._rows[k].tolist()
@@ -112,7 +112,7 @@ class GoalMarks:
                 yield self.begin + s, on, width, opens, mark
 
     def note_passed(self, output: str, number: int) -> None:
-        """Record that `number` more switches of an output have taken place."""
+        """Record that the next `number` switches of an output have taken place."""
         self._passed[self._pending_rows(output)[:number]] = True
 
     def _pending_rows(self, output: str) -> NDArray[np.int64]:
@@ -121,7 +121,7 @@ class GoalMarks:
 
 
 class _Trace:
-    """Path of a tool: arc length and coordinates as functions of the time along the path."""
+    """Arc length and coordinates of a tool as functions of the time along its path."""
 
     def __init__(self, path: Path, legs: Array, start: Sequence[float]) -> None:
         self._path, self._legs = path, legs
@@ -141,7 +141,7 @@ class _Trace:
         return float(self._lengths[-1])
 
     def states(self, times: Array) -> tuple[Array, Array]:
-        """Return the tool's coordinates x, y [m], phi [rad] at times, (n, 3), and their velocities at full speed."""
+        """Return the tool's coordinates x, y [m], phi [rad] at times along the path, (n, 3), and their velocities."""
         if self._path.in_sliders:
             return self._platform_states(times)
         knots, pieces = self._path.knots, self._path.pieces
@@ -156,7 +156,7 @@ class _Trace:
         law = constant_law(1.0)
         out, near = np.zeros((3, 3)), self._near.copy()
         states = np.zeros((2, len(times), 3))
-        for k in np.argsort(times, kind="stable"):  # take each on the branch of the pose before it
+        for k in np.argsort(times, kind="stable"):  # each pose is on the branch of the previous pose
             if platform_at_law_time(self._legs, *self._path, law.knots, law.pieces, times[k], near, out):
                 raise RefusedError(RefusalCode.BAD_MARK, "the marks of a path through a singular pose have no place")
             near[:] = out[0]
@@ -197,7 +197,7 @@ class _Trace:
         return high
 
     def crossing(self, coordinate: int, value: float) -> float | None:
-        """Return the first time at which a coordinate crosses a value; None if it never does."""
+        """Return the first time at which a coordinate reaches or crosses a value; None if it never does."""
         offset = self.coordinates[:, coordinate] - value
         if offset[0] == 0.0:
             return 0.0
@@ -213,7 +213,7 @@ class _Trace:
 
 
 def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, float, int, int]]:
-    """Yield the rows of SWITCH for a mark."""
+    """Yield the switches of a mark as rows of SWITCH."""
     width = mark.pulse_width if mark.pulse_width is not None else np.nan
     if mark.start is None:
         yield _time_of(number, mark, trace), width, number, int(mark.value)
@@ -234,7 +234,7 @@ def _switches(number: int, mark: Mark, trace: _Trace) -> Iterator[tuple[float, f
 
 
 def _time_of(number: int, mark: Mark, trace: _Trace) -> float:
-    """Return the time along the path at which a mark with a single place is reached."""
+    """Return the time along the path at which the path reaches a mark that has a single position."""
     if mark.at is not None:
         coordinate, value = mark.at.coordinate
         s = trace.crossing(coordinate, value)
@@ -272,7 +272,10 @@ def _check_length(number: int, mark: Mark, name: str, length: float, whole: floa
 
 
 def _check_spacing(switches: NDArray[np.void], marks: Sequence[Mark], period: float) -> None:
-    """Refuse switches of one output that, at full speed, would share a cycle or come before a pulse has ended."""
+    """Raise RefusedError if two switches of an output are too close to each other at full speed.
+
+    Two switches must not take place in the same cycle, and the next switch must wait until a pulse has ended.
+    """
     for output in {mark.output for mark in marks}:
         own = switches[[marks[number].output == output for number in switches["mark"]]]
         if len(own) < 2:

@@ -1,7 +1,7 @@
-"""Planner as a pure function: it takes a goal and the motion under way, and returns a new motion or a refusal.
+"""Motion planner without state: from a request with a goal and the current motion to a new motion or a refusal.
 
-It keeps no state between requests. A plan depends only on the request and on the robot's geometry and limits, which
-have a revision. The planner can therefore run in its own process or in the calling one, or on a recorded request.
+A plan depends only on the request, and on the robot's geometry and limits, which are identified by a revision. The
+planner can therefore run in a separate process or in the calling process, and can repeat recorded requests.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from trirail.wire.plan_packets import NotPlanned, PackedRun, PathExtension, Plan
 
 
 def revision(config: Config) -> int:
-    """Return a checksum of everything in a configuration that plans depend on."""
+    """Return a checksum of all values in a configuration that affect plans."""
     limits = config.limits.platform, config.limits.slider, config.limits.singularity_margin
     correction = config.correction.as_built, config.correction.backlash
     return zlib.crc32(msgspec.json.encode((config.geometry, correction, limits, config.loop.rate_hz)))
 
 
 class MotionPlanner:
-    """Planner of one robot. It calls `beat` between the parts of a plan, as a sign of life."""
+    """Planner of one robot. During planning, `beat` is called repeatedly to show that the planner is alive."""
 
     def __init__(self, config: Config, beat: Callable[[], None] = lambda: None) -> None:
         robot = corrected_geometry(config)
@@ -42,12 +42,12 @@ class MotionPlanner:
         self._goals = GoalPlanner(robot, planned_limits(config.limits, config.correction.backlash), config.period, beat)
 
     def plan(self, request: PlanRequest) -> PlanAnswer:
-        """Return the motion to a goal, or a refusal. An internal error also results in a refusal."""
+        """Return the planned motion to the goal of a request, or a refusal. Any exception becomes a refusal."""
         try:
             decided = self._decide(request)
         except RefusedError as refusal:
             return _refusal(request, refusal)
-        except Exception as error:  # noqa: BLE001 - the loop waits for an answer
+        except Exception as error:  # noqa: BLE001 - the loop needs an answer to each request
             words = f"internal error in planning, please report it: {error!r}"
             return _refusal(request, RefusedError(RefusalCode.INTERNAL, words))
         number, version = request.number, request.version

@@ -1,4 +1,7 @@
-"""Packed paths and runs, for messages between loop and planner and for recordings. All numbers keep full precision."""
+"""Conversion of paths and runs to bytes and back, for messages between loop and planner and for recordings.
+
+The conversion preserves the full precision of all numbers.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,14 @@ def pack_path(path: Path) -> PackedPath:
 
 
 def unpack_path(packed: PackedPath, degrees: int) -> Path:
-    """Return the path of `degrees` coordinates that is stored in packed form.
+    """Return a path with `degrees` coordinates from its packed form.
 
-    The function checks the shape, so that compiled code can rely on it.
+    The shape is checked because compiled code accesses the arrays without checks.
 
     Raises
     ------
     ValueError
-        The shape is wrong, a number is not finite, or the knots are not in ascending order.
+        The shape is wrong, a number is not finite, or a knot is less than the previous knot.
     """
     knots = np.frombuffer(packed.knots).copy()
     pieces = np.frombuffer(packed.pieces).copy()
@@ -42,7 +45,10 @@ def unpack_path(packed: PackedPath, degrees: int) -> Path:
 
 
 def unpack_law(packed: PackedPath) -> Path:
-    """Return a law from its packed form. Raises ValueError like unpack_path, and if its time decreases."""
+    """Return a law from its packed form.
+
+    Raises ValueError if the packed path is invalid (see unpack_path), or if the time along the path would decrease.
+    """
     law = unpack_path(packed, 1)
     if law_falls(law.knots, law.pieces):
         raise ValueError("a law whose time along the path falls")
@@ -56,9 +62,9 @@ def pack_run(run: Run) -> PackedRun:
 
 
 def unpack_run(legs: Array, packed: PackedRun) -> Run:
-    """Return a run from its packed form, for a robot with these packed legs. Raises ValueError like unpack_path.
+    """Return a run from its packed form. `legs` is Geometry.packed(). Raises ValueError if the packed run is invalid.
 
-    The paths before the seams are not packed, because no plan starts from them.
+    Seam.before is not part of the packed form, because the planner does not need the paths without the later goals.
     """
     path = unpack_path(packed.path, 3)
     run = Run(legs, path, unpack_law(packed.law), packed.target)

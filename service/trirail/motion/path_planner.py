@@ -1,4 +1,4 @@
-"""Planner of jerk-limited paths from any state of motion. Each path is sampled completely before it starts."""
+"""Planner of jerk-limited paths from any state of motion. Each path is checked from start to end before use."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from trirail.quantities import apart, as_familiar_unit, beyond, worded
 from trirail.wire.messages import GoalReply
 
 MIN_LIMIT_SHARE = 0.1
-"""Lowest share of a limit that is tried for a plan from motion."""
+"""Lowest factor on a limit in one replanning step, if a plan from a moving robot does not fit."""
 MAX_REPLANS = 3
-"""Greatest number of plans from motion, each with lower limits than the one before."""
+"""Greatest number of plans from a moving robot. Each plan has lower limits than the previous plan."""
 MAX_SLOWDOWN_CHECKS = 8
-"""Greatest number of checks of a slowed path. If the path does not fit, it is slowed further after each check."""
+"""Greatest number of slowdowns of a path, each followed by a check whether the path fits."""
 LIMIT_UTILISATION = 0.97
-"""Share of a limit that replanning aims at, so that rounding does not exceed the limit."""
+"""Fraction of a limit that a replanned path aims at. The margin prevents rounding errors from exceeding the limit."""
 MAX_JOG_PLANS = 12
-"""Greatest number of plans for a jog, each slower, softer or shorter. After the last one, the jog is refused or only
-brakes."""
+"""Greatest number of plans for a jog. Each plan is slower, shorter, or has softer ramps than the previous plan. If no
+plan fits, a robot at rest refuses the jog, and a moving robot brakes."""
 MAX_PATH_RATE = 2.0
-"""Highest rate of the time along a path, which is an override of 200 %."""
+"""Highest rate of the time along a path. It corresponds to an override of 200 %."""
 RATE_UNITS = "/s", "/s²", "/s³"
 TOO_FAST_IN_MOTION = RefusedError(
     RefusalCode.TOO_FAST, "from its present motion the robot cannot take this path within its sliders' limits"
@@ -52,17 +52,17 @@ TOO_FAST_IN_MOTION = RefusedError(
 
 
 class Plan(NamedTuple):
-    """Path that keeps all limits."""
+    """Path that stays within all limits, with information for the reply to the goal."""
 
     path: Path
     reply: GoalReply = GoalReply("", None)
-    """Those fields of the reply to the goal that follow from the path; id and duration are missing."""
+    """Reply to the sender of the goal, without the goal's id and without the duration."""
     bound: str | None = None
-    """Limit before which a jog brakes, or which the target of a track exceeds."""
+    """Name of the limit before which a jog brakes, or which the target of a track exceeds."""
 
 
 def slowed(factor: float) -> GoalReply:
-    """Return the reply to a goal whose motion the limits make slower by a factor than requested."""
+    """Return the reply to a goal if the limits make its motion `factor` times slower than requested."""
     return GoalReply("", None, slowed=factor)
 
 
@@ -92,10 +92,10 @@ class PathPlanner:
         self._arm = geometry.arm
 
     def check_pose(self, target: Sequence[float], start: Sequence[float], tool: Sequence[float] = NO_TOOL) -> None:
-        """Check that a tool pose keeps the platform's centre within its workspace.
+        """Check that the platform's centre is within its position limits when the tool is at a pose.
 
-        `tool` is the point (u, v) of the platform in its own frame [m] that `target` refers to. A robot that starts
-        beyond a limit may move closer to it.
+        `tool` is the point of the platform that `target` refers to, (u, v) in the platform's frame [m]. A robot that
+        starts beyond a limit may move to a target that is closer to the limit.
 
         Raises
         ------
@@ -114,8 +114,8 @@ class PathPlanner:
     def check_sliders(self, target: Sequence[float], start: Sequence[float]) -> None:
         """Check that slider positions are within the travel of the sliders.
 
-        A slider that starts beyond its travel may move closer to it. Raises RefusedError with the slider, the value and
-        the limit.
+        A slider that starts beyond its travel may move towards the permitted range. Raises RefusedError with the
+        slider, the value and the limit.
         """
         rows = zip(LEGS, self.bounds.labels, target, start, self._travel, strict=True)
         for name, label, position, begin, (low, high) in rows:
@@ -125,7 +125,7 @@ class PathPlanner:
                 raise RefusedError(RefusalCode.OUT_OF_WORKSPACE, text, slider=name, value=position, limit=limit)
 
     def check_velocity(self, velocity: Sequence[float]) -> None:
-        """Check a jog's velocity against the platform's limits. Raises RefusedError with the value and the limit."""
+        """Check the velocity of a jog against the platform's limits. Raises RefusedError with value and limit."""
         for name, unit, value, limit in zip(COORDINATES, UNITS, velocity, self._robot_limits.velocity, strict=True):
             if abs(value) > limit * ROUNDING_FACTOR:
                 most = math.copysign(limit, value)
@@ -137,7 +137,10 @@ class PathPlanner:
     def lower_limits(
         self, velocity: Sequence[float] | None, acceleration: Sequence[float] | None, jerk: Sequence[float] | None
     ) -> Kinodynamic:
-        """Return the limits for a plan, lowered to a goal's own. Raises RefusedError if these exceed the robot's."""
+        """Return the limits for a plan: the lower of the platform's limits and the given limits of the goal.
+
+        Raises RefusedError if a given limit exceeds the platform's limit.
+        """
         asked = velocity, acceleration, jerk
         for name, per, own, limits in zip(Kinodynamic._fields, RATE_UNITS, asked, self._robot_limits, strict=True):
             for coordinate, unit, value, limit in zip(COORDINATES, UNITS, own or limits, limits, strict=True):
@@ -159,8 +162,8 @@ class PathPlanner:
     ) -> Plan:
         """Plan a motion that ends at rest at a pose. If the robot starts at rest, the path is straight in pose space.
 
-        A path that is too fast for a slider or the platform is replaced by the time-optimal path on the same line. It
-        is slowed as a whole instead if that takes no longer.
+        If a straight path is too fast for a slider or the platform, the planner uses the faster of two paths on the
+        same line: the time-optimal path, or the original path slowed by a constant factor.
 
         Parameters
         ----------
@@ -169,25 +172,26 @@ class PathPlanner:
         target : (3,)
             Pose of the tool in the base frame [m, rad].
         speed : float
-            Share of full speed; at 0.5 the motion takes twice as long.
+            Fraction of full speed. At 0.5, the motion takes twice as long as at full speed.
         limits : Kinodynamic, optional
-            Limits of the tool's motion. The platform's limits apply to its centre as well.
+            Limits of the tool's motion. The platform's limits also apply to the centre of the platform.
         tool : (2,)
             Point that moves on the straight line, in the platform's frame [m].
 
         Raises
         ------
         RefusedError
-            The path leaves the workspace (with slider or coordinate, value and limit), or it starts in motion and
-            cannot be slowed.
+            The path leaves the workspace, or the path starts in motion and is too fast. In the first case, the error
+            contains the slider, the value and the limit.
         """
         self.check_pose(target, start.pose, tool)
         return self._plan_to_rest(start, tool_motion(start, tool), target, limits or self.platform, speed, tool=tool)
 
     def plan_to_sliders(self, start: MotionState, target: Sequence[float], speed: float = 1.0) -> Plan:
-        """Plan a motion that ends at rest at slider positions [m]. From rest, it is straight in slider space.
+        """Plan a motion that ends at rest at slider positions [m].
 
-        In all other respects, it is planned as by plan_to_pose.
+        If the robot starts at rest, the path is straight in slider space. In all other respects, this method works like
+        plan_to_pose.
         """
         rows = np.zeros((6, 3))
         inverse_into(self._legs, np.array(start), rows)
@@ -198,11 +202,12 @@ class PathPlanner:
     def plan_jog(
         self, start: MotionState, velocity: Sequence[float], timeout: float, tool: Sequence[float] = NO_TOOL
     ) -> Plan:
-        """Plan a jog: a ramp to a velocity, a part at that velocity until a limit is near, and a brake.
+        """Plan a jog: a ramp to a velocity, a part at constant velocity, and braking before a limit of the workspace.
 
-        The control ends the jog at its time-out. The path lasts longer than `timeout`, which is real time, because the
-        time along the path may run at up to MAX_PATH_RATE. A velocity that is too high for the platform or the sliders
-        is lowered. If only the ramp exceeds a limit, the ramp becomes softer and the velocity stays.
+        The control stops the jog when its time-out elapses. The constant part may last MAX_PATH_RATE times `timeout`,
+        because the time along the path may run faster than real time. A velocity that is too high for the platform or
+        the sliders is lowered. If only the ramp exceeds a limit, the ramp becomes softer and the velocity does not
+        change.
 
         Parameters
         ----------
@@ -211,9 +216,9 @@ class PathPlanner:
         velocity : (3,)
             Velocity of the tool [m/s, rad/s].
         timeout : float
-            Longest duration of the jog [s].
+            Longest duration of the jog without a renewal, in real time [s].
         tool : (2,)
-            Point about which the platform turns, in the platform's frame [m].
+            Point that has the requested velocity, and about which the platform turns, in the platform's frame [m].
 
         Raises
         ------
@@ -239,7 +244,8 @@ class PathPlanner:
                 continue
             bound = self.checker.bound(path, result.leaves_at, start.pose)
             if hold > 0.0:
-                hold = max(0.0, result.leaves_at - ramp - brake)  # rest where the last plan left the workspace
+                # Shorten the constant part, so that the robot is at rest when the last plan left the workspace.
+                hold = max(0.0, result.leaves_at - ramp - brake)
             else:
                 share /= 2.0
         if start.at_rest and any(velocity):
@@ -250,14 +256,15 @@ class PathPlanner:
         return Plan(path, bound=bound)
 
     def plan_trajectory(self, start: MotionState, points: Sequence[Point], stretch: bool) -> Plan:
-        """Plan a path through timed points, with a quintic between each two of them.
+        """Plan a path through timed points. Successive points are connected by quintics.
 
-        With `stretch`, a trajectory that is too fast is slowed as a whole.
+        If `stretch` is set, a trajectory that is too fast is slowed by a constant factor.
 
         Raises
         ------
         RefusedError
-            The trajectory is too fast, leaves the workspace, or does not begin and end at rest.
+            The trajectory is too fast, leaves the workspace, does not begin at the robot's pose, or does not begin and
+            end at rest.
         """
         check_ends(points, start)
         path = quintic(points, start.pose)
@@ -278,11 +285,14 @@ class PathPlanner:
         return Plan(path, slowed(slower))
 
     def path_to_velocity(self, start: MotionState, velocity: Sequence[float]) -> Path:
-        """Return the quickest path to a velocity within the platform's limits, unchecked. Raises RefusedError."""
+        """Return the quickest path to a velocity within the platform's limits. Limits of the sliders are not checked.
+
+        Raises RefusedError if no path is possible.
+        """
         return self._solver.to_velocity(start, velocity, self.platform)
 
     def distance(self, pose: Sequence[float], target: Sequence[float]) -> float:
-        """Return the greatest distance that any point of the platform travels between two poses [m]."""
+        """Return an upper bound of the distance that any point of the platform travels between two poses [m]."""
         x, y, phi = (here - there for here, there in zip(pose, target, strict=True))
         return math.hypot(x, y) + self._arm * abs(phi)
 
@@ -298,7 +308,7 @@ class PathPlanner:
         in_sliders: bool = False,
         tool: Sequence[float] = NO_TOOL,
     ) -> Plan:
-        """Plan a motion to rest. `begin` is `start` in the coordinates of the path: sliders or a tool."""
+        """Plan a motion to rest. `begin` is the state `start`, converted to slider positions or to a tool's motion."""
         if start.at_rest:
             path = self._solver.to_rest(begin, target, limits, in_sliders, tool)
             slower = max(1.0 / speed, slowdown_factor(self.checker.worst_shares(path, start.pose)))
@@ -320,9 +330,9 @@ class PathPlanner:
         raise TOO_FAST_IN_MOTION
 
     def _time_optimal_path(self, path: Path, limits: Kinodynamic, asked: float, pose: Sequence[float]) -> Path | None:
-        """Return the time-optimal path along the line of a path that is too fast. `asked` is its shortest duration [s].
+        """Return the time-optimal path along the line of a path that is too fast.
 
-        Returns None if the method fails or the resulting path does not fit.
+        The result takes at least `asked` [s]. Returns None if the method fails or if the resulting path does not fit.
         """
         others = self.platform if path.in_sliders else self._checked_sliders
         quickest = time_optimal(self._legs, path, limits, others, self._centre, pose)
@@ -335,9 +345,10 @@ class PathPlanner:
         return path
 
     def _slow_down(self, path: Path, factor: float, pose: Sequence[float]) -> tuple[Path, float]:
-        """Slow a path by at least `factor` until it fits. Return the slowed path and the factor used.
+        """Slow a path by at least `factor` until it fits the limits. Return the slowed path and the final factor.
 
-        One slowdown may not be enough, because a jerk shorter than one sampling step lasts longer in the slower path.
+        One slowdown may not be enough. A peak of the jerk that is shorter than a sampling step lasts longer in the
+        slower path, and may only then be sampled.
         """
         for _ in range(MAX_SLOWDOWN_CHECKS):
             slow = stretched(path, factor)
@@ -348,14 +359,14 @@ class PathPlanner:
         raise RefusedError(RefusalCode.TOO_FAST, f"the path does not fit its limits even {factor:.3g} times slower")
 
     def _can_hold(self, path: Path, ramp: float, brake: float, pose: Sequence[float]) -> bool:
-        """Return whether the constant velocity of a jog, between its ramp and its brake, is within the limits."""
+        """Return whether a jog is within the limits during its part at constant velocity."""
         first, until = ramp + self._period, path.duration - brake - 2.0 * self._period
         return first >= until or self.checker.sample(path, constant_law(1.0), first, until, pose).slowdown_factor <= 1.0
 
     def _jog_path(
         self, start: MotionState, velocity: Sequence[float], hold: float, tool: Sequence[float], limits: Kinodynamic
     ) -> tuple[float, float, Path]:
-        """Return the durations of a jog's ramp and brake [s], and the complete path."""
+        """Return the duration of the ramp, the duration of braking [s], and the complete path of a jog."""
         ramp = self._solver.to_velocity_straight(start, velocity, limits, tool)
         if not any(velocity):
             return ramp.duration, 0.0, ramp
@@ -379,7 +390,10 @@ def _jog_refusal(bound: str | None, result: SampleResult) -> RefusedError:
 
 
 def _scaled_limits(limits: Kinodynamic, factor: float, softer: float) -> Kinodynamic:
-    """Return limits for a motion `factor` times slower, with acceleration `softer`² and jerk `softer`³ times lower."""
+    """Return the limits for a motion that is `factor` times slower.
+
+    Accelerations are also divided by `softer`², and jerks by `softer`³.
+    """
     powers = factor ** np.arange(1.0, 4.0) * softer ** np.array((0.0, 2.0, 3.0))
     return Kinodynamic(*(np.array(limits) / powers[:, None]).tolist())
 

@@ -1,4 +1,4 @@
-"""Compiled sampling of a path under a law. It compares positions with limits and finds the greatest rates."""
+"""Compiled sampling of a path under a law, to compare positions with limits and to find the greatest rates."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from trirail.motion.paths import BISECTIONS, ROUNDING, law_at, passing_time, pla
 __all__ = ["survey"]
 
 TURN_CLEARANCE = 1e-3
-"""Distance from a limit within which the turning point of a position is located exactly [m, rad]."""
+"""Distance from a limit within which the turning point of a position is computed exactly [m, rad]."""
 UNIT_WEIGHTS = (1.0, 1.0, 1.0)
 RETURN_SLOWDOWN = 10.0
-"""Factor by which the robot moves more slowly while it returns from beyond its limits."""
+"""Factor by which velocities are reduced while the robot returns from outside its limits."""
 SAMPLES_PER_PIECE = 4
 """Number of samples in every piece of a path."""
 
 
 @compiled()
 def _insert_time(times: Array, n: int, time: float, first: float, until: float) -> int:
-    """Append a time after the first n times if it is between `first` and `until`. Return the new number of times."""
+    """Append `time` to the first n times if it is between `first` and `until`. Return the new number of times."""
     if first <= time <= until:
         times[n] = time
         n += 1
@@ -38,10 +38,11 @@ def _insert_time(times: Array, n: int, time: float, first: float, until: float) 
 def _sample_times(
     knots: Array, law_knots: Array, law_pieces: Array, first: float, until: float, even: int, step: float
 ) -> Array:
-    """Return the ascending times of samples: evenly spaced, within every piece, and on both sides of every knot.
+    """Return the sample times in ascending order: evenly spaced, within every piece, and on both sides of every knot.
 
-    Jerk peaks next to a knot of the path or of the law, possibly only for a short time. The mean jerk over a step
-    across a knot is between the means over the steps that end and begin there.
+    The jerk may have a short peak next to a knot of the path or of the law. The step that ends at the knot and the step
+    that begins at the knot are therefore sampled. The mean jerk of any step across the knot is between their mean
+    jerks.
     """
     times = np.empty(even + (SAMPLES_PER_PIECE + 1) * len(knots) + 2 * len(law_knots))
     for k in range(even):
@@ -67,7 +68,7 @@ def _sample_times(
 
 @compiled()
 def _limited_position(motion: Array, sliders: Array, i: int) -> tuple[float, float]:
-    """Return one of the nine limited positions (x, y, phi, sliders, cross slides) and its velocity."""
+    """Return position i and its velocity. The nine positions with limits are x, y, phi, sliders and cross slides."""
     if i < 3:
         return motion[0, i], motion[1, i]
     if i < 6:
@@ -76,10 +77,11 @@ def _limited_position(motion: Array, sliders: Array, i: int) -> tuple[float, flo
 
 
 class PathProblem(NamedTuple):
-    """Path, its law, the robot, and the limits of the robot.
+    """Path and law to be sampled, with the robot and its limits.
 
-    `box` (2, 9) holds the position limits. `reach` (2, 9) equals `box` for a robot that starts within the limits. If a
-    position starts beyond a limit, its reach is the position itself, and moves inwards with it.
+    `box` (2, 9) holds the position limits. `reach` (2, 9) holds the limits that apply to this path. If a position
+    starts outside its limits, `reach` is extended to this position, and shrinks as the position moves inwards.
+    Otherwise, `reach` equals `box`.
     """
 
     legs: Array
@@ -96,9 +98,9 @@ class PathProblem(NamedTuple):
 
 @compiled()
 def _initialise_reach(problem: PathProblem, time: float, near: Array, tolerance: Array) -> int:
-    """Set the reach for a path that begins at a time of the law.
+    """Set `reach` for a path that begins at a time of the law.
 
-    Returns 0, 1 if the path begins beyond a limit by more than `tolerance`, or -1 if the robot is singular there.
+    Returns 0, 1 if the path begins beyond a limit by more than `tolerance`, or -1 if the start is singular.
     """
     motion, sliders = np.empty((3, 3)), np.empty((6, 3))
     problem.reach[0], problem.reach[1] = -math.inf, math.inf
@@ -115,7 +117,7 @@ def _initialise_reach(problem: PathProblem, time: float, near: Array, tolerance:
 
 @compiled()
 def _narrow_reach(problem: PathProblem, motion: Array, sliders: Array) -> None:
-    """Move the reach inwards with a position that returns from beyond a limit, so that it cannot move out again."""
+    """Shrink `reach` while a position returns from outside its limits. The position cannot move out again."""
     for i in range(9):
         position, _ = _limited_position(motion, sliders, i)
         problem.reach[0, i] = min(problem.box[0, i], max(problem.reach[0, i], position))
@@ -124,7 +126,7 @@ def _narrow_reach(problem: PathProblem, motion: Array, sliders: Array) -> None:
 
 @compiled()
 def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sliders: Array) -> bool:
-    """Write the platform and the sliders at a time of the law. Return whether they are within reach."""
+    """Write the motion of the platform and the sliders at a time of the law. Return True if they are within reach."""
     law = law_at(problem.law_knots, problem.law_pieces, time)
     if (
         platform_at(problem.legs, problem.knots, problem.pieces, problem.in_sliders, problem.tools, law, near, motion)
@@ -142,7 +144,7 @@ def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sli
     phi = motion[0, 2]
     if problem.box[0, 2] - ROUNDING <= phi <= problem.box[1, 2] + ROUNDING:
         return True
-    # J2 is regular within the limits of phi. Beyond them, there may be a singular angle on the way back.
+    # J2 is regular within the limits of phi. Outside these limits, a singular angle may be on the way back.
     return sign_of_det_j2(problem.legs, (motion[0, 0], motion[0, 1], phi)) == sign_of_det_j2(problem.legs, ZERO)
 
 
@@ -150,9 +152,9 @@ def _solve_at(problem: PathProblem, time: float, near: Array, motion: Array, sli
 def _find_turn_beyond_limit(
     problem: PathProblem, last: float, time: float, near: Array, motion: Array, sliders: Array
 ) -> float:
-    """Return the time at which a position that turns between two samples exceeds its limit; NaN if none does.
+    """Return a time at which a position that turns between two samples is out of reach; NaN if there is none.
 
-    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for a third one.
+    `motion` (3, 3, 3) and `sliders` (3, 6, 3) hold the samples at `last` and `time`, and space for a third sample.
     """
     for i in range(9):
         before, leaving = _limited_position(motion[0], sliders[0], i)
@@ -186,15 +188,15 @@ def _measure_rates(
     worst: Array,
     weights: tuple[float, float, float] = UNIT_WEIGHTS,
 ) -> None:
-    """Raise `worst` (3,) to the velocity, acceleration and jerk of column i between two samples one step apart.
+    """Update the maxima `worst` (3,) with velocity, acceleration and jerk of column i, from two samples one step apart.
 
-    `now` and `then` have the rows position, velocity, acceleration. `whole` states whether the platform moves during
-    the whole step. `weights` are factors of the three results.
+    `now` and `then` have the rows position, velocity, acceleration. `whole` is True if the motion covers the complete
+    step, without a standstill. The values are multiplied by `weights`.
     """
     worst[0] = max(worst[0], weights[0] * abs(now[1, i]))
     worst[1] = max(worst[1], weights[1] * abs(now[2, i]))
-    # Compute the jerk of both halves of the step from the change of velocity, in addition to the mean jerk. Within a
-    # step, a rate may rise and fall while the acceleration is the same before and after.
+    # In addition to the mean jerk, compute the jerk of both halves of the step from the change of velocity. Within a
+    # step, the acceleration may rise and fall again, and the mean jerk would be zero.
     change = then[1, i] - now[1, i]
     early = 2.0 * (change / step - now[2, i]) / step
     late = 2.0 * (then[2, i] - change / step) / step
@@ -207,9 +209,10 @@ def _measure_rates(
 def _measure_tool(
     problem: PathProblem, time: float, motion: Array, arms: Array, step: float, whole: bool, worst: Array
 ) -> None:
-    """Raise `worst` to the rates of the tool. If the tool is not the centre, the last two rows are those of the centre.
+    """Update the maxima `worst` with the rates of the tool, and with those of the centre if the tool is another point.
 
-    `motion` (3, 3, 3) holds the platform one step later and at `time`; `arms` (2, 3, 3) is space for the tool's motion.
+    `motion` (3, 3, 3) holds the motion of the platform one step later and at `time`. `arms` (2, 3, 3) is space for the
+    tool's motion.
     """
     u, v = tool_at(problem.knots, problem.tools, law_at(problem.law_knots, problem.law_pieces, time)[0])
     arms[:] = motion[:2]
@@ -227,7 +230,10 @@ def _measure_tool(
 def _sample_path(
     problem: PathProblem, times: Array, until: float, step: float, near: Array, worst: Array
 ) -> tuple[float, float]:
-    """Sample a path at ascending times and one step after each. Return the last time within reach and one beyond it."""
+    """Sample a path at ascending times, and one step after each of these times.
+
+    Returns the last time that was found within reach, and a later time out of reach (NaN if there is none).
+    """
     motion, sliders, arms = np.empty((3, 3, 3)), np.empty((3, 6, 3)), np.empty((2, 3, 3))
     last = -math.inf
     for k in range(len(times)):
@@ -245,7 +251,7 @@ def _sample_path(
         last = time + step
         if not _solve_at(problem, last, near, motion[0], sliders[0]):
             return time, last
-        whole = time >= 0.0 and last <= until  # false for the step from or to a standstill
+        whole = time >= 0.0 and last <= until  # False for the first step from rest and the last step to rest
         for i in range(3):
             weights = problem.shares[0, i], problem.shares[1, i], problem.shares[2, i]
             _measure_rates(sliders[1], sliders[0], i, step, whole, worst[0], weights)
@@ -275,7 +281,7 @@ def survey(
     shares: Array,
     worst: Array,
 ) -> float:
-    """Sample a path under a law between two times.
+    """Sample a path under a law between two times. Find the greatest rates, and the first time out of reach.
 
     Parameters
     ----------
@@ -284,17 +290,19 @@ def survey(
     first, until : float
         Times of the law between which the path is sampled [s].
     even : int
-        Number of evenly spaced samples. Samples at and between knots, and at turning points near a limit, are added.
+        Number of evenly spaced samples. More samples are added at knots, between knots, and at turning points near a
+        limit.
     step : float
-        Cycle time [s]. Jerk is measured between setpoints one step apart, because the drives see it that way.
+        Cycle time [s]. Jerk is computed from setpoints one step apart, as it acts on the drives.
     start : (3,)
         Pose at `first`. It selects the branch of the forward kinematics.
     box : (2, 9)
         Low and high limits of x, y, phi, of each slider and of each cross slide.
     tolerance : (9,)
-        Distances beyond these limits at which a path may begin. There, velocities count RETURN_SLOWDOWN times.
+        Tolerances of the limits. If a path begins farther outside its limits than the tolerance, velocities are
+        multiplied by RETURN_SLOWDOWN.
     shares : (3, 3)
-        Weights of velocity, acceleration and jerk for each slider.
+        Factors for velocity, acceleration and jerk of each slider, which make sliders with different limits comparable.
     worst : (6, 3)
         Output: greatest velocity, acceleration and jerk. The rows are: all sliders; x, y and phi of the tool; x and y
         of the centre, if the tool is another point. Undefined if the path leaves the workspace.

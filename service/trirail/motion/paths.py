@@ -1,12 +1,12 @@
 """Paths as piecewise polynomials in time, and laws that map real time to time along a path.
 
-A path has knots (n + 1,) in seconds and pieces (n, d, 6). A piece holds, for each of d coordinates, the coefficients of
-ascending powers of the time since the piece's knot. A law is a path of one coordinate: it gives s, the time along the
-path, as a function of real time. The functions are compiled and return error codes.
+A path has knots (n + 1,) in seconds and pieces (n, d, 6). For each of d coordinates, a piece holds the coefficients of
+ascending powers of the time since the knot at which the piece begins. A law is a path with one coordinate: s, the time
+along another path, as a function of real time. The functions are compiled and return error codes.
 
-In pose space the coordinates are those of a point of the platform, the tool: its place in the base frame [m], and phi.
-The platform is a rigid body, so its centre is p = T - R(phi) t for a tool at t in the platform's frame. Only this
-module converts paths into platform poses.
+In pose space, a path describes the motion of one point of the platform, the tool. The coordinates are the position T of
+the tool in the base frame [m], and phi. The platform is a rigid body. If the tool is at t in the platform's frame, the
+centre of the platform is at p = T - R(phi) t. Only this module converts paths into platform poses.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ __all__ = [
 ]
 
 LAST_PIECE_S = 1e9
-"""Duration of the last piece of a law [s]; in practice, the law never ends."""
+"""Duration of the last piece of a law, which has a constant rate and in practice never ends [s]."""
 BISECTIONS = 48
 """Number of bisection steps after which an interval is narrower than the resolution of a float."""
 ROUNDING = 1e-9
-"""Tolerance for rounding of positions beyond a limit, and of times that should be equal [m, rad, s]."""
+"""Tolerance for rounding errors of positions and times [m, rad, s]."""
 MAX_TIME_FALL_S = 1e-12
 """Greatest decrease of the time along a path that is treated as rounding [s]."""
 CENTRE_TOOLS = np.zeros((0, 2))
-"""Tools of a path of the platform's centre, which needs none."""
+"""Value of Path.tools for a path that describes the motion of the platform's centre."""
 
 
 class Path(NamedTuple):
@@ -55,7 +55,8 @@ class Path(NamedTuple):
     pieces: Array
     in_sliders: bool = False
     tools: Array = CENTRE_TOOLS
-    """Point of the platform that each piece moves, (n, 2) in the platform's frame [m]; CENTRE_TOOLS for the centre."""
+    """Point of the platform that each piece describes, (n, 2) in the platform's frame [m]; CENTRE_TOOLS for the
+    centre."""
 
     @property
     def duration(self) -> float:
@@ -82,7 +83,7 @@ def _find_piece(knots: Array, time: float) -> int:
 
 
 class PieceTime(NamedTuple):
-    """Piece of a path, time since its knot [s], and whether the time is within the path."""
+    """Index of a piece, time since the start of the piece [s], and True if the time is within the path."""
 
     piece: int
     time: float
@@ -110,7 +111,7 @@ def _evaluate_polynomial(p: Array, at: PieceTime) -> Vector:
 
 @compiled()
 def evaluate_path(knots: Array, pieces: Array, time: float, out: Array) -> None:
-    """Write the value and the first two derivatives, (3, d). This is `evaluate` for calls from compiled code."""
+    """Write the value and the first two derivatives of a path at a time into `out` (3, d), from compiled code."""
     at = _locate(knots, time)
     for i in range(pieces.shape[1]):
         out[0, i], out[1, i], out[2, i] = _evaluate_polynomial(pieces[at.piece, i], at)
@@ -118,7 +119,7 @@ def evaluate_path(knots: Array, pieces: Array, time: float, out: Array) -> None:
 
 @compiled()
 def tool_at(knots: Array, tools: Array, time: float) -> tuple[float, float]:
-    """Return the point that a path moves at a time along it, (u, v) in the platform's frame [m]."""
+    """Return the tool of a path at a time along the path, (u, v) in the platform's frame [m]."""
     if len(tools) == 0:
         return 0.0, 0.0
     piece = _locate(knots, time).piece
@@ -127,11 +128,11 @@ def tool_at(knots: Array, tools: Array, time: float) -> tuple[float, float]:
 
 @compiled("void(f8[:, ::1], f8, f8)")
 def transfer_to_point(motion: Array, u: float, v: float) -> None:
-    """Convert the motion of one point of the platform to that of a second point at (u, v) from the first, in place.
+    """Replace the motion of one point of the platform by the motion of another point, in place.
 
-    `motion` (3, 3) has the rows x, y, phi, and their first and second derivatives. (u, v) is in the platform's frame
-    [m]. With r = R(phi) (u, v) and with r_ as r turned by a right angle, the rows become p + r, p' + phi' r_ and p'' +
-    phi'' r_ - phi'^2 r.
+    The rows of `motion` (3, 3) are x, y, phi, their first and their second derivatives. (u, v) is the vector from the
+    first point to the second, in the platform's frame [m]. With r = R(phi) (u, v), and with r_ as r rotated by 90°, the
+    rows become p + r, p' + phi' r_ and p'' + phi'' r_ - phi'^2 r.
     """
     if u == 0.0 and v == 0.0:
         return
@@ -148,7 +149,7 @@ def transfer_to_point(motion: Array, u: float, v: float) -> None:
 
 @compiled()
 def law_at(knots: Array, pieces: Array, time: float) -> Vector:
-    """Return a law's state at a time [s]: time along the path [s], its rate, and the rate's change [1/s]."""
+    """Return the state of a law at a time [s]: time along the path [s], the rate, and the change of the rate [1/s]."""
     at = _locate(knots, time)
     return _evaluate_polynomial(pieces[at.piece, 0], at)
 
@@ -161,7 +162,10 @@ def evaluate(knots: Array, pieces: Array, time: float, out: Array) -> None:
 
 @compiled()
 def motion_at(knots: Array, pieces: Array, tools: Array, law: Vector, out: Array) -> None:
-    """Write the motion (3, 3) of sliders or platform centre at a state of the law: value and two derivatives."""
+    """Write the motion of the sliders or of the platform's centre for a state of the law.
+
+    The rows of `out` (3, 3) are the value and the first two derivatives.
+    """
     s, rate, change = law
     evaluate_path(knots, pieces, s, out)
     for i in range(3):
@@ -173,7 +177,7 @@ def motion_at(knots: Array, pieces: Array, tools: Array, law: Vector, out: Array
 
 @compiled("void(f8[::1], f8[:, :, ::1], f8[:, ::1], f8, f8[:, ::1])")
 def path_motion(knots: Array, pieces: Array, tools: Array, time: float, out: Array) -> None:
-    """Write the motion (3, 3) of sliders or platform centre at a time along a path [s], at full speed."""
+    """Write the motion (3, 3) of the sliders or the platform's centre at a time along the path [s], at full speed."""
     motion_at(knots, pieces, tools, (time, 1.0, 0.0), out)
 
 
@@ -181,9 +185,10 @@ def path_motion(knots: Array, pieces: Array, tools: Array, time: float, out: Arr
 def platform_at(
     legs: Array, knots: Array, pieces: Array, in_sliders: bool, tools: Array, law: Vector, near: Array, out: Array
 ) -> int:
-    """Write the pose, velocity and acceleration (3, 3) of the platform at a state of the law.
+    """Write the pose, velocity and acceleration (3, 3) of the platform for a state of the law.
 
-    A path in slider space is converted on the branch of the pose `near`. Returns 0, or a code of forward_into.
+    For a path in slider space, the pose `near` selects the branch of the forward kinematics. Returns 0, or a code of
+    forward_into.
     """
     motion_at(knots, pieces, tools, law, out)
     if not in_sliders:
@@ -209,13 +214,13 @@ def platform_at_law_time(
     near: Array,
     out: Array,
 ) -> int:
-    """Write the pose, velocity and acceleration (3, 3) of the platform at a time of the law [s]; see platform_at."""
+    """Write the motion of the platform at a time of the law [s]; see platform_at."""
     return platform_at(legs, knots, pieces, in_sliders, tools, law_at(law_knots, law_pieces, time), near, out)
 
 
 @compiled("b1(f8[::1], f8[::1], f8[::1])")
 def is_valid_path(knots: Array, coefficients: Array, tools: Array) -> bool:
-    """Return whether all numbers of a path are finite and its knots are in ascending order."""
+    """Return whether all numbers of a path are finite and no knot is less than the previous knot."""
     for numbers in (knots, coefficients, tools):
         for number in numbers:
             if not math.isfinite(number):
@@ -230,10 +235,10 @@ def is_valid_path(knots: Array, coefficients: Array, tools: Array) -> bool:
 
 @compiled("b1(f8[::1], f8[:, :, ::1])")
 def law_falls(law_knots: Array, law_pieces: Array) -> bool:
-    """Return whether the time along a path ever decreases by more than MAX_TIME_FALL_S, so that the law is not valid.
+    """Return True if a law is invalid because the time along the path decreases by more than MAX_TIME_FALL_S.
 
-    The pieces of a law are cubic. The extrema of the time are therefore at knots and at the zeros of its rate, which is
-    a parabola. A piece of a higher degree counts as decreasing, because this method cannot check it.
+    The pieces of a law are cubic. The extrema of the time along the path are therefore at knots, and at the zeros of
+    the rate, which is a parabola. If a piece has a higher degree, the result is also True.
     """
     highest = -math.inf
     for k in range(len(law_pieces)):
@@ -255,7 +260,7 @@ def law_falls(law_knots: Array, law_pieces: Array) -> bool:
 
 @compiled("f8(f8[::1], f8[:, :, ::1], f8, f8)")
 def passing_time(law_knots: Array, law_pieces: Array, s: float, last: float) -> float:
-    """Return the time at which a law passes a time along the path [s]. Found by bisection from its start to `last`."""
+    """Return the time at which a law reaches the time `s` along the path [s], by bisection from its start to `last`."""
     low, high = law_knots[0], last
     for _ in range(BISECTIONS):
         middle = (low + high) / 2.0

@@ -1,4 +1,4 @@
-"""Quintic paths through timed points, each with a given position, velocity and acceleration."""
+"""Paths through timed points, with a quintic polynomial between successive points."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from trirail.quantities import apart, worded
 MAX_START_OFFSET = 1e-4
 """Greatest allowed distance between the start of a trajectory and the robot's pose [m, rad]."""
 GO_THERE_HINT = "trirail follow --go-there or in Python follow(…, go_there=True)"
-"""Advice for messages if the robot is not at the start of a trajectory."""
+"""Advice in messages about a robot that is not at the start of a trajectory."""
 REST_VELOCITY = 1e-6
-"""Velocity below which the ends of a trajectory count as being at rest [m/s, rad/s]."""
+"""Velocity below which the robot counts as being at rest at the ends of a trajectory [m/s, rad/s]."""
 
 
 class Point(NamedTuple):
@@ -32,9 +32,10 @@ class Point(NamedTuple):
 
 
 def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
-    """Return the path through points. It begins at rest at the pose `start`, and ends at rest.
+    """Return the path through points. The path begins at rest at the pose `start`, and ends at rest.
 
-    Missing velocities and accelerations are central differences of the neighbouring points, and zero at the ends.
+    A missing velocity or acceleration is computed as the central difference of the neighbouring points. At the first
+    and the last point, it is zero.
     """
     t = np.array([point.t for point in points])
     p = np.array([point.pose for point in points])
@@ -46,7 +47,10 @@ def quintic(points: Sequence[Point], start: Sequence[float]) -> Path:
 
 
 def quintic_between(begin: Point, end: Point) -> Path:
-    """Return the quintic between two complete points, which has the least squared jerk."""
+    """Return the quintic between two points with given velocities and accelerations.
+
+    Of all paths between the points, the quintic has the least mean square of the jerk.
+    """
     t, p, v, a = (np.array(values) for values in zip(begin, end, strict=True))
     return _hermite_path(t, p, v, a)
 
@@ -65,7 +69,7 @@ def _hermite_path(t: Array, p: Array, v: Array, a: Array) -> Path:
 
 
 def _complete_derivatives(specified: Sequence[Sequence[float] | None], t: Array, values: Array) -> Array:
-    """Return the derivatives at points (n, 3): those specified, else central differences, and zero at the ends."""
+    """Return the derivatives at points (n, 3). Missing derivatives are central differences, or zero at the ends."""
     rates = np.zeros_like(values)
     if len(t) > 2:
         rates[1:-1] = (values[2:] - values[:-2]) / (t[2:] - t[:-2])[:, None]
@@ -76,9 +80,9 @@ def _complete_derivatives(specified: Sequence[Sequence[float] | None], t: Array,
 
 
 def check_ends(points: Sequence[Point], start: MotionState) -> None:
-    """Check that points begin at rest where the robot is, and end at rest. Raises RefusedError.
+    """Check that a trajectory begins at the robot's pose, and begins and ends at rest. Raises RefusedError.
 
-    An acceleration at either end is allowed. Checker.sample counts it as a jerk over one cycle.
+    An acceleration is allowed at both ends. Checker.sample takes it into account as the jerk of one cycle.
     """
     if not start.at_rest:
         raise RefusedError(RefusalCode.WRONG_START, "the robot moves: send the trajectory when it is at rest")

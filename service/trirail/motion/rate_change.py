@@ -1,6 +1,7 @@
-"""Changes of the rate at which a motion runs, for pause, stop, resume and override.
+"""Changes of the rate at which time runs along a path, for pause, stop, resume and override.
 
-The loop itself makes the change and samples a limited number of knots per cycle, so braking needs no other process.
+The loop process computes the change, and checks a limited number of knots per cycle. Braking therefore does not depend
+on any other process.
 """
 
 from __future__ import annotations
@@ -19,34 +20,35 @@ from trirail.motion.time_scaling import CHANGE_SHARES, TimeScaling, greatest_rat
 MIN_KNOTS_PER_CYCLE = 8
 """Least number of knots of a path that are sampled in one cycle."""
 KNOTS_PER_SECOND = 24_000.0
-"""Number of knots sampled in one cycle per second of its period, because a longer cycle has more time."""
+"""Number of knots that are sampled in one cycle, per second of the cycle's period. A longer cycle has more time."""
 MAX_POSTPONEMENTS = 3
-"""Greatest number of times that the start of a law is postponed so that all of it can be sampled before it starts."""
+"""Greatest number of times that the start of a law is postponed, to leave enough cycles for sampling the whole law."""
 
 
 class _Candidate(NamedTuple):
-    """Proposed law, and the parts of it that have not been sampled yet."""
+    """Law that has been proposed but not completely sampled."""
 
     law: Path
     begins: int
     """Cycle of the schedule in which the law begins."""
     ahead: list[tuple[float, float]]
-    """Parts to sample, the last part first."""
+    """Parts of the law that have not been sampled yet, in reverse order."""
 
 
 class RateChange:
-    """Change of the last motion of a schedule to another rate, as early and as quickly as the limits allow.
+    """Change of the rate of a schedule's last motion, as early and as quickly as the limits allow.
 
-    The old law stays valid until a new one has been proven. The change is improved while it is running, because a
-    slower motion leaves a larger part of the limits free. A motion that has not begun yet begins at the new rate.
+    The old law remains in use until a new law has been checked completely. While the rate is changing, the search for a
+    quicker change continues, because a slower motion leaves a larger part of the limits free. A motion that has not
+    begun yet begins at the new rate.
     """
 
     def __init__(self, scaling: TimeScaling, schedule: Schedule, rate: float, period: float) -> None:
         self.rate = rate
         self.cycles = 0
-        """Number of cycles used."""
+        """Number of cycles since the change was requested."""
         self.applied = False
-        """Whether the motion has a law that leads to the new rate. Further cycles only make the change quicker."""
+        """Whether the motion has a law that leads to the new rate. Further cycles can only make the change quicker."""
         self._scaling = scaling
         self._schedule = schedule
         self._period = period
@@ -55,17 +57,17 @@ class RateChange:
 
     @property
     def lowers_rate(self) -> bool:
-        """Whether the rate falls and no law for it is applied yet. Such a change does not wait for the planner."""
+        """Whether this is a change to a lower rate that has not been applied yet, and must not wait for the planner."""
         runs = self._schedule.runs
         return not self.applied and bool(runs) and self.rate < max(runs[-1].target, runs[-1].law_state.rate)
 
     def step(self) -> bool:
-        """Sample at most one part. Return whether the change is complete."""
+        """Continue the change, with at most one call of the sampler per cycle. Return True if it is complete."""
         self.cycles += 1
         schedule = self._schedule
         if not schedule.runs:
             return True
-        if self._motion_key != (schedule.version, len(schedule.runs)):  # another motion is under way
+        if self._motion_key != (schedule.version, len(schedule.runs)):  # the motion has changed
             self._restart()
         run = schedule.runs[-1]
         if self._unsampled is not None:
@@ -85,11 +87,14 @@ class RateChange:
     # ------------------------------------------------------------------ inside
 
     def _is_over(self, run: Run) -> bool:
-        """Return whether the applied law has reached the rate, or is slowing down to a rate above zero."""
+        """Return True if the applied law is complete and needs no improvement.
+
+        A change to rate 0 is complete at rest. Any other change is complete when the rate is not below its target.
+        """
         return self.applied and (run.at_rest if self.rate == 0.0 else run.law_state.rate >= self._possible)
 
     def _restart(self) -> None:
-        """Start again from the motion as it is now."""
+        """Restart the change from the current state of the motion."""
         schedule = self._schedule
         self._motion_key = schedule.version, len(schedule.runs)
         self._possible = self.rate
@@ -119,9 +124,9 @@ class RateChange:
             self._unsampled = None
 
     def _check_candidate(self, run: Run) -> None:
-        """Sample one part of the proposed law. Apply the law when all parts fit and its cycle has come."""
+        """Sample one part of the proposed law. In the cycle in which the law begins, apply it if all parts fit."""
         cycle = self._schedule.cycle
-        if self._candidate is not None and self._candidate.begins < cycle:  # too late: not all of it was sampled
+        if self._candidate is not None and self._candidate.begins < cycle:  # too late: the sampling took too long
             self._candidate = None
         if self._candidate is None:
             self._candidate = self._propose(run)
@@ -142,7 +147,10 @@ class RateChange:
         self._candidate, self._share = None, (self._share + 1) % len(CHANGE_SHARES)
 
     def _propose(self, run: Run) -> _Candidate | None:
-        """Return the law at the current share, late enough to be sampled before it starts; None if there is none."""
+        """Return a law at the current fraction of the quickest change; None if there is no suitable law.
+
+        The law begins late enough for all of its parts to be sampled before.
+        """
         cycles = 1
         for _ in range(MAX_POSTPONEMENTS):
             at = run.law_state if cycles == 1 else run.law_state_at(run.time + (cycles - 1) * self._period)
@@ -156,12 +164,12 @@ class RateChange:
         return None
 
     def _stops_sooner(self, run: Run, law: Path, cycles: int) -> bool:
-        """Return whether a law ends or stops the run at least one cycle sooner than the present law."""
+        """Return whether a law ends the run at least one cycle earlier than the present law."""
         ends = run.path.duration
         stands = arrival_time(law, self._possible, ends) if self._possible else float(law.knots[-2])
         if (cycles - 1) * self._period + stands <= run.end_time - run.time - self._period:
             return True
-        self._share = -1  # slower changes would end no sooner: continue with the quickest
+        self._share = -1  # slower changes would not end earlier either: try the quickest change next
         return False
 
     def _change_law(self, run: Run, law: Path) -> None:

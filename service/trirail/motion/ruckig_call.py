@@ -1,4 +1,4 @@
-"""Calls to Ruckig, with workarounds for its failures."""
+"""Calls to the trajectory generator Ruckig, with workarounds for inputs for which Ruckig fails."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from trirail.motion.paths import Path
 from trirail.motion.runs import NO_TOOL, MotionState, from_ruckig, repeat_tool
 
 JERK_SHARES = (1.0, 1.0 - 1e-6, 1.0 - 1e-3)
-"""Shares of the jerk limit that are tried in turn. Ruckig fails exactly at the border between two kinds of profile,
-for example for a distance of 2 a³ / j² from rest to rest. With slightly less jerk, there is a solution."""
+"""Fractions of the jerk limit that are tried in turn. Ruckig fails exactly at the border between two kinds of profile,
+for example for a distance of 2 a³ / j² from rest to rest. With a slightly lower jerk limit, Ruckig finds a solution."""
 PARALLEL_TOLERANCE = 1e-9
-"""Motion across a line that is treated as rounding [m/s, m/s², m/s³]; relative to the greatest if that is above 1."""
+"""Motion across a line that is treated as rounding [m/s, m/s², m/s³]. If the greatest rate is above 1, the tolerance is
+relative to the greatest rate."""
 UNBOUNDED_LIMIT = 1e6
-"""Limit used in place of infinity, for motions that no limit bounds [m/s, m/s², m/s³]."""
+"""Limit for Ruckig in place of infinity, for motions to which no limit applies [m/s, m/s², m/s³]."""
 
 
 class Kinodynamic(NamedTuple):
@@ -34,7 +35,7 @@ class Kinodynamic(NamedTuple):
 def try_solve(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory) -> bool:
     """Return whether Ruckig finds a trajectory.
 
-    Some failures raise an exception; code -101 raises ValueError because it is missing in Ruckig's own enum.
+    Some failures raise an exception. Code -101 raises ValueError, because it is missing in Ruckig's Python enum.
     """
     try:
         return ruckig.calculate(request, trajectory) in (Result.Working, Result.Finished)
@@ -43,7 +44,7 @@ def try_solve(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory) -
 
 
 def solve_within(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory, jerk: Sequence[float]) -> None:
-    """Solve a request with the given jerk limits, or with slightly lower ones. Raises RefusedError."""
+    """Solve a request with the given jerk limits or, if that fails, slightly lower limits. Raises RefusedError."""
     for share in JERK_SHARES:
         request.max_jerk = [share * limit for limit in jerk]
         if try_solve(ruckig, request, trajectory):
@@ -54,7 +55,7 @@ def solve_within(ruckig: Ruckig, request: InputParameter, trajectory: Trajectory
 
 
 class Solver:
-    """Path solver based on Ruckig. It does not check the paths against the workspace."""
+    """Path solver based on Ruckig. The paths are not checked against the workspace."""
 
     def __init__(self) -> None:
         self._three_axes, self._one_axis = Ruckig(3), Ruckig(1)
@@ -67,10 +68,10 @@ class Solver:
         in_sliders: bool = False,
         tool: Sequence[float] = NO_TOOL,
     ) -> Path:
-        """Return the path to rest at a target. It is straight if it starts at rest. Raises RefusedError.
+        """Return the path to rest at a target. A path that starts at rest is straight. Raises RefusedError.
 
-        With `in_sliders`, the target is slider positions. Otherwise it is the pose of a tool, (u, v) in the platform's
-        frame [m].
+        If `in_sliders` is set, the target consists of slider positions. Otherwise, the target is the pose of the tool,
+        (u, v) in the platform's frame [m].
         """
         if start.at_rest:
             return self._straight(start.pose, target, limits, in_sliders, tool)
@@ -81,7 +82,7 @@ class Solver:
     def to_velocity(
         self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic, tool: Sequence[float] = NO_TOOL
     ) -> Path:
-        """Return the quickest path to a tool's velocity [m/s, rad/s]. Raises RefusedError."""
+        """Return the quickest path to a velocity of the tool [m/s, rad/s]. Raises RefusedError."""
         request = _request(start, limits)
         request.control_interface = ControlInterface.Velocity
         request.target_velocity = list(velocity)
@@ -90,9 +91,10 @@ class Solver:
     def to_velocity_straight(
         self, start: MotionState, velocity: Sequence[float], limits: Kinodynamic, tool: Sequence[float] = NO_TOOL
     ) -> Path:
-        """Return the path to a tool's velocity along one line if the motion begins on that line, else as to_velocity.
+        """Return a path to a velocity of the tool that is straight if the motion begins along the line of the velocity.
 
-        Ruckig's phase synchronisation fails for some of these paths; see `_straight`.
+        Otherwise, the result is the path of to_velocity. For some straight paths, the phase synchronisation of Ruckig
+        fails; see `_straight`. In these cases, one coordinate is solved, and the others are scaled copies.
         """
         direction = np.array(velocity if any(velocity) else start.velocity)
         farthest = float(np.abs(direction).max())
@@ -127,10 +129,11 @@ class Solver:
         in_sliders: bool,
         tool: Sequence[float],
     ) -> Path:
-        """Return the straight path from rest to rest: Ruckig's for the farthest coordinate, scaled for the others.
+        """Return the straight path from rest to rest.
 
-        Ruckig's phase synchronisation fails if one coordinate would have to use less velocity, acceleration or jerk
-        than it would use alone. With it, 3 % of the goals left their line.
+        Ruckig solves the motion of the coordinate with the longest way. The other coordinates are scaled copies. The
+        phase synchronisation of Ruckig is not used, because it fails if a coordinate would have to use less velocity,
+        acceleration or jerk than it would use alone: 3 % of the goals left their line.
         """
         length = np.subtract(target, begin)
         farthest = float(np.abs(length).max())

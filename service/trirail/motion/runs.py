@@ -1,4 +1,4 @@
-"""Motion of the platform that is under way: a path, its law, and the state of both."""
+"""Runs: motions of the platform, each with a path, a law of time, and the current state."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ZERO_RATES = (0.0, 0.0, 0.0)
 NO_TOOL = (0.0, 0.0)
 """Tool that is the platform's centre itself [m]."""
 KNOT_TOLERANCE_S = 1e-9
-"""Distance between two knots below which they are merged [s]."""
+"""Interval below which two knots are merged [s]."""
 
 
 class MotionState(NamedTuple):
@@ -50,20 +50,20 @@ def rest(pose: Sequence[float]) -> MotionState:
 
 
 def tool_motion(motion: MotionState, tool: Sequence[float]) -> MotionState:
-    """Convert the motion of the platform's centre to that of a point of the platform, (u, v) in its frame [m]."""
+    """Return the motion of a tool, (u, v) in the platform's frame [m], given the motion of the platform's centre."""
     rows = np.array(motion, dtype=np.float64)
     transfer_to_point(rows, *tool)
     return MotionState(*rows.tolist())
 
 
 def centre_motion(motion: MotionState, tool: Sequence[float]) -> MotionState:
-    """Convert the motion of a point of the platform, (u, v) in its frame [m], to that of the platform's centre."""
+    """Return the motion of the platform's centre, given the motion of a tool, (u, v) in the platform's frame [m]."""
     u, v = tool
     return tool_motion(motion, (-u, -v))
 
 
 class LawState(NamedTuple):
-    """State of a law: time along the path [s], the rate of that time, and the change of the rate [1/s]."""
+    """State of a law: time along the path [s], rate of the time along the path, and change of the rate [1/s]."""
 
     s: float
     rate: float
@@ -76,11 +76,11 @@ class Seam(NamedTuple):
     s: float
     """Time along the path [s]."""
     before: Path
-    """Path without the next goal. It equals the whole path up to the seam."""
+    """Path without the next goal and the goals after it. Up to the seam, it equals the whole path."""
 
 
 class GoalSpan(NamedTuple):
-    """Times along the path at which the current goal begins and ends [s], and the time of the law at its end [s]."""
+    """Times along the path at which the current goal begins and ends [s], and time of the law at which it ends [s]."""
 
     begun: float
     end: float
@@ -88,20 +88,20 @@ class GoalSpan(NamedTuple):
 
 
 class Run:
-    """Path and its law, which advance by one period per cycle."""
+    """Motion along a path under a law. The owner advances `time` by one period per cycle."""
 
     def __init__(self, legs: Array, path: Path, law: Path, target: float) -> None:
         self.path = path
         self.law = law
         self.target = target
-        """Rate at which the law ends."""
+        """Rate of the time along the path at the end of the law."""
         self.time = 0.0
         """Time since the start of the law [s]."""
         self.furthest = np.full(1, -np.inf)
         """Greatest time along the path that has been commanded, (1,) [s]. It never decreases."""
         self.seams: deque[Seam] = deque()
         self.marks: deque[GoalMarks] = deque()
-        """Marks of the goals on the path, from the current goal on, in order; empty if no goal has marks."""
+        """Marks of the current goal and of the following goals on the path, in order; empty if no goal has marks."""
         self._begun = 0.0
         self._goal_span = GoalSpan(0.0, 0.0, 0.0)
         self._span_law: Path | None = None
@@ -128,13 +128,13 @@ class Run:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the motion is at rest: at the end of the path, or because its law has stopped it."""
+        """Whether the motion is at rest, at the end of the path or because the law has stopped it."""
         at = self.law_state
         return at.s >= self.path.duration or (self.target == 0.0 and at.rate == at.change == 0.0)
 
     @property
     def goal_span(self) -> GoalSpan:
-        """Span of the current goal. It is computed again after a change of the law or of the goal."""
+        """Span of the current goal, computed again only after a change of the law or of the goal."""
         begun, end = self._begun, self.seams[0].s if self.seams else self.path.duration
         if self._span_law is not self.law or self._goal_span[:2] != (begun, end):
             self._goal_span, self._span_law = GoalSpan(begun, end, self.arrival_at(end)), self.law
@@ -142,7 +142,7 @@ class Run:
 
     @property
     def remaining(self) -> float:
-        """Time to the end of the current goal [s]. If the law stops before that, full speed is assumed."""
+        """Time until the end of the current goal [s]. If the law leads to a standstill, full speed is assumed."""
         _, end, arrival = self.goal_span
         return max(0.0, arrival - self.time if self.target else end - self.law_state.s)
 
@@ -153,21 +153,21 @@ class Run:
         return min(self.arrival_at(self.path.duration), stops)
 
     def arrival_at(self, s: float) -> float:
-        """Return the time of the law at a time along the path [s]; infinite if the motion stops before that."""
+        """Return the time of the law at which the time along the path is `s` [s]; infinite if it never is."""
         return arrival_time(self.law, self.target, s)
 
     @property
     def progress(self) -> float:
-        """Elapsed share of the duration of the current goal, from 0 to 1."""
+        """Completed fraction of the current goal, from 0 to 1, as a fraction of its time along the path."""
         begun, end, _ = self.goal_span
         return max(0.0, min(1.0, (self.law_state.s - begun) / (end - begun))) if end > begun else 1.0
 
     def destination(self, near: Sequence[float]) -> Sequence[float]:
-        """Return the target pose of the current goal, on the branch of the pose `near`."""
+        """Return the target pose of the current goal. For a path in slider space, `near` selects the branch."""
         return self._end_of(self.seams[0].before if self.seams else self.path, near)
 
     def end(self, near: Sequence[float]) -> Sequence[float]:
-        """Return the pose at the end of the path, where the last goal ends, on the branch of the pose `near`."""
+        """Return the pose at the end of the path, which is the target of the last goal; `near` selects the branch."""
         return self._end_of(self.path, near)
 
     def _end_of(self, path: Path, near: Sequence[float]) -> Sequence[float]:
@@ -184,9 +184,9 @@ class Run:
         return other
 
     def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
-        """Continue with another path from a time along this one. Both have the same state of motion there.
+        """Replace the path after the time `s` by another path, which begins with the same state of motion.
 
-        Marks of earlier goals that lie after `s` are disabled; they return if the new goal is dropped.
+        Marks of earlier goals after `s` are not used, unless the new goal is dropped.
         """
         longer = joined([cut(self.path, s), path])
         self.marks.append(marks or GoalMarks())
@@ -195,7 +195,7 @@ class Run:
         self.path = longer
 
     def drop(self, number: int) -> None:
-        """Remove the goals after a seam. Seams are counted from zero."""
+        """Remove the goals after seam `number`, counted from zero, and restore the path before this seam."""
         self.path = self.seams[number].before
         while len(self.seams) > number:
             self.seams.pop()
@@ -203,7 +203,7 @@ class Run:
                 self.marks.pop()
 
     def pass_seams(self) -> int:
-        """Remove the seams that have been passed. Return their number, which is the number of goals that have ended."""
+        """Remove the seams that the motion has passed. Return the number of goals that have thereby ended."""
         s, passed = self.law_state.s, 0
         while self.seams and s >= self.seams[0].s:
             self._begun = self.seams.popleft().s
@@ -213,11 +213,11 @@ class Run:
         return passed
 
     def change_law(self, law: Path, target: float) -> None:
-        """Continue with another law from now on."""
+        """Continue the motion under another law, which begins now."""
         self.law, self.target, self.time = law, target, 0.0
 
     def state(self, ahead: float, near: Sequence[float]) -> MotionState:
-        """Return the state of motion `ahead` seconds from now; NaN for an impossible pose."""
+        """Return the state of motion `ahead` seconds from now; all values are NaN if no pose is possible."""
         self._near[:] = near
         code = platform_at_law_time(self._legs, *self.path, *self.law[:2], self.time + ahead, self._near, self._out)
         if code:
@@ -226,14 +226,17 @@ class Run:
 
 
 def nominal_motion(path: Path, s: float) -> MotionState:
-    """Return the motion of the platform's centre or of the sliders at a time along a path [s], at full speed."""
+    """Return the motion at a time along a path [s] at full speed, of the platform's centre or of the sliders."""
     out = np.zeros((3, 3))
     path_motion(path.knots, path.pieces, path.tools, s, out)
     return MotionState(*out.tolist())
 
 
 def arrival_time(law: Path, target: float, s: float) -> float:
-    """Return when a law to the rate `target` reaches a time along the path [s]; infinite if it never does."""
+    """Return the time of a law at which the time along the path reaches `s` [s]; infinite if it never does.
+
+    `target` is the rate of the time along the path at the end of the law.
+    """
     last = law.pieces[-1, 0]
     begins, at, rate = float(law.knots[-2]), float(last[0]), float(last[1])
     if at >= s:
@@ -242,7 +245,7 @@ def arrival_time(law: Path, target: float, s: float) -> float:
 
 
 def from_ruckig(trajectory: Trajectory, in_sliders: bool = False, tool: Sequence[float] = ZERO_RATES[:2]) -> Path:
-    """Convert a Ruckig trajectory to a path of a tool. The path is cubic between the switching times."""
+    """Convert a trajectory of Ruckig to a path of a tool. The pieces are cubics between changes of the jerk."""
     duration: float = trajectory.duration
     times = {0.0, duration}
     for profile in trajectory.profiles[0]:
@@ -267,12 +270,12 @@ def from_ruckig(trajectory: Trajectory, in_sliders: bool = False, tool: Sequence
 
 
 def repeat_tool(tool: Sequence[float], number: int) -> Array:
-    """Return the tools of a path with `number` pieces that all move the same point of the platform [m]."""
+    """Return Path.tools for a path with `number` pieces that all describe the same point of the platform [m]."""
     return np.tile(np.array(tool, dtype=np.float64), (number, 1)) if any(tool) else CENTRE_TOOLS
 
 
 def law_from_ruckig(trajectory: Trajectory, target: float) -> Path:
-    """Convert a one-dimensional Ruckig trajectory to a law that keeps its final rate."""
+    """Convert a one-dimensional trajectory of Ruckig to a law that continues at the final rate `target`."""
     ramp = from_ruckig(trajectory)
     last = np.zeros((1, 1, 6))
     last[0, 0, :2] = ramp.end[0], target
@@ -290,7 +293,7 @@ def joined(paths: Sequence[Path]) -> Path:
 
 
 def cut(path: Path, s: float) -> Path:
-    """Return the part of a path up to a time along it [s]."""
+    """Return the part of a path from its start to the time `s` [s]."""
     if s >= path.duration:
         return path
     last = max(1, int(np.searchsorted(path.knots, s - KNOT_TOLERANCE_S)))
@@ -298,7 +301,7 @@ def cut(path: Path, s: float) -> Path:
 
 
 def stretched(path: Path, factor: float) -> Path:
-    """Return the path made `factor` times slower. Derivatives that are too small for a float become zero."""
+    """Return a path that is `factor` times slower. Derivatives that are too small for a float become zero."""
     with np.errstate(over="ignore"):  # the fifth power of a factor of 1e62 overflows
         powers = factor ** np.arange(6.0)
     return path._replace(knots=path.knots * factor, pieces=path.pieces / powers)

@@ -1,4 +1,4 @@
-"""Schedule of the platform: the motion under way, the motions that follow, and the commanded state."""
+"""Schedule of the platform: the current motion, the motions that follow, and the commanded state."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from trirail.motion.runs import MotionState, Run
 
 
 class Schedule:
-    """Sequence of runs.
+    """Sequence of runs, and the commanded state of the platform.
 
-    Each cycle calls either `advance`, or `begin_cycle` and `end_cycle` before and after its own evaluation of the
-    motion.
+    In each cycle, the owner calls `advance`. If the owner computes the commanded state itself, it calls `begin_cycle`
+    before and `end_cycle` after the computation instead.
     """
 
     def __init__(self, commanded: MotionState, period: float) -> None:
@@ -23,10 +23,10 @@ class Schedule:
         """Commanded motion now and in the previous cycle (2, 3, 3); rows are pose, velocity, acceleration."""
         self.commanded = commanded
         self.runs: deque[Run] = deque()
-        """Motion under way, and the motions that follow at its end."""
+        """Current motion, followed by the motions that begin when it ends."""
         self.cycle = 0
         self.version = 0
-        """Version of the motion under way. Every change to its future increases the version."""
+        """Version number of the runs, which every change of the planned motion increases."""
         self._period = period
 
     @property
@@ -40,7 +40,7 @@ class Schedule:
 
     @property
     def last(self) -> Run | None:
-        """Last run. The robot is at rest at its end."""
+        """Last run; None if there is no run. The robot is at rest at the end of the last run."""
         return self.runs[-1] if self.runs else None
 
     @property
@@ -50,39 +50,39 @@ class Schedule:
 
     @property
     def ended(self) -> bool:
-        """Whether the end of the last path has been reached, so that no goal can follow in motion."""
+        """Whether the end of the last path has been reached. A following goal then begins at rest."""
         return len(self.runs) == 1 and self.runs[0].arrived
 
     @property
     def progress(self) -> tuple[float, float]:
-        """Elapsed share of the duration of the current goal, and the remaining time [s]."""
+        """Completed fraction of the current goal, 0 to 1, and the remaining time [s]."""
         if not self.runs:
             return 0.0, 0.0
         *stops, run = self.runs
         return run.progress, run.remaining + sum(stop.end_time - stop.time for stop in stops)
 
     def replace_runs(self, runs: deque[Run]) -> None:
-        """Continue with other runs, the first of which begins in the commanded state."""
+        """Replace all runs. The first new run must begin in the commanded state."""
         self.runs = runs
         self.version += 1
 
     def append(self, s: float, path: Path, marks: GoalMarks | None = None) -> None:
-        """Continue with another path from a time along the last path; see Run.append."""
+        """Extend the last run by the path of another goal; see Run.append."""
         self.runs[-1].append(s, path, marks)
         self.version += 1
 
     def drop(self, number: int) -> None:
-        """Remove the goals after a seam of the last path; see Run.drop."""
+        """Remove the goals after a seam of the last run; see Run.drop."""
         self.runs[-1].drop(number)
         self.version += 1
 
     def change_law(self, run: Run, law: Path, target: float) -> None:
-        """Continue a run with another law; see Run.change_law."""
+        """Continue a run under another law; see Run.change_law."""
         run.change_law(law, target)
         self.version += 1
 
     def stop_on_path(self) -> None:
-        """Remove all later motions and goals. The current motion then leads to none of them."""
+        """Remove all motions after the current motion, and all following goals on the current path."""
         while len(self.runs) > 1:
             self.runs.pop()
         for run in self.runs:
@@ -99,7 +99,7 @@ class Schedule:
         return self.end_cycle(run)
 
     def begin_cycle(self) -> Run | None:
-        """Begin the next cycle. Return its run, which is advanced by one period."""
+        """Begin the next cycle. Advance the current run by one period and return it; None if there is no run."""
         self.cycle += 1
         if not self.runs:
             return None

@@ -18,13 +18,13 @@ from trirail.motion.time_optimal import END_COEFFICIENTS, limit_excess, minimise
 __all__ = ["time_optimal"]
 
 INTERVALS = 32
-"""Number of intervals of constant jerk. Ten times as many would shorten a path by only 0.25 %."""
+"""Number of intervals with constant jerk per path. Ten times as many intervals would shorten a path by only 0.25 %."""
 SAMPLE_CELLS = 64
-"""Number of cells of a line. The derivatives of the line are interpolated within a cell."""
+"""Number of cells into which a line is divided. Within a cell, the derivatives of the line are interpolated."""
 KNOT_LIMIT_SHARE = 0.999
-"""Share of the limits that is used at the ends of intervals. The rest covers peaks between them."""
+"""Fraction of the limits that the method may use. The margin covers peaks between the times that are checked."""
 INITIAL_SLOWDOWN = 1.01
-"""Factor by which the first iterate is slower than a law that is just within the limits."""
+"""Factor by which the first iterate is slower than a law that just reaches the limits."""
 
 
 def time_optimal(
@@ -37,21 +37,21 @@ def time_optimal(
 ) -> Path | None:
     """Return the fastest straight path from rest to rest between the ends of a path; None if the method fails.
 
-    The limits are enforced at discrete times only, so Checker samples the result like every other path.
+    The limits are enforced only at discrete times. The result must therefore be checked by Checker, like every path.
 
     Parameters
     ----------
     legs : Array
         Packed legs of the robot.
     path : Path
-        Straight path that gives the line and the first iterate.
+        Straight path that defines the line and the first iterate.
     own, others : (3, 3)
-        Limits of the path's own coordinates, and of the coordinates of the other space (platform or sliders). Rows are
-        velocity, acceleration, jerk.
+        Limits of the coordinates of the path, and of the coordinates of the other space. For a path in pose space, the
+        other space is the slider space, and vice versa. Rows are velocity, acceleration, jerk.
     centre : (2, 3)
-        Limits of x and y of the platform's centre, for a path of another point.
+        Limits of the platform's centre in x and y, used if the path describes another point of the platform.
     near : (3,)
-        Pose that selects the branch of a path in slider space.
+        Pose that selects the branch of the forward kinematics for a path in slider space.
     """
     begin = path.pieces[0, :, 0].copy()
     length = path.end - begin
@@ -88,7 +88,7 @@ def time_optimal(
 def _peak_velocity(states: Array, step: float) -> float:
     """Return the peak velocity of a law, given its states sigma, v, a, j at the start of intervals (n, 4).
 
-    The peak may be within an interval. A later check cannot find it, because it does not know the goal's own limits.
+    The peak may be within an interval. It must be found here, because Checker does not know the limits of the goal.
     """
     _, v, a, j = states.T
     turn = np.clip(np.divide(-a, j, out=np.zeros_like(a), where=j != 0.0), 0.0, step)
@@ -99,10 +99,10 @@ def _peak_velocity(states: Array, step: float) -> float:
 def _sample_line(
     legs: Array, begin: Array, length: Array, in_sliders: bool, tool: Array, near: Array, out: Array
 ) -> int:
-    """Write the first and second derivatives with respect to sigma of all coordinates whose limits apply.
+    """Write the first and second derivatives with respect to sigma of all coordinates that have limits.
 
-    These are the coordinates of the other space, sigma itself, and the centre of a tool path. Returns 0, or a code of
-    forward_into.
+    These are the coordinates of the other space, sigma itself and, for a path of another point, x and y of the centre.
+    Returns 0, or a code of forward_into.
     """
     motion, other = np.zeros((3, 3)), np.empty((6, 3))
     rate = length[0], length[1], length[2]
@@ -131,7 +131,7 @@ def _sample_line(
 
 @compiled("void(f8[::1], f8[:, :, ::1], f8, f8[::1])")
 def _resample(knots: Array, pieces: Array, step: float, coefficients: Array) -> None:
-    """Write the coefficients of a spline that approximates a law; exact where one cubic covers two steps."""
+    """Write the coefficients of a spline that approximates a law. The spline is exact if one cubic covers two steps."""
     for k in range(len(coefficients)):
         sigma, _, change = law_at(knots, pieces, (k - 1) * step)
         coefficients[k] = sigma - step**2 * change / 6.0

@@ -1,18 +1,20 @@
-"""Interior-point method for the fastest motion along a line from rest to rest, with limits up to the jerk.
+"""Interior-point method for the fastest motion along a line, with limits on velocity, acceleration and jerk.
 
-sigma(t), the completed share of the line, is a cubic B-spline with n intervals of h seconds. Its jerk is constant in
-each interval. Of its n + 3 coefficients, the first three are zero and the last three are one. The other coefficients
-and ln h are the unknowns. Each coordinate of the platform and the sliders is a function q(sigma). With v, a, j for the
+The motion begins and ends at rest.
+
+sigma(t), the completed fraction of the line, is a cubic B-spline with n intervals of h seconds. The jerk is constant in
+each interval. Of the n + 3 coefficients, the first three are zero and the last three are one. The other coefficients
+and ln h are the unknowns. Each coordinate of the platform and the sliders is a function q(sigma). With v, a, j as the
 derivatives of sigma with respect to time, the rates of the coordinate are
 
     velocity q' v    acceleration q' a + q'' v²    jerk q' j + 3 q'' v a + q''' v³
 
-Each rate divided by its limit is a share f. A barrier keeps f between -1 and 1 at several moments of every interval:
-the method minimises ln h / mu - sum ln (1 - f²) for ever smaller mu (Boyd and Vandenberghe, Convex Optimization,
-chapter 11). The Newton steps omit the second derivatives of f (Gauss-Newton). This leaves a banded system that is
-bordered by ln h.
+Each rate is divided by its limit. A barrier function confines the quotient f to the range from -1 to 1 at several times
+in every interval. The method minimises ln h / mu - sum ln (1 - f²) for ever smaller mu (Boyd and Vandenberghe, Convex
+Optimization, chapter 11). The Newton steps omit the second derivatives of f (Gauss-Newton). The resulting system of
+equations is banded, with one additional row and column for ln h.
 
-The functions are compiled. motion/feasibility.py checks the result, as it checks every other path.
+The functions are compiled. motion/feasibility.py checks the result, as it checks every path.
 """
 
 from __future__ import annotations
@@ -28,23 +30,24 @@ from trirail.kinematics.compiled import compiled
 __all__ = ["END_COEFFICIENTS", "limit_excess", "minimise_time", "spline_states"]
 
 COEFFICIENTS_PER_INTERVAL = 4
-"""Number of coefficients that a cubic B-spline depends on within an interval."""
+"""Number of coefficients that determine a cubic B-spline within an interval."""
 END_COEFFICIENTS = 3
 """Number of coefficients at each end that are fixed because the motion is at rest there."""
 CHECKS_PER_INTERVAL = 2
 """Number of parts into which an interval is divided. The limits are enforced at the ends of each part."""
 FIRST_MU, LAST_MU, MU_FACTOR = 1e-2, 1e-5, 0.1
-"""Weights of the barrier relative to ln h. The last one lengthens the motion by less than a thousandth."""
+"""First and last weight mu of the barrier relative to ln h, and factor between weights. With the last weight, the
+barrier lengthens the motion by less than a thousandth."""
 CENTRED_GAIN = 0.5
 """Predicted gain of a Newton step below which mu is reduced."""
 ARMIJO_SHARE = 1e-4
-"""Share of the predicted gain that a step must reach (Armijo condition)."""
+"""Fraction of the predicted gain that a step must achieve to be accepted (Armijo condition)."""
 MIN_STEP_SHARE = 1e-9
-"""Share of a step below which the line search ends."""
+"""Fraction of a Newton step below which the line search gives up."""
 MAX_NEWTON_STEPS = 100
-"""Greatest number of Newton steps; about thirty are usual."""
+"""Greatest number of Newton steps. About 30 steps are usual."""
 DIAGONAL_FACTOR = 1.0 + 1e-12
-"""Factor on the diagonal that keeps the system positive definite despite rounding."""
+"""Factor for the diagonal, so that the system remains positive definite despite rounding."""
 
 
 class Derivatives(NamedTuple):
@@ -64,7 +67,7 @@ class Derivatives(NamedTuple):
 def _coordinate_derivatives(samples: Array, sigma: float, q: Array) -> None:
     """Write the first four derivatives of the coordinates with respect to sigma, (m, 4).
 
-    Between samples, the first derivative is a cubic.
+    Between samples, the first derivative is interpolated by a cubic polynomial.
     """
     cells = len(samples) - 1
     k = min(max(int(sigma * cells), 0), cells - 1)
@@ -81,7 +84,7 @@ def _coordinate_derivatives(samples: Array, sigma: float, q: Array) -> None:
 
 @compiled()
 def _spline_weights(u: float, h: float, out: Array) -> None:
-    """Write the weights (4, 4) that give sigma, v, a, j from the coefficients, at a share u of an interval."""
+    """Write the matrix (4, 4) that converts coefficients to sigma, v, a, j, at the fraction u of an interval."""
     w = 1.0 - u
     out[0, 0], out[0, 3] = w**3 / 6.0, u**3 / 6.0
     out[0, 1], out[0, 2] = (4.0 - 3.0 * u**2 * (2.0 - u)) / 6.0, (4.0 - 3.0 * w**2 * (2.0 - w)) / 6.0
@@ -108,7 +111,10 @@ def _spline_state(c: Array, k: int, weights: Array) -> tuple[float, float, float
 
 @compiled()
 def _rate_of_coordinate(q: Array, order: int, v: float, a: float, j: float, by: Array) -> float:
-    """Return velocity, acceleration or jerk (order 0, 1, 2) of a coordinate; write its gradient in sigma, v, a, j."""
+    """Return velocity, acceleration or jerk (order 0, 1, 2) of a coordinate.
+
+    The derivatives of the result with respect to sigma, v, a, j are written to `by`.
+    """
     value: float
     if order == 0:
         by[0], by[1], by[2], by[3] = q[1] * v, q[0], 0.0, 0.0
@@ -125,9 +131,10 @@ def _rate_of_coordinate(q: Array, order: int, v: float, a: float, j: float, by: 
 
 @compiled()
 def _add_derivatives(out: Derivatives, k: int, chain: Array, slope: Array, curvature: Array) -> None:
-    """Add derivatives with respect to sigma, v, a, j, (4,) and (4, 4), to those with respect to the unknowns.
+    """Convert derivatives with respect to sigma, v, a, j by the chain rule, and add them to `out`.
 
-    `chain` (4, 5) holds the derivatives of sigma, v, a, j with respect to the unknowns.
+    `slope` (4,) and `curvature` (4, 4) are first and second derivatives with respect to sigma, v, a, j. `chain` (4, 5)
+    holds the derivatives of sigma, v, a, j with respect to the unknowns.
     """
     free = len(out.gradient)
     of_x = np.empty(4)
@@ -162,7 +169,10 @@ def _add_derivatives(out: Derivatives, k: int, chain: Array, slope: Array, curva
 
 @compiled()
 def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives) -> float:
-    """Return the barrier and write its derivatives. At a limit it is infinite, and no derivatives are written."""
+    """Return the value of the barrier and write its derivatives.
+
+    At or beyond a limit, the result is infinite, and the derivatives are not valid.
+    """
     q, by = np.empty((len(limits), 4)), np.empty(4)
     weights, chain = np.empty((4, COEFFICIENTS_PER_INTERVAL)), np.empty((4, COEFFICIENTS_PER_INTERVAL + 1))
     slope, curvature = np.empty(4), np.empty((4, 4))
@@ -172,7 +182,7 @@ def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives
     for part in range(CHECKS_PER_INTERVAL + 1):
         _spline_weights(part / CHECKS_PER_INTERVAL, h, weights)
         chain[:, :COEFFICIENTS_PER_INTERVAL] = weights
-        # At the end of an interval, only the jerk differs from that at the start of the next interval.
+        # Only the jerk differs between the end of an interval and the start of the next interval.
         lowest = 2 if part == CHECKS_PER_INTERVAL else 0
         for k in range(len(c) - END_COEFFICIENTS):
             sigma, v, a, j = _spline_state(c, k, weights)
@@ -205,7 +215,7 @@ def _barrier(samples: Array, limits: Array, c: Array, h: float, out: Derivatives
 
 @compiled()
 def _factorise(band: Array) -> bool:
-    """Replace a banded matrix by its Cholesky factor. Return whether the matrix is positive definite."""
+    """Replace a banded matrix by its Cholesky factor. Return False if the matrix is not positive definite."""
     for row in range(len(band)):
         for d in range(min(COEFFICIENTS_PER_INTERVAL - 1, row), -1, -1):
             rest = band[row, d]
@@ -236,7 +246,10 @@ def _substitute(band: Array, x: Array) -> None:
 
 @compiled()
 def _newton_step(at: Derivatives, mu: float, step: Array) -> tuple[float, float]:
-    """Write the Newton step for the coefficients; return the step in ln h and the predicted gain (NaN if singular)."""
+    """Write the Newton step of the coefficients. Return the step of ln h, and the predicted gain.
+
+    The predicted gain is NaN if the system is not positive definite.
+    """
     at.band[:, 0] *= DIAGONAL_FACTOR
     if not _factorise(at.band):
         return 0.0, math.nan
@@ -266,9 +279,9 @@ def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
     limits : (m, 3)
         Velocity, acceleration and jerk limits of the coordinates.
     c : (n + 3,)
-        Coefficients of a law within the limits. They are improved in place.
+        Input: coefficients of a law within the limits. Output: coefficients of the result.
     h : float
-        Duration of the law's intervals [s].
+        Duration of the intervals of the given law [s].
 
     Returns
     -------
@@ -305,7 +318,7 @@ def minimise_time(samples: Array, limits: Array, c: Array, h: float) -> float:
 
 @compiled("f8(f8[:, :, ::1], f8[:, ::1], f8[::1], f8)")
 def limit_excess(samples: Array, limits: Array, c: Array, h: float) -> float:
-    """Return the factor by which a law must be slowed to fit the limits. The parameters are those of minimise_time."""
+    """Return the factor by which a law must be slowed to fit the limits; see minimise_time for the parameters."""
     q, by, weights, most = np.empty((len(limits), 4)), np.empty(4), np.empty((4, COEFFICIENTS_PER_INTERVAL)), 0.0
     for part in range(CHECKS_PER_INTERVAL + 1):
         _spline_weights(part / CHECKS_PER_INTERVAL, h, weights)

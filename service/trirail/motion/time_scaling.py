@@ -1,4 +1,4 @@
-"""Laws of time along a path: constant rates, and rate changes within the limits of sliders and platform."""
+"""Laws of the time along a path: constant rates, and changes of the rate within the limits of sliders and platform."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from trirail.motion.runs import LawState, Run, arrival_time, law_from_ruckig
 
 FINE_RATIO, COARSE_RATIO = 0.88, 0.6
 CHANGE_SHARES = (*(FINE_RATIO**k for k in range(12)), *(FINE_RATIO**11 * COARSE_RATIO**k for k in range(1, 9)))
-"""Shares of the quickest rate change, tried in turn. The smaller the share, the longer the stop. The steps are
-therefore fine for quick stops, and coarse where a robot with weak sliders needs any stop at all."""
+"""Fractions of the quickest change of rate, which are tried in turn. A smaller fraction gives a longer stop. The steps
+between the fractions are fine for quick stops. They are coarse for long stops, which only robots with low slider limits
+need."""
 
 
 class TimeScaling:
-    """Laws of time for the paths of one robot."""
+    """Generator of laws for the paths of one robot."""
 
     def __init__(self, geometry: Geometry, checker: Checker, period: float) -> None:
         self._legs = geometry.packed()
@@ -28,23 +29,27 @@ class TimeScaling:
         self._period = period
         self._ruckig = Ruckig(1)
         velocity, acceleration, jerk = checker.law_limits.T
-        # Derivatives of the rate [1/s, 1/s²] at which a motion at full speed reaches the platform's limits.
+        # First and second derivative of the rate at which a motion at full speed reaches the platform's limits
+        # [1/s, 1/s²].
         self._change = float((acceleration / velocity).min())
         self._change_jerk = float((jerk / velocity).min())
 
     def start_run(self, path: Path, rate: float, pose: Sequence[float]) -> Run:
-        """Return the run of a path at a rate, or at the greatest rate that the limits allow."""
+        """Return a run along a path at a constant rate. A rate that exceeds the limits is lowered."""
         rate = self.possible_rate(path, rate, pose)
         return Run(self._legs, path, constant_law(rate), rate)
 
     def possible_rate(self, path: Path, rate: float, pose: Sequence[float]) -> float:
-        """Return `rate`, or the greatest rate at which the whole path fits the limits if that is lower."""
+        """Return the lower of `rate` and the greatest rate at which the whole path fits the limits."""
         return (
             rate if rate <= 1.0 else greatest_rate(rate, self.sample(path, constant_law(1.0), 0.0, path.duration, pose))
         )
 
     def stop(self, run: Run, pose: Sequence[float], shares: Sequence[float]) -> Path | None:
-        """Return the first law that stops a run within the limits, trying the shares in turn; None if no share fits."""
+        """Return a law that stops a run within the limits; None if there is none.
+
+        `shares` are fractions of the quickest stop, which are tried in turn.
+        """
         for share in shares:
             law = self.ramp(run.law_state, 0.0, share)
             if (
@@ -55,7 +60,7 @@ class TimeScaling:
         return None
 
     def last_new_time(self, run: Run, law: Path, rate: float) -> float:
-        """Return the time up to which a law to a rate must be sampled [s]; the motion does not change after it."""
+        """Return the time until which a law must be sampled [s]. Later, the rate is constant or the path is over."""
         return min(arrival_time(law, rate, run.path.duration), float(law.knots[-2]) + self._period)
 
     def sample(self, path: Path, law: Path, first: float, until: float, pose: Sequence[float]) -> SampleResult:
@@ -63,10 +68,10 @@ class TimeScaling:
         return self._checker.sample(path, law, first, until, pose)
 
     def ramp(self, at: LawState, rate: float, share: float) -> Path | None:
-        """Return the law from a state to a rate, at a share of the quickest change; None if there is none.
+        """Return a law from the state `at` to a rate; None if there is none.
 
-        A falling rate needs enough jerk to level out before it becomes negative, so there may be no law for a small
-        share.
+        `share` is the fraction of the quickest change. If the rate is already falling, a small fraction may not be
+        enough to prevent the rate from becoming negative. In this case, there is no law.
         """
         request = InputParameter(1)
         request.control_interface = ControlInterface.Velocity
@@ -82,9 +87,9 @@ class TimeScaling:
 
 
 def greatest_rate(rate: float, result: SampleResult) -> float:
-    """Return `rate`, or the greatest rate that a path allows if that is lower, given its samples at the nominal rate.
+    """Return the lower of `rate` and the greatest rate that a path allows, given the samples of the path at rate 1.
 
-    Every path fits at rate 1. A higher rate uses the part of the limits that the path leaves free.
+    Every path fits the limits at rate 1. A higher rate is possible if the path does not use its limits completely.
     """
     return (
         min(rate, max(1.0, 1.0 / result.slowdown_factor))

@@ -1,4 +1,4 @@
-"""Named tools and work frames."""
+"""Conversion of the names of tools and work frames in goals to coordinates."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from trirail.wire.goals import Tool
 
 
 class NamedFrames:
-    """Tools and work frames of one robot."""
+    """Named tools and work frames from the configuration of one robot."""
 
     def __init__(self, table: FramesTable) -> None:
         self._table = table
 
     def frame(self, name: str) -> Triple:
-        """Return a frame: x, y [m] and angle [rad] in the base frame. Raises RefusedError if the name is unknown."""
+        """Return the pose of a frame, x, y [m] and angle [rad], in the base frame. Raises RefusedError if unknown."""
         if name == BASE:
             return 0.0, 0.0, 0.0
         entry = self._table.work.get(name)
@@ -29,7 +29,7 @@ class NamedFrames:
         return entry
 
     def tool(self, tool: Tool | None) -> tuple[float, float]:
-        """Return a tool as a point of the platform in its own frame [m]. Raises RefusedError if the name is unknown."""
+        """Return the position of a tool in the platform's frame [m]. Raises RefusedError if the name is unknown."""
         if not isinstance(tool, str):
             return tool or NO_TOOL
         entry = self._table.tool.get(tool)
@@ -39,12 +39,12 @@ class NamedFrames:
 
 
 def tool_point(tool: Tool | None) -> tuple[float, float]:
-    """Return the tool of a resolved goal as a point of the platform [m].
+    """Return the tool of a resolved goal as a point in the platform's frame [m]; the centre if the goal has no tool.
 
     Raises
     ------
     TypeError
-        The tool is still a name.
+        The tool is a name, because the goal has not been resolved.
     """
     if isinstance(tool, str):
         raise TypeError(f"tool {tool!r} of a resolved goal is a name, not a point")
@@ -60,6 +60,6 @@ def rotated(x: float, y: float, angle: float) -> tuple[float, float]:
 
 
 def unknown_name(kind: str, name: str, known: Sequence[str]) -> RefusedError:
-    """Return the error that refuses an unknown tool or frame and lists the known names."""
+    """Return the error for an unknown tool or frame, with a list of the known names."""
     there_are = f"there is {', '.join(known)}" if known else "there is none in [frames.tool]: give a point, [u, v]"
     return RefusedError(RefusalCode.UNKNOWN_FRAME, f"no {kind} {name!r}: {there_are}")

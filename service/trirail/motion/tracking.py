@@ -1,8 +1,10 @@
-"""Planning of motion towards a moving target: smooth if the target is near, as fast as the limits allow if it is far.
+"""Planning of the motion of a track, which follows a moving target.
 
-The planner assumes that the target keeps its velocity. In the frame that moves with the target, the motion that meets
-it ends at rest at the origin. Accelerations and jerks are the same in this frame, and velocity limits are shifted by
-the velocity of the target. Every path ends at rest, so the robot brakes if no further target reports arrive.
+The motion is smooth if the target is near, and as fast as the limits allow if the target is far. The planner assumes
+that the velocity of the target remains constant. In a frame that moves with the target, the motion to the target ends
+at rest at the origin. Accelerations and jerks are the same in this frame, and the velocity limits are shifted by the
+velocity of the target. Every path ends at rest. The robot therefore brakes if no further reports about the target
+arrive.
 """
 
 from __future__ import annotations
@@ -24,23 +26,24 @@ from trirail.motion.ruckig_call import Kinodynamic, solve_within
 from trirail.motion.runs import ZERO_RATES, MotionState, cut, from_ruckig, joined, nominal_motion
 
 CATCH_UP_S = 0.05
-"""Shortest duration of a smooth motion to the target [s]. The platform lags 0.15 a CATCH_UP_S² behind a target with
-acceleration a. A shorter duration follows the target more closely, but passes on more of its noise."""
+"""Shortest duration of a smooth motion to the target [s]. The platform lags behind a target with acceleration a by
+0.15 a CATCH_UP_S². With a shorter duration, the platform would follow more closely, but would also follow more of the
+noise in the reports."""
 SMOOTH_DURATION_FACTOR = 1.25
-"""Shortest duration of a smooth motion to the target, relative to the quickest one. From rest to rest, it then keeps
-the same acceleration and jerk limits with a margin of one fifth."""
+"""Shortest duration of a smooth motion to the target, relative to the quickest motion. From rest to rest, the smooth
+motion then stays within the same acceleration and jerk limits with a margin of one fifth."""
 MAX_REPLANS = 3
-"""Greatest number of plans to meet a target, each with lower limits."""
+"""Greatest number of plans to meet a target. Each plan has lower limits than the previous plan."""
 MAX_SHORTENINGS = 2
-"""Greatest number of times that a path which leaves the workspace is shortened."""
+"""Greatest number of times that a path is shortened because it leaves the workspace."""
 BORDER_BISECTIONS = 12
-"""Number of bisection steps on the line to a target out of reach, to find the last pose within reach."""
+"""Number of bisection steps to find the last pose within reach on the line to a target that is out of reach."""
 
 
 class _TrackTarget(NamedTuple):
-    """Target within reach: its pose at the start of the path, and its constant velocity.
+    """Target within reach, with its pose at the start of the path and its constant velocity.
 
-    `bound` names the limit that the requested target exceeds.
+    `bound` is the name of the limit that the requested target exceeds, or None.
     """
 
     pose: Sequence[float]
@@ -49,7 +52,7 @@ class _TrackTarget(NamedTuple):
 
 
 class Tracker:
-    """Planner of motion towards moving targets, within the limits of platform and sliders."""
+    """Planner of motions towards moving targets, within the limits of platform and sliders."""
 
     def __init__(self, planner: PathPlanner) -> None:
         self._planner, self._platform = planner, planner.platform
@@ -57,10 +60,10 @@ class Tracker:
         self._ruckig = Ruckig(3)
 
     def follow(self, start: MotionState, pose: Sequence[float], velocity: Sequence[float], hold: float) -> Plan:
-        """Plan to meet a target, move at its velocity, and then stop.
+        """Plan a motion that meets a target, moves at the velocity of the target, and then stops.
 
-        If the target is too fast, the platform follows it as fast as the limits allow. If the target is out of reach,
-        the platform follows it up to the border, on a straight line from the platform.
+        If the target is too fast, the platform follows as fast as the limits allow. If the target is out of reach, the
+        platform moves on the straight line towards the target, as far as the workspace allows.
 
         Parameters
         ----------
@@ -69,7 +72,7 @@ class Tracker:
         pose, velocity : (3,)
             Pose and velocity of the target at the start of the path [m, rad, m/s, rad/s].
         hold : float
-            Time after which the path brakes, even if it has not met the target [s].
+            Time after which the platform brakes, even if it has not met the target [s].
 
         Raises
         ------
@@ -90,7 +93,10 @@ class Tracker:
     def _reachable_targets(
         self, start: MotionState, pose: Sequence[float], velocity: Sequence[float]
     ) -> Iterator[_TrackTarget]:
-        """Yield the target, clipped to the platform's limits, then the last pose within reach on the line to it."""
+        """Yield two targets to try: the target clipped to the platform's limits, and the last pose within reach.
+
+        The last pose within reach is on the straight line from the platform to the clipped target.
+        """
         low, high = self._bounds.box
         met = np.add(pose, CATCH_UP_S * np.array(velocity))
         inside = np.clip(met, low, high)
@@ -102,7 +108,10 @@ class Tracker:
         yield _TrackTarget(border, ZERO_RATES, bound)
 
     def _border(self, pose: Sequence[float], target: Array) -> tuple[Sequence[float], str | None]:
-        """Return the last pose within reach on the line to another pose, and the name of the limit there."""
+        """Return the last pose within reach on the line from `pose` to `target`, and the limit that ends the line.
+
+        If the target is within reach, the result is the target and None.
+        """
         begin, way = np.array(pose), target - pose
         low, high = 0.0, 1.0
         bound = self._checker.exceeded_bound(target.tolist())
@@ -119,7 +128,7 @@ class Tracker:
         return border, bound
 
     def _plan_meeting(self, start: MotionState, target: _TrackTarget, hold: float) -> Plan | None:
-        """Plan to meet the target, with lower limits each time, until the path fits. Returns None if it never does."""
+        """Plan a motion that meets the target, if necessary with lower limits. Returns None if no path fits."""
         shares = np.ones(3)
         for _ in range(MAX_REPLANS):
             limits = Kinodynamic(*(np.array(self._platform) * shares[:, None]).tolist())
@@ -147,9 +156,10 @@ class Tracker:
     def _follow_and_brake(
         self, start: MotionState, meeting: Path, velocity: Sequence[float], hold: float
     ) -> tuple[Path, SampleResult, str | None]:
-        """Return the path that meets the target, moves with it until `hold` [s] and brakes; its samples; and a bound.
+        """Extend a path that meets the target: move with the target until `hold` [s], and then brake.
 
-        A path that would leave the workspace after the meeting brakes earlier. The bound is named only in this case.
+        If the path would leave the workspace after it has met the target, it brakes earlier. Returns the path, the
+        result of sampling it, and the name of the limit that makes the path brake earlier, or None.
         """
         way, until, bound = _extend_meeting(meeting, velocity, hold), hold, None
         for _ in range(MAX_SHORTENINGS + 1):
@@ -165,7 +175,7 @@ class Tracker:
     def _quickest_meeting(
         self, start: MotionState, pose: Sequence[float], velocity: Sequence[float], limits: Kinodynamic
     ) -> Path:
-        """Return the quickest path to a target, solved in the frame of the target. Raises RefusedError."""
+        """Return the quickest path to a target, computed in a frame that moves with it. Raises RefusedError."""
         request, trajectory = InputParameter(3), Trajectory(3)
         request.current_position = np.subtract(start.pose, pose).tolist()
         request.current_velocity = np.subtract(start.velocity, velocity).tolist()
@@ -183,13 +193,13 @@ class Tracker:
 
 
 def _smooth_meeting(start: MotionState, pose: Sequence[float], velocity: Sequence[float], duration: float) -> Path:
-    """Return the path that reaches a target in a duration [s] with the least mean square of the jerk."""
+    """Return the path that meets a target after `duration` [s] with the least mean square of the jerk."""
     met = np.add(pose, duration * np.array(velocity))
     return quintic_between(Point(0.0, *start), Point(duration, met.tolist(), velocity, ZERO_RATES))
 
 
 def _extend_meeting(meeting: Path, velocity: Sequence[float], hold: float) -> Path:
-    """Return a path to a target, continued at the target's velocity until `hold` [s]."""
+    """Return a path to a target, extended by a motion at the target's velocity until `hold` [s]."""
     if meeting.duration >= hold:
         return meeting
     going = np.zeros((1, 3, 6))

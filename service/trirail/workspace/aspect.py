@@ -1,6 +1,7 @@
-"""Bounds of the aspect in which the robot works: angles that are singular for any centre G, and zeros of det J2.
+"""Bounds of the aspect (the region without singular poses) in which the robot works.
 
-This module uses plain numpy, so that drawing a workspace does not need the compiled kinematics.
+The bounds are angles that are singular for any centre G, and zeros of det J2. This module uses numpy only. Plots of the
+workspace therefore do not need the compiled kinematics.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ def det_j2_rows(geometry: Geometry, phi: Array) -> Array:
 
 
 def wall_angles(geometry: Geometry) -> Array:
-    """Return the angles phi [rad] that are singular for any G; they repeat every pi.
+    """Return the angles phi, modulo pi, at which the robot is singular for any G [rad]. These angles are called walls.
 
-    A 3-PRP robot has one such angle per leg, at which the cross slide is parallel to the rail. A 3-PPR robot has a
-    single such angle, which is a zero of det J2, because its det J2 does not depend on G.
+    A 3-PRP robot has one wall per leg, at which the cross slide is parallel to the rail. A 3-PPR robot has a single
+    wall. It is a zero of det J2, which does not depend on G.
     """
     parallel = [leg.parallel_angle for leg in geometry.each]
     known = [phi for phi in parallel if phi is not None]

@@ -1,6 +1,6 @@
-"""Positions of the robot's parts for drawings [m], computed from its geometry and limits.
+"""Positions of the parts of a robot for drawings [m], computed from the geometry and the limits.
 
-Fixed parts are in the base frame. Parts of the platform are in the platform's frame, whose origin is the centre G.
+Fixed parts are in the base frame. Parts of the platform are in the platform's frame, with the origin at the centre G.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from trirail.kinematics.leg import AnyLeg
 
 Points = NDArray[np.float64]
 STOP_LENGTH_SHARE = 0.022
-"""Length of the mark for an end stop, as a share of the longest rail."""
+"""Length of the drawn mark for an end stop, as a fraction of the length of the longest rail."""
 SLEEVE_HALF_LENGTH_SHARE = 0.035
-"""Half the length of the sleeve around an edge of the platform, as a share of the longest rail."""
+"""Half the length of the drawn sleeve on an edge of the platform, as a fraction of the length of the longest rail."""
 TABLE_OVERHANG_SHARE = 0.3
-"""Overhang of a stage's table beyond its supports, as a share of its size."""
+"""Difference between the sizes of a table and of the area of its supports, as a fraction of the latter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotParts:
-    """Parts of the robot. Each line is an array of points (N, 2)."""
+    """Positions of the parts of the robot. Each line is an array of points (N, 2)."""
 
     anchors: Points
     """Start points of the rails (3, 2)."""
@@ -35,25 +35,26 @@ class RobotParts:
     travel: list[Points]
     """Travel of each slider on its rail."""
     stops: list[Points]
-    """Marks across both ends of each travel."""
+    """Marks across the rails at both ends of the travel of each slider."""
     outline: list[Points]
-    """Outline of the platform: the triangle formed by its edges or, if there is none, a table over edges or pivots."""
+    """Outline of the platform: the triangle formed by the edges or, if there is no triangle, a rectangular table."""
     edge_stops: list[Points]
-    """Marks across both ends of each passive joint's travel along its edge of the platform."""
+    """Marks across the edges of the platform at both ends of the travel of each passive joint."""
     arms: list[Points]
     """Lines from the platform's centre to its supports."""
     names: Points
     """Positions of the sliders' labels, on the outer side of the middle of each rail (3, 2)."""
     cross_slides: Points
-    """Start and end of the drawn part of each cross slide, measured along the slide from the carriage (3, 2) [m]."""
+    """Start and end of the drawn part of each cross slide, as distances along the slide from the carriage (3, 2)
+    [m]."""
     bounds: Points
-    """Lowest and highest x and y of all parts at the pose (0, 0, 0); shape (2, 2)."""
+    """Lowest and highest x and y of the rails and of the platform at the pose (0, 0, 0); shape (2, 2)."""
 
     @classmethod
     def from_geometry(cls, geometry: Geometry, limits: SliderLimits) -> RobotParts:
-        """Return the parts of a robot with this geometry and these limits."""
+        """Compute the parts of a robot with the given geometry and limits."""
         legs, ends_of = geometry.each, limits.positions
-        # a rail extends equally far beyond both ends of its slider's travel
+        # a rail begins at the anchor, and is equally long beyond both ends of the slider's travel
         rails = [
             _rail_points(leg, -leg.home, high + (low + leg.home))
             for leg, (low, high) in zip(legs, ends_of, strict=True)
@@ -91,7 +92,7 @@ class RobotParts:
 
 
 def slider_points(geometry: Geometry, position: Points) -> Points:
-    """Return the sliders' points (N, 3, 2) in the base frame for positions lambda_10 (N, 3)."""
+    """Return the points of the carriages (N, 3, 2) in the base frame for positions lambda_10 of the sliders (N, 3)."""
     at = np.empty((*position.shape, 2))
     for k, leg in enumerate(geometry.each):
         at[:, k] = np.array(leg.anchor) + np.outer(leg.home + position[:, k], _unit_vector(leg.rail_angle))
@@ -99,9 +100,10 @@ def slider_points(geometry: Geometry, position: Points) -> Points:
 
 
 def cross_slide_lines(geometry: Geometry, parts: RobotParts, carriages: Points, phi: Points) -> Points:
-    """Return the cross slides as lines (N, 3, 2, 2), for carriages (N, 3, 2) and platform angles (N,).
+    """Return the cross slides as lines (N, 3, 2, 2), for points of the carriages (N, 3, 2) and platform angles (N,).
 
-    The sleeve around an edge turns with the platform, whereas a cross slide mounted on a carriage does not.
+    The sleeve on an edge of the platform (3-PRP) turns with the platform. A cross slide on a carriage (3-PPR) does not
+    turn.
     """
     crossings = [leg.crossing for leg in geometry.each]
     angles = np.outer(phi, [each.turns for each in crossings]) + [each.angle for each in crossings]
@@ -111,9 +113,10 @@ def cross_slide_lines(geometry: Geometry, parts: RobotParts, carriages: Points, 
 
 
 def pivot_points(geometry: Geometry, carriages: Points, poses: Points) -> Points:
-    """Return the pivots (N, 3, 2).
+    """Return the positions of the pivots (N, 3, 2) in the base frame.
 
-    In 3-PRP, the pivots are the carriages (N, 3, 2). In 3-PPR, they are points of the platform at poses (N, 3).
+    In a 3-PRP robot, the pivots are at the points of the carriages (N, 3, 2). In a 3-PPR robot, the pivots are points
+    of the platform, which is at `poses` (N, 3).
     """
     at = carriages.copy()
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -141,19 +144,19 @@ def _edge_points(leg: AnyLeg, *positions: float) -> Points:
 
 
 def _stop_mark(place: Points, angle: float, length: float) -> Points:
-    """Return a mark across a line with this angle [rad] at the point `place` (1, 2)."""
+    """Return a mark at the point `place` (1, 2) across a line with the given angle [rad]."""
     across = length / 2.0 * _unit_vector(angle + math.pi / 2.0)
     return np.concatenate([place - across, place + across])
 
 
 def _outward_normal(leg: AnyLeg, outward: Points) -> Points:
-    """Return the unit vector perpendicular to the rail that points to the side of `outward`."""
+    """Return the unit vector perpendicular to the rail, on the side to which the vector `outward` points."""
     across = _unit_vector(leg.rail_angle + math.pi / 2.0)
     return across if across @ outward >= 0.0 else -across
 
 
 def _edge_intersections(legs: Sequence[AnyLeg]) -> Points | None:
-    """Return the intersections of neighbouring platform edges (3, 2), or None if edges are parallel or missing."""
+    """Return the intersections of the platform's edges (3, 2); None if edges are parallel or there are no edges."""
     corners = []
     for one, other in zip(legs, (*legs[1:], legs[0]), strict=True):
         (point, angle, turns), (beyond, other_angle, _) = one.crossing, other.crossing
@@ -167,7 +170,7 @@ def _edge_intersections(legs: Sequence[AnyLeg]) -> Points | None:
 
 
 def _table_outline(legs: Sequence[AnyLeg]) -> Points:
-    """Return a closed rectangle (5, 2) that covers the centre and the supports of a stage's table."""
+    """Return the outline of a table as a closed rectangle (5, 2) that covers the centre and the supports."""
     held = np.array([(0.0, 0.0), *(leg.crossing.point for leg in legs)])
     low, high = held.min(axis=0), held.max(axis=0)
     beyond = TABLE_OVERHANG_SHARE * float((high - low).max()) / 2.0

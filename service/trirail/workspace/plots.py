@@ -1,4 +1,4 @@
-"""Plot of the workspace: slices at several phi, coloured by conditioning, and their area as a function of phi.
+"""Plot of the workspace: slices at several angles phi, coloured by conditioning, and the area as a function of phi.
 
 This module requires matplotlib.
 """
@@ -33,7 +33,7 @@ COLOURS, SCALE = colormaps["viridis"], Normalize(0.0, 1.0)
 OUTSIDE_OPACITY = 0.35  # opacity of the reachable slice outside the platform's limits
 SLICE_PIXELS = 160  # samples of conditioning along each side of a slice
 MAX_COLUMNS, FIGURE_WIDTH_IN, STRIP_HEIGHT_IN = 4, 13.0, 3.4
-VIEW_REACH_RATIO = 2.5  # the view shows at most this many times the reach, for stages with a large table
+VIEW_REACH_RATIO = 2.5  # greatest ratio of the displayed range to the reach, for stages with long rails
 DASHES = (0, (4, 3))
 MM, CM2 = 1e3, 1e4
 
@@ -41,7 +41,7 @@ MM, CM2 = 1e3, 1e4
 def draw_workspace(
     file: Path, title: str, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
-    """Draw slices of the workspace and their areas into a file, whose suffix selects the format.
+    """Draw slices of the workspace and their areas into a file. The suffix of the file selects the format.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def draw_workspace(
 
 
 def _draw_slice(panel: Axes, geometry: Geometry, limits: Limits, parts: RobotParts, phi: float) -> None:
-    """Draw the slice at one angle, with the rails and with the platform at the origin, turned by this angle."""
+    """Draw the slice at an angle phi, with the rails, and with the platform at the origin and rotated by phi."""
     for rail in parts.rails:
         panel.plot(*(MM * rail.T), color=RAIL, linewidth=4.0, solid_capstyle="round", zorder=1)
     reach, service = reachable_slice(geometry, limits, phi), permitted_slice(geometry, limits, phi)
@@ -136,7 +136,7 @@ def _draw_conditioning(panel: Axes, geometry: Geometry, polygon: Array, phi: flo
 def _draw_areas(
     strip: Axes, geometry: Geometry, limits: Limits, angles: Sequence[float], reach: Extent, service: Extent
 ) -> None:
-    """Draw the area of the slices as a function of phi, and the angles near which every pose is singular."""
+    """Draw the area of the slices as a function of phi, and the singular angles with the singularity margin."""
     low, high = np.degrees(phi_range(geometry))
     margin = math.degrees(limits.singularity_margin)
     for wall, inward in ((low, margin), (high, -margin)):

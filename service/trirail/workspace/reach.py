@@ -1,6 +1,6 @@
-"""Reach from the current pose: outline of the permitted centres at its φ, and distance of φ from a singularity.
+"""Reach at a pose: outline of the permitted centres at the φ of the pose, and distance of φ from a singularity.
 
-Both results are cached for rounded poses, so that a recorder can compute them at any rate.
+Both results are cached for rounded poses. A recorder can therefore request them at a high rate.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from trirail.workspace.part_positions import Points
 from trirail.workspace.workspace import permitted_slice
 
 ANGLE_STEP_RAD = math.radians(0.5)
-"""Step to which φ is rounded when looking up workspace outlines."""
+"""Step to which φ is rounded for cached outlines of the workspace [rad]."""
 CENTRE_STEP_M = 2e-3
-"""Step to which x and y of the centre are rounded when looking up singular angles."""
+"""Step to which x and y of the centre are rounded for cached singular angles [m]."""
 _CACHE_SIZE = 4096
 
 
 class Reach:
-    """Workspace outlines and singular angles of one robot."""
+    """Cache of workspace outlines and singular angles of one robot."""
 
     def __init__(self, geometry: Geometry, limits: Limits) -> None:
         self.outline = lru_cache(_CACHE_SIZE)(lambda step: _closed_outline(geometry, limits, int(step)))
@@ -41,11 +41,11 @@ class Reach:
         )
 
     def outline_indices(self, phi: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of the outlines that belong to angles [rad]."""
+        """Return the argument `step` of `outline` for each of the given angles [rad]."""
         return np.rint(phi / ANGLE_STEP_RAD).astype(np.int64)
 
     def singularity_distance(self, poses: Points) -> NDArray[np.float64]:
-        """Return the distance of φ from the nearest singular angle [rad] for poses (N, 3); shape (N,)."""
+        """Return the distance of φ from the nearest singular angle [rad], (N,), for poses (N, 3)."""
         if self._constant_angles:
             return _least_angle(poses[:, 2], self._singular(0, 0))
         distances = np.empty(len(poses))

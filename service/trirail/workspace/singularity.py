@@ -1,9 +1,9 @@
 """Distance of a pose from a singularity, and conditioning of the Jacobian.
 
-A pose (x, y, phi) consists of the platform's centre G [m] and its angle [rad]. An array holds one pose, shape (3,), or
-N poses, shape (N, 3). Singular poses divide all other poses into aspects; no motion leads from one aspect to another
-without passing a singular pose. The robot works in the aspect of the pose (0, 0, 0), in which each delta_i of J1 and
-det J2 keep the signs that they have at that pose.
+A pose (x, y, phi) consists of the platform's centre G [m] and the angle of the platform [rad]. An array holds one pose,
+shape (3,), or N poses, shape (N, 3). Singular poses divide all other poses into regions, which are called aspects.
+Every motion from one aspect to another passes a singular pose. The robot works in the aspect of the pose (0, 0, 0). In
+this aspect, each delta_i of J1 and det J2 have the same signs as at the pose (0, 0, 0).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ __all__ = [
 ]
 
 HOME = np.zeros(3)
-DET_SAMPLES = 255  # samples of det J2 between two walls
-COINCIDENT_WALLS_RAD = 1e-4  # no pose fits between walls nearer than this
+DET_SAMPLES = 255  # number of samples of det J2 between two walls
+COINCIDENT_WALLS_RAD = 1e-4  # if two walls are closer together, there are no poses between them
 
 
 def sensitivity(geometry: Geometry, pose: ArrayLike) -> Array:
@@ -41,12 +41,12 @@ def sensitivity(geometry: Geometry, pose: ArrayLike) -> Array:
 
 
 def characteristic_length(geometry: Geometry) -> float:
-    """Return the length [m] that makes rotation comparable with translation.
+    """Return the length [m] that makes rotations comparable with translations.
 
-    A rotation by an angle counts as a translation by this length times the angle. At the pose (0, 0, 0), both move the
-    sliders by the same amount in the root mean square over sliders and directions. A symmetric robot is therefore
-    isotropic at that pose, and its length is l0/√6. The length does not depend on the choice of zeros or of points
-    along rails and edges.
+    A rotation by an angle is treated like a translation by this length times the angle. At the pose (0, 0, 0), both
+    cause the same root-mean-square motion of the sliders, averaged over sliders and directions. A symmetric robot is
+    therefore isotropic at the pose (0, 0, 0), and its characteristic length is l0/√6. The length does not depend on the
+    zeros of the joints, or on the choice of points along rails and edges.
     """
     at_home = sensitivity(geometry, HOME)
     return float(math.sqrt(2.0) * np.linalg.norm(at_home[:, 2]) / np.linalg.norm(at_home[:, :2]))
@@ -55,8 +55,8 @@ def characteristic_length(geometry: Geometry) -> float:
 def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = None) -> NDArray[np.float64]:
     """Return the ratio of the smallest to the largest singular value of J1⁻¹ J2, shape () or (N,), dimensionless.
 
-    The ratio is 1 at an isotropic pose and 0 at a singular one. `length` [m] scales the column for phi; the default is
-    the characteristic length. Raises KinematicsError in the same cases as inverse.
+    The ratio is 1 at an isotropic pose and 0 at a singular pose. The column of J1⁻¹ J2 for phi is divided by `length`
+    [m]; the default is the characteristic length. Raises KinematicsError in the same cases as inverse.
     """
     scale = [1.0, 1.0, 1.0 / (characteristic_length(geometry) if length is None else length)]
     values = np.linalg.svd(sensitivity(geometry, pose) * scale, compute_uv=False)
@@ -64,16 +64,16 @@ def conditioning(geometry: Geometry, pose: ArrayLike, length: float | None = Non
 
 
 def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.float64]:
-    """Return the angle [rad] by which the platform can turn in both directions before it is singular, () or (N,).
+    """Return the angle by which the platform can rotate in both directions before it is singular, () or (N,) [rad].
 
-    The angle is the distance in phi to the nearest of singular_angles at the pose's G. It is negative if the pose
-    belongs to an aspect other than that of (0, 0, 0). Like singular_angles, this function can miss two zeros of det J2
-    that are closer together than its samples, which are at most 1.2° apart.
+    This angle is the distance of phi from the nearest of the singular_angles for the G of the pose. The result is
+    negative if the pose is not in the aspect of (0, 0, 0). Like singular_angles, this function can miss two zeros of
+    det J2 that are closer together than the samples of det J2, which have a distance of at most 1.2°.
 
     Raises
     ------
     KinematicsError
-        In the same cases as inverse, and therefore also if J1 is singular.
+        J1 is singular, or a number is not finite.
     """
     at_home, _ = jacobians(geometry, HOME)
     j1, j2 = jacobians(geometry, pose)
@@ -86,7 +86,7 @@ def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.f
     at_walls = np.sort(np.concatenate([wall_angles(geometry) % math.pi + k * math.pi for k in (-2, -1, 0, 1)]))
     above = np.searchsorted(at_walls, poses[:, 2])
     distance = np.minimum(poses[:, 2] - at_walls[above - 1], at_walls[above] - poses[:, 2])
-    for k in np.unique(above):  # no singular angle beyond the neighbouring walls is nearer
+    for k in np.unique(above):  # the nearest singular angle is a wall or between the neighbouring walls
         if at_walls[k] - at_walls[k - 1] > COINCIDENT_WALLS_RAD:
             rows = np.flatnonzero(above == k)
             indices, zeros = _zeros_of_det_j2(geometry, poses[rows], at_walls[k - 1], at_walls[k])
@@ -96,15 +96,18 @@ def distance_to_singularity(geometry: Geometry, pose: ArrayLike) -> NDArray[np.f
 
 
 def _zeros_of_det_j2(geometry: Geometry, poses: Array, low: float, high: float) -> tuple[NDArray[np.intp], Array]:
-    """Return indices of poses, each with a phi between two neighbouring walls at which J2 is singular."""
-    # zeros of det J2 cluster near the walls, so the samples are denser there
+    """Find the zeros of det J2 between two neighbouring walls, for the G of each pose.
+
+    Returns the index of the pose and the angle phi [rad] for each zero.
+    """
+    # zeros of det J2 are most frequent near the walls, and the samples are therefore denser there
     phi = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(np.linspace(0.0, math.pi, DET_SAMPLES + 2)[1:-1])
     ones = np.ones(len(poses))
     negative = np.column_stack([ones, poses[:, :2]]) @ det_j2_rows(geometry, phi).T < 0.0
     rows, columns = np.nonzero(negative[:, 1:] != negative[:, :-1])
     start, end = phi[columns], phi[columns + 1]
     middle = poses[rows]
-    for _ in range(52):  # halvings, one for each bit of a float64
+    for _ in range(52):  # bisection, with one step for each bit of a float64
         middle[:, 2] = (start + end) / 2.0
         as_at_start = (_det_j2(geometry, middle) < 0.0) == negative[rows, columns]
         start, end = np.where(as_at_start, middle[:, 2], start), np.where(as_at_start, end, middle[:, 2])

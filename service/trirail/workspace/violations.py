@@ -1,4 +1,4 @@
-"""Check of a pose against the limits of the robot's own reach."""
+"""Check of a pose against the travel of the joints and the singularity margin."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["violations"]
 
 
 def violations(geometry: Geometry, limits: Limits, pose: ArrayLike) -> list[Violation]:
-    """Return every limit of the robot's own reach that a pose (3,) exceeds, with the value at that pose.
+    """Return a description of every limit that a pose (3,) exceeds, except the limits in limits.platform.
 
-    The limits are those of `reachable_slice`. Raises KinematicsError in the same cases as inverse.
+    These are the limits that bound `reachable_slice`. Raises KinematicsError in the same cases as inverse.
     """
     motion = inverse(geometry, pose)
     exceeded = []

@@ -1,8 +1,8 @@
-"""Workspace: the exact polygon of the possible centres G for one phi, and the extent and volume over all phi.
+"""Workspace: the exact polygon of the possible centres G at an angle phi, and the extent and volume over all phi.
 
-At a fixed phi, the travel of every joint and det J2 are linear in x and y. Each limit is therefore a half-plane, and
-the intersection of all limits is a convex polygon. A half-plane is given by a row r with r @ (1, x, y) >= 0. A polygon
-is an array of vertices (V, 2) [m] in anticlockwise order; an empty polygon has the shape (0, 2).
+At a fixed phi, the positions of the joints and det J2 are linear in x and y. Each limit therefore defines a half-plane,
+and the intersection of all half-planes is a convex polygon. A half-plane is described by a row r with r @ (1, x, y) >=
+0. A polygon is an array of vertices (V, 2) [m] in anticlockwise order; an empty polygon has the shape (0, 2).
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from trirail.workspace.aspect import det_j2_rows, phi_range
 __all__ = ["Extent", "measure_extent", "permitted_slice", "polygon_area", "reachable_slice"]
 
 EMPTY_POLYGON = np.empty((0, 2))
-EDGE_TOLERANCE_M = 1e-13  # a vertex nearer than this to the edge of a half-plane is on the edge
-MARGIN_SAMPLES = np.linspace(-1.0, 1.0, 129)  # samples of det J2 between the ends of the singularity margin
-WALL_CLEARANCE_RAD = 1e-4  # nearer than this to a wall, rounding hides the sign of det J2
-SLOPE_STEP_M = 1e-4  # step of the centre within which as-built errors are nearly linear
-PHI_SLICES = 721  # slices for the integral over phi
+EDGE_TOLERANCE_M = 1e-13  # a vertex that is closer to the edge of a half-plane counts as on the edge
+MARGIN_SAMPLES = np.linspace(-1.0, 1.0, 129)  # angles at which det J2 is sampled, in multiples of the margin
+WALL_CLEARANCE_RAD = 1e-4  # closer to a wall, the sign of det J2 is not reliable because of rounding
+SLOPE_STEP_M = 1e-4  # step for slopes, within which as-built errors are nearly linear
+PHI_SLICES = 721  # number of slices for the integral over phi
 GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 class Extent(NamedTuple):
-    """Workspace over all phi: extents [m, rad], volume [m² rad], greatest slice, and area as a function of phi."""
+    """Workspace over all phi: ranges [m, rad], volume [m² rad], largest slice, and area as a function of phi."""
 
     x: Range
     y: Range
@@ -44,13 +44,13 @@ class Extent(NamedTuple):
 
 
 def reachable_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
-    """Return the polygon (V, 2) [m] of all G that the robot itself can reach at this phi.
+    """Return the polygon (V, 2) [m] of all centres G that the robot can reach at an angle phi.
 
     The polygon is bounded by the travel of the sliders (limits.slider.position), the travel of the cross slides
-    (limits.slider.passive), and the singularity margin: the platform must be able to turn by the margin in either
-    direction and stay in the aspect of (0, 0, 0). Vertices are exact to rounding, with one exception. If det J2 is not
-    monotonic within the margin, as on robots that are far from symmetric, the true limit is a curve. The polygon then
-    circumscribes the curve, and misses at most a 64th of the margin.
+    (limits.slider.passive), and the singularity margin. The latter requires that the platform can rotate by the margin
+    in both directions without leaving the aspect of (0, 0, 0). The vertices are exact except for rounding, with one
+    exception: if det J2 is not monotonic within the margin, as for robots that are far from symmetric, the true
+    boundary is a curve. The polygon then circumscribes the curve, with an error of at most a 64th of the margin.
     """
     phi = math.remainder(phi, 2.0 * math.pi)
     low, high = phi_range(geometry)
@@ -64,14 +64,14 @@ def reachable_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
     unit = np.array([1.0, 0.0, 0.0])
     polygon = _clip(polygon, joints - np.outer(least, unit))
     polygon = _clip(polygon, np.outer(most, unit) - joints)
-    # for a monotonic det J2 the two ends would be enough
+    # if det J2 were always monotonic, the two ends of the margin would be sufficient
     turned = np.clip(phi + margin * MARGIN_SAMPLES, low + WALL_CLEARANCE_RAD, high - WALL_CLEARANCE_RAD)
     sign = np.sign(det_j2_rows(geometry, np.zeros(1))[0, 0])
     return _clip(polygon, sign * det_j2_rows(geometry, turned))
 
 
 def permitted_slice(geometry: Geometry, limits: Limits, phi: float) -> Array:
-    """Return the part of the reachable polygon that is within limits.platform; the service enforces these limits."""
+    """Return the part of the reachable polygon within limits.platform, which the service also enforces."""
     window = limits.platform
     if not window.phi[0] <= phi <= window.phi[1]:
         return EMPTY_POLYGON
@@ -89,9 +89,9 @@ def polygon_area(polygon: Array) -> float:
 
 
 def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geometry, Limits, float], Array]) -> Extent:
-    """Return the extent of `reachable_slice` or `permitted_slice` over all phi.
+    """Return the extent of the workspace over all phi. `section` is `reachable_slice` or `permitted_slice`.
 
-    Extents and the greatest slice are accurate to 1e-9. The volume is integrated by the trapezoidal rule and has a
+    The ranges and the largest slice are accurate to 1e-9. The volume is integrated by the trapezoidal rule and has a
     relative error of about 1e-6. Raises KinematicsError if no pose is within the limits.
     """
 
@@ -102,7 +102,7 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
     filled = np.flatnonzero([len(slice_at(phi)) > 0 for phi in scan])
     if len(filled) == 0:
         raise KinematicsError("no pose is within the limits: widen limits.slider, limits.platform or the margin")
-    first, last = filled[0], filled[-1]  # never an end of the scan: both are singular
+    first, last = filled[0], filled[-1]  # never an end of the scan, because both ends are singular
     angles = np.linspace(
         _last_nonempty_phi(slice_at, scan[first], scan[first - 1]),
         _last_nonempty_phi(slice_at, scan[last], scan[last + 1]),
@@ -134,7 +134,7 @@ def measure_extent(geometry: Geometry, limits: Limits, section: Callable[[Geomet
 
 
 def _joint_rows(geometry: Geometry, phi: float) -> Array:
-    """Return rows (6, 3) for the sliders A, B, C and their cross slides, such that position = row @ (1, x, y) [m]."""
+    """Return rows (6, 3) with position = row @ (1, x, y) [m] for the sliders A, B, C, then for the cross slides."""
     step = 1.0 if geometry.correction is None else SLOPE_STEP_M
     at_zero, *beside = travels(geometry, [[0.0, 0.0, phi], [step, 0.0, phi], [0.0, step, phi]]).swapaxes(0, 1)
     slopes = [(there - at_zero) / step for there in beside]
@@ -142,7 +142,7 @@ def _joint_rows(geometry: Geometry, phi: float) -> Array:
 
 
 def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:
-    """Return the polygon that one leg alone can reach, from the rows of its slider and cross slide (2, 3)."""
+    """Return the polygon that one leg alone can reach. `joints` (2, 3) are the rows of its slider and cross slide."""
     (low, high), (inner, outer) = position, passive
     ends = np.array([[low, inner], [high, inner], [high, outer], [low, outer]])
     corners = np.asarray(np.linalg.solve(joints[:, 1:], (ends - joints[:, 0]).T).T, dtype=np.float64)
@@ -150,9 +150,9 @@ def _parallelogram(joints: Array, position: Range, passive: Range) -> Array:
 
 
 def _clip(polygon: Array, half_planes: Array) -> Array:
-    """Return the part of a convex polygon within all half-planes (K, 3)."""
+    """Return the part of a convex polygon that is inside all half-planes (K, 3)."""
     values = half_planes[:, 0] + polygon @ half_planes[:, 1:].T
-    for offset, *slope in half_planes[(values < -EDGE_TOLERANCE_M).any(axis=0)]:  # most half-planes cut nothing off
+    for offset, *slope in half_planes[(values < -EDGE_TOLERANCE_M).any(axis=0)]:  # most half-planes have no effect
         inside = offset + polygon @ slope
         inside[np.abs(inside) < EDGE_TOLERANCE_M] = 0.0
         if not (inside > 0.0).any():
@@ -177,7 +177,7 @@ def _last_nonempty_phi(slice_at: Callable[[float], Array], nonempty: float, empt
 
 
 def _golden_section_maximum(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Find the only maximum of a function in an interval by golden-section search; return its argument and value."""
+    """Return argument and value of the maximum of a unimodal function in an interval, by golden-section search."""
     inner = high - GOLDEN_RATIO * (high - low), low + GOLDEN_RATIO * (high - low)
     values = function(inner[0]), function(inner[1])
     while high - low > 1e-10:

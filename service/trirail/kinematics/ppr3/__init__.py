@@ -1,1 +1,1 @@
-"""3-PPR mechanism: the cross slide is on the driven carriage and keeps its direction, and the pivot is on top of it."""
+"""3-PPR mechanism: a cross slide of fixed direction is on the driven carriage, and the pivot is on the cross slide."""

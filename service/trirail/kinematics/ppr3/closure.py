@@ -1,4 +1,4 @@
-"""Closed leg of the 3-PPR mechanism, compiled and based on the recursion."""
+"""Compiled loop closure of a leg of the 3-PPR mechanism, based on the recursion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["close", "demand", "line"]
 
 @compiled()
 def close(leg: Array, pose: Vector) -> ClosedLeg:
-    """Solve the loop, linear with phi_32 = phi, for the positions of rail and cross slide that bring G to the pose."""
+    """Return the positions of slider and cross slide at a pose. They follow from a linear equation, as phi_32 = phi."""
     first = link(BASE, leg, 0, 0.0)
     second = link(first, leg, 1, 0.0)
     third = link(second, leg, 2, pose[2])
@@ -28,9 +28,10 @@ def close(leg: Array, pose: Vector) -> ClosedLeg:
 
 @compiled()
 def line(leg: Array, slider: float) -> SlideLine:
-    """Return the line of the cross slide for the position of its slider.
+    """Return the line of the cross slide for a position of the slider.
 
-    The cross slide keeps its normal while the arm e from G to the pivot turns: n . G = n . carriage - n . R(phi) e.
+    The normal n of the cross slide is constant, and the arm e from G to the pivot rotates with the platform: n . G =
+    n . carriage - n . R(phi) e.
     """
     first = link(BASE, leg, 0, slider)
     second = link(first, leg, 1, 0.0)
@@ -43,5 +44,5 @@ def line(leg: Array, slider: float) -> SlideLine:
 
 @compiled()
 def demand(line: SlideLine, cosine: float, sine: float) -> tuple[Vector, Vector, float]:
-    """Return the normal and the direction of the cross slide, and the n . G that the leg requires at phi."""
+    """Return normal n and direction of the cross slide, and the value that the leg requires for n . G at phi."""
     return line.n, line.u, line.a * cosine + line.b * sine - line.c

@@ -1,10 +1,12 @@
-"""A leg of the 3-PPR mechanism: rail, cross slide on the carriage that keeps its direction, pivot under the platform.
+"""Leg of the 3-PPR mechanism: a rail, a cross slide of fixed direction on the carriage, and a pivot under the platform.
 
-With u(a) = (cos a, sin a), the platform's centre G and its rotation R(phi), the leg closes the loop
+With u(a) = (cos a, sin a), the platform's centre G and the rotation R(phi) of the platform, the loop equation of the
+leg is
 
     anchor + (home + lambda_10) u(rail_angle) + lambda_21 u(slide_angle) = G + R(phi) pivot
 
-so with n across the cross slide, n . u lambda_10 = n . (G + R(phi) pivot - anchor - home u): linear in G.
+With n as the normal of the cross slide, n . u lambda_10 = n . (G + R(phi) pivot - anchor - home u) follows. This
+equation is linear in G.
 """
 
 from __future__ import annotations
@@ -26,16 +28,17 @@ __all__ = ["CrossLeg"]
 
 @dataclass(frozen=True, slots=True)
 class CrossLeg:
-    """Leg with a slider on a rail of the base. It carries a cross slide, on which a pivot of the platform moves.
+    """Leg with a slider on a rail of the base. The slider carries a cross slide, along which a platform pivot moves.
 
-    `anchor` is a point of the rail and `rail_angle` is its direction. The slider reads zero at the distance `home` from
-    the anchor. `pivot` is in the platform's frame, and `slide_angle` is the direction of the cross slide in the base
-    frame; None means at right angles to the rail.
+    `anchor` is a point of the rail and `rail_angle` is the direction of the rail. The slider reads zero at the distance
+    `home` from the anchor. `pivot` is in the platform's frame. `slide_angle` is the direction of the cross slide in the
+    base frame; if it is None, the cross slide is at right angles to the rail.
     """
 
     KIND: ClassVar[str] = "3-PPR"
-    # Moving the anchor only changes `home` and the zero of lambda_21, so it is not calibrated. If the cross slide is at
-    # right angles to its rail, the poses do not determine the angle of the rail, which is left open.
+    # A displacement of the anchor only changes `home` and the zero of lambda_21. The anchor is therefore not
+    # calibrated. If the cross slide is at right angles to its rail, measured poses do not determine the angle of the
+    # rail, and calibration reports it as undetermined.
     PARAMETERS: ClassVar[tuple[str, ...]] = ("rail_angle", "home", "pivot in x", "pivot in y", "slide_angle")
     DOUBT: ClassVar[tuple[float, ...]] = (0.05, 0.01, 0.01, 0.01, 0.05)
     CROSS: ClassVar[str] = "cross slide"
@@ -56,7 +59,7 @@ class CrossLeg:
 
     @property
     def parallel_angle(self) -> None:
-        """None, because cross slide and rail keep the angle between them."""
+        """None, because the angle between cross slide and rail is constant."""
         return None
 
     @property
@@ -70,7 +73,7 @@ class CrossLeg:
         return CrossSlide(self.pivot, self.cross_angle, False)
 
     def keys(self) -> dict[str, Any]:
-        """Return the numbers of the leg, by their keys in [[geometry.leg]] [m, rad]."""
+        """Return the numbers of the leg [m, rad] under their keys in [[geometry.leg]]."""
         return asdict(self)
 
     def check(self, name: str) -> None:
@@ -87,7 +90,8 @@ class CrossLeg:
     def packed(self) -> Array:
         """Return the leg as joints for trirail.kinematics.recursion, with shape (4, 13)."""
         start = np.array([*self.anchor, 0.0]) + self.home * theta(self.rail_angle)[0]
-        # Each prismatic joint's z axis is its direction; THETA_1 takes x to z, and its transpose back.
+        # The z axis of a prismatic joint is its direction of motion. THETA_1 maps x to z, and its transpose maps z to
+        # x.
         return serial_leg(
             [
                 Joint("prismatic", THETA_1 @ theta(self.rail_angle), start),
@@ -109,19 +113,19 @@ class CrossLeg:
         return slider, (rail_x * way_y - rail_y * way_x) / delta
 
     def row(self, pose: tuple[float, float, float]) -> tuple[float, Array]:
-        """Return the leg's diagonal element of J1 and its row (3,) of J2, (16)."""
+        """Return the diagonal element of J1 and the row (3,) of J2, (16), that belong to this leg."""
         x, y = math.cos(self.cross_angle), math.sin(self.cross_angle)
         lever = self.lever((pose[0], pose[1]), np.array([pose[2]]))
         return math.sin(self.cross_angle - self.rail_angle), np.array([y, -x, lever[0]])
 
     def lever(self, centre: tuple[float, float], phi: Array) -> Array:  # noqa: ARG002 - as of every leg
-        """Return u(cross_angle) . (-R(phi) pivot), the last element of the leg's row of J2 [m], wherever G is."""
+        """Return the last element of the row of J2 of this leg, u(cross_angle) . (-R(phi) pivot) [m], for any G."""
         angle = phi - self.cross_angle
         element: Array = -(self.pivot[0] * np.cos(angle) - self.pivot[1] * np.sin(angle))
         return element
 
     def corrected(self, corrections: Sequence[float]) -> CrossLeg:
-        """Return the leg with corrections to its PARAMETERS."""
+        """Return a copy of the leg with corrections added to its PARAMETERS."""
         rail_angle, home, pivot_x, pivot_y, slide_angle = corrections
         return CrossLeg(
             anchor=self.anchor,
@@ -132,7 +136,7 @@ class CrossLeg:
         )
 
     def parameter_derivatives(self, first: CrossLeg, phi: Array, slider: Array, passive: Array) -> Array:  # noqa: ARG002
-        """Return the derivatives of F by corrections to the leg: (N, 5).
+        """Return the derivatives of F with respect to corrections of the leg, (N, 5).
 
         With n = (sin, -cos)(cross_angle), F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R pivot) = 0.
         """

@@ -1,4 +1,4 @@
-"""Closed leg of the 3-PRP mechanism, compiled and based on the recursion."""
+"""Compiled loop closure of a leg of the 3-PRP mechanism, based on the recursion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["close", "demand", "line"]
 
 @compiled()
 def close(leg: Array, pose: Vector) -> ClosedLeg:
-    """Solve (11), linear with phi_21 = phi by (8), for the positions of rail and edge that bring G to the pose."""
+    """Return the positions of slider and edge at a pose. With phi_21 = phi, (8), equation (11) is linear in them."""
     first = link(BASE, leg, 0, 0.0)
     third = link(link(first, leg, 1, pose[2]), leg, 2, 0.0)
     rail, edge = first.q[2], third.q[2]
@@ -28,9 +28,9 @@ def close(leg: Array, pose: Vector) -> ClosedLeg:
 
 @compiled()
 def line(leg: Array, slider: float) -> SlideLine:
-    """Return the edge before the platform turns, and the pin through which the slider makes the edge pass.
+    """Return the line of the edge at phi = 0 for a position of the slider. The edge passes through the slider's pin.
 
-    The normal turns with the platform, and n . (pin - G) = c at every phi.
+    The normal n of the edge rotates with the platform. At every phi, n . (pin - G) = c.
     """
     first = link(BASE, leg, 0, slider)
     third = link(link(first, leg, 1, 0.0), leg, 2, 0.0)
@@ -43,7 +43,7 @@ def line(leg: Array, slider: float) -> SlideLine:
 
 @compiled()
 def demand(line: SlideLine, cosine: float, sine: float) -> tuple[Vector, Vector, float]:
-    """Return the normal and the direction of the edge at phi, and the n . G that the leg requires there."""
+    """Return the normal n and the direction of the edge at phi, and the value that the leg requires for n . G."""
     n = add(scale(cosine, line.n), scale(sine, line.u))
     u = subtract(scale(cosine, line.u), scale(sine, line.n))
     return n, u, dot(n, line.point) - line.c

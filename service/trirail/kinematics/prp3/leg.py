@@ -1,6 +1,7 @@
-"""A leg of the 3-PRP mechanism: rail, pivot on the carriage, cross slide along an edge of the platform.
+"""Leg of the 3-PRP mechanism: a rail, a pivot on the carriage, and a cross slide along an edge of the platform.
 
-With u(a) = (cos a, sin a), the platform's centre G and its rotation R(phi), the leg closes the loop (9), (11):
+With u(a) = (cos a, sin a), the platform's centre G and the rotation R(phi) of the platform, the loop equation of the
+leg, (9) and (11), is
 
     anchor + (home + lambda_10) u(rail_angle) + lambda_32 u(phi + edge_angle) = G + R(phi) edge_point
 """
@@ -26,14 +27,14 @@ __all__ = ["Leg"]
 class Leg:
     """Leg with a slider on a rail of the base. The slider carries a pin, along which an edge of the platform slides.
 
-    `anchor` is a point of the rail and `rail_angle` is its direction. The slider reads zero at the distance `home` from
-    the anchor. `edge_point` is the point of the platform that is at the pin when lambda_32 is zero, and `edge_angle` is
-    the direction of the edge; both are in the platform's frame.
+    `anchor` is a point of the rail and `rail_angle` is the direction of the rail. The slider reads zero at the distance
+    `home` from the anchor. `edge_point` is the point of the platform that is at the pin when lambda_32 is zero, and
+    `edge_angle` is the direction of the edge. Both are in the platform's frame.
     """
 
     KIND: ClassVar[str] = "3-PRP"
-    # Moving the anchor along its rail only changes `home`, and moving the edge point along its edge only changes the
-    # zero of lambda_32. Neither is therefore calibrated.
+    # A displacement of the anchor along the rail only changes `home`. A displacement of the edge point along the edge
+    # only changes the zero of lambda_32. These displacements are therefore not calibrated.
     PARAMETERS: ClassVar[tuple[str, ...]] = (
         "anchor across the rail",
         "rail_angle",
@@ -57,7 +58,7 @@ class Leg:
 
     @property
     def parallel_angle(self) -> float:
-        """Angle phi at which the edge is parallel to the rail, as it is every pi [rad]."""
+        """Angle phi at which the edge is parallel to the rail, modulo pi [rad]."""
         return self.rail_angle - self.edge_angle
 
     @property
@@ -71,7 +72,7 @@ class Leg:
         return CrossSlide(self.edge_point, self.edge_angle, True)
 
     def keys(self) -> dict[str, Any]:
-        """Return the numbers of the leg, by their keys in [[geometry.leg]] [m, rad]."""
+        """Return the numbers of the leg [m, rad] under their keys in [[geometry.leg]]."""
         return asdict(self)
 
     def check(self, name: str) -> None:
@@ -90,7 +91,7 @@ class Leg:
         start = np.array([*self.anchor, 0.0]) + self.home * theta(self.rail_angle)[0]
         to_centre = theta(self.edge_angle) @ [-self.edge_point[0], -self.edge_point[1], 0.0]
         return serial_leg(
-            [  # (2), with theta_2 for the angle between this leg's rail and edge
+            [  # (2), with theta_2 as the rotation by the angle between rail and edge of this leg
                 Joint("prismatic", THETA_1 @ theta(self.rail_angle), start),
                 Joint("revolute", THETA_1.T),
                 Joint("prismatic", THETA_1 @ theta(self.edge_angle - self.rail_angle)),
@@ -110,10 +111,10 @@ class Leg:
             return pin - self.home, edge_x * (way_x - pin * rail_x) + edge_y * (way_y - pin * rail_y)
 
     def row(self, pose: tuple[float, float, float]) -> tuple[float, Array]:
-        """Return the leg's diagonal element of J1 and its row (3,) of J2, (16), up to a common sign.
+        """Return the diagonal element of J1 and the row (3,) of J2, (16), that belong to this leg, up to a common sign.
 
-        They follow from (11) after eliminating lambda_32: the sine between the edge and the line from the slider's pin
-        to G + R(phi) edge_point stays zero.
+        They follow from (11) by eliminating lambda_32: the edge always passes through the pin of the slider, and the
+        velocity of the edge relative to the pin has no component across the edge.
         """
         x, y, phi = pose
         edge = theta(phi + self.edge_angle)[:2, :2]  # along the edge, and across it
@@ -125,7 +126,7 @@ class Leg:
         return delta, np.array([*edge[1], sideways - edge[0] @ (way - pin)])
 
     def lever(self, centre: tuple[float, float], phi: Array) -> Array:
-        """Return beta_3 of (18) [m], with the slider's position replaced by its solution of (11)."""
+        """Return beta_3 of (18) [m]. The position of the slider is eliminated by (11)."""
         rail, edge = self.rail_angle, self.edge_angle
         x, y = self.anchor[0] - centre[0], self.anchor[1] - centre[1]
         to_rail = y * math.cos(rail) - x * math.sin(rail)
@@ -135,7 +136,7 @@ class Leg:
         return element
 
     def corrected(self, corrections: Sequence[float]) -> Leg:
-        """Return the leg with corrections to its PARAMETERS."""
+        """Return a copy of the leg with corrections added to its PARAMETERS."""
         anchor, rail_angle, home, edge_point, edge_angle = corrections
         return Leg(
             anchor=across(self.anchor, self.rail_angle, anchor),
@@ -146,7 +147,7 @@ class Leg:
         )
 
     def parameter_derivatives(self, first: Leg, phi: Array, slider: Array, passive: Array) -> Array:
-        """Return the derivatives of F by corrections to `first`: (N, 5).
+        """Return the derivatives of F with respect to corrections of `first`, (N, 5).
 
         With n as the normal of the edge, F = n . (anchor + (home + lambda_10) u(rail_angle) - G - R edge_point) = 0.
         """

@@ -1,1 +1,1 @@
-"""Planning of each kind of goal, with one module per kind. goal_planner imports all of them."""
+"""Planning of goals, with one module per kind of goal. goal_planner imports all modules of this package."""

@@ -11,13 +11,13 @@ from trirail.wire.kinds.pose import PoseGoal, pose_in_place_of
 
 
 class MoveMotion(GoalMotion[MoveGoal]):
-    """Relative move, which is resolved to a pose goal."""
+    """Planning of relative moves, which are converted to pose goals."""
 
     kind = MoveGoal
 
     @staticmethod
     def resolve(goal: MoveGoal, frames: NamedFrames, source: PoseSource) -> PoseGoal:
-        """Return the pose goal of a move that begins at the pose given by `source`."""
+        """Return a pose goal with the target of the move, which begins at the pose that `source` returns."""
         tool = frames.tool(goal.tool)
         x, y, phi = tool_motion(rest(source(goal.origin)), tool).pose
         turned = phi if goal.frame == PLATFORM else frames.frame(goal.frame)[2]

@@ -1,4 +1,4 @@
-"""Refusal of goals with an unknown pose name. The gateway keeps the named poses."""
+"""Refusal of goals with an unknown pose name. The gateway replaces known names before the goal is planned."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from trirail.wire.kinds.named import NamedGoal
 
 
 class NamedMotion(GoalMotion[NamedGoal]):
-    """Goal with an unknown pose name."""
+    """Refusal of goals with an unknown pose name."""
 
     kind = NamedGoal
 
     @staticmethod
     def resolve(goal: NamedGoal, frames: NamedFrames, source: PoseSource) -> NoReturn:
-        """Refuse the goal, because the gateway has already replaced every known name by its pose."""
+        """Raise RefusedError, because the gateway has already replaced all goals that have a known pose name."""
         del frames, source
         text = f"no pose {goal.name!r}: `trirail poses` lists the saved poses"
         raise RefusedError(RefusalCode.UNKNOWN_POSE, text)

@@ -15,14 +15,14 @@ from trirail.wire.goals import PoseGoal
 
 
 class PoseMotion(GoalMotion[PoseGoal]):
-    """Motion to a pose."""
+    """Planning of motions to a pose."""
 
     kind = PoseGoal
     examples = PoseGoal(0.02, 0.01, 0.1), PoseGoal(-0.01, 0.0, 0.0, blend=0.01)
 
     @staticmethod
     def resolve(goal: PoseGoal, frames: NamedFrames, source: PoseSource) -> PoseGoal:
-        """Return the goal in the base frame, with its tool as a point of the platform."""
+        """Return the goal with its pose in the base frame, and with the tool as a point in the platform's frame."""
         del source
         if goal.frame == PLATFORM:
             raise RefusedError(
@@ -35,7 +35,7 @@ class PoseMotion(GoalMotion[PoseGoal]):
         return structs.replace(goal, **there, tool=frames.tool(goal.tool), frame=BASE)
 
     def check(self, goal: PoseGoal) -> None:
-        """Refuse limits of the goal that exceed those of the platform. Raises RefusedError."""
+        """Raise RefusedError if a limit that the goal requests is higher than the limit of the platform."""
         self._limits(goal)
 
     def plan(self, goal: PoseGoal, start: MotionState, rate: float, begins: float) -> Plan:

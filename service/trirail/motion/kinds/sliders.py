@@ -9,7 +9,7 @@ from trirail.wire.kinds.sliders import SlidersGoal
 
 
 class SlidersMotion(GoalMotion[SlidersGoal]):
-    """Motion to given slider positions."""
+    """Planning of motions to given slider positions."""
 
     kind = SlidersGoal
     examples = (SlidersGoal((0.01, 0.0, 0.0)),)

@@ -12,7 +12,7 @@ from trirail.wire.kinds.track import TrackGoal
 
 
 class TrackMotion(GoalMotion[TrackGoal]):
-    """Motion that follows a moving target."""
+    """Planning of motions that follow a moving target."""
 
     kind = TrackGoal
     examples = (TrackGoal(0.0, 0.0, 0.0, (0.01, 0.0, 0.0), 0.0),)
@@ -22,7 +22,10 @@ class TrackMotion(GoalMotion[TrackGoal]):
         self._tracker = Tracker(planner)
 
     def plan(self, goal: TrackGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan to the pose of the target at the start of the path. Its velocity is converted to the path's own time."""
+        """Plan a motion that follows the target, from the pose that the target has at the start of the path.
+
+        The velocity of the target is converted from real time to the time along the path.
+        """
         rate, late = rate or 1.0, begins - goal.time if goal.time is not None else 0.0
         pose = [at + late * v for at, v in zip(goal.target, goal.velocity, strict=True)]
         plan = self._tracker.follow(start, pose, [v / rate for v in goal.velocity], goal.timeout)

@@ -12,7 +12,7 @@ from trirail.wire.packed_trajectory import PackedTrajectory, packed
 
 
 class PackedMotion(GoalMotion[TrajectoryGoal]):
-    """Trajectory that is packed before it is planned."""
+    """Conversion of trajectories to the packed form, which TrajectoryMotion plans."""
 
     kind = TrajectoryGoal
 
@@ -24,13 +24,13 @@ class PackedMotion(GoalMotion[TrajectoryGoal]):
 
 
 class TrajectoryMotion(GoalMotion[PackedTrajectory]):
-    """Motion through timed points, with a quintic between each two of them."""
+    """Planning of motions through timed points, with a quintic between successive points."""
 
     kind = PackedTrajectory
 
     def plan(self, goal: PackedTrajectory, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan through the points."""
+        """Plan a motion through the points of the trajectory."""
         del rate, begins
         points = [Point(*row) for row in goal.points]
-        first = points[0].t  # a float resolves times since 1970 only to 0.2 µs, but differences are exact
+        first = points[0].t  # subtract: a float resolves times since 1970 only to 0.2 µs, but differences are exact
         return self._planner.plan_trajectory(start, [p._replace(t=p.t - first) for p in points], goal.stretch)

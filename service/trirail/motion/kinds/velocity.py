@@ -12,22 +12,22 @@ from trirail.wire.kinds.velocity import VelocityGoal
 
 
 class VelocityMotion(GoalMotion[VelocityGoal]):
-    """Motion at a constant velocity, which ends at rest after the time-out."""
+    """Planning of jogs, which are motions at a constant velocity that end at rest."""
 
     kind = VelocityGoal
 
     @staticmethod
     def resolve(goal: VelocityGoal, frames: NamedFrames, source: PoseSource) -> VelocityGoal:
-        """Return the goal with its tool as a point of the platform."""
+        """Return the goal with the tool as a point in the platform's frame."""
         del source
         return msgspec.structs.replace(goal, tool=frames.tool(goal.tool))
 
     def check(self, goal: VelocityGoal) -> None:
-        """Refuse velocities above the platform's limits. Raises RefusedError."""
+        """Raise RefusedError if the velocity exceeds the limits of the platform."""
         self._planner.check_velocity((goal.x, goal.y, goal.phi))
 
     def plan(self, goal: VelocityGoal, start: MotionState, rate: float, begins: float) -> Plan:
-        """Plan a motion to the velocity, and then to rest."""
+        """Plan a motion that accelerates to the velocity, and later brakes to rest."""
         del rate, begins
         velocity = goal.x, goal.y, goal.phi
         return self._planner.plan_jog(start, velocity, goal.timeout, tool_point(goal.tool))
