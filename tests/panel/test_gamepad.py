@@ -9,7 +9,8 @@ from collections.abc import Callable
 import pytest
 from chromium import Page, needs_chromium
 from panel.fake_robot import FakeRobot
-from panel.test_page import moves, stands, until
+from panel.test_page import moves, stands
+from waiting import wait_until
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
 
@@ -66,7 +67,7 @@ def test_a_stick_moves_the_robot_while_a_shoulder_button_is_held(
     settle(held)
     assert not robot.sent
     press(held, shoulder)
-    until(lambda: any(robot.velocity), "it moves")
+    wait_until(lambda: any(robot.velocity), "it moves")
     assert [(value > 0) - (value < 0) for value in robot.velocity] == list(signs)
     press(held, shoulder, False)
     stands(robot)
@@ -135,7 +136,7 @@ def test_a_frozen_tab_ends_the_jog_by_its_time_out(held: Page, robot: FakeRobot)
 def test_a_jog_that_the_robot_has_ended_begins_again_only_by_a_new_press(held: Page, robot: FakeRobot) -> None:
     jog(held, robot)
     held.evaluate("document.querySelector('#stop').dispatchEvent(new PointerEvent('pointerdown'))")
-    until(lambda: "stop" in robot.commands, "it stops")
+    wait_until(lambda: "stop" in robot.commands, "it stops")
     stands(robot)
     asked = len(robot.sent)
     settle(held)
@@ -151,7 +152,7 @@ def test_the_other_buttons_stop_and_set_the_speed(held: Page, robot: FakeRobot) 
         press(held, button, False)
         settle(held)
     press(held, EAST)
-    until(lambda: "stop" in robot.commands, "it stops")
+    wait_until(lambda: "stop" in robot.commands, "it stops")
     settle(held)
     assert robot.commands.count("stop") == 1
     assert not robot.sent

@@ -12,8 +12,7 @@ import subprocess
 import sys
 import termios
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from chromium import Page, chromium, needs_chromium
 from processes.test_service import Service, until
 from trirail.client.client import Robot
 from trirail.wire.state import State
+from waiting import wait_until
 
 pytestmark = [pytest.mark.slow, pytest.mark.alone]  # a hand's signs of life have to be in time, through a browser
 
@@ -271,7 +271,7 @@ class Pendant:
             return  # the terminal is closed
 
     def wait_shown(self, words: str) -> None:
-        wait(lambda: words.encode() in self.shown, f"{words!r} in {self.shown!r}")
+        wait_until(lambda: words.encode() in self.shown, f"{words!r} in {self.shown!r}")
 
     @contextmanager
     def holding(self, key: bytes) -> Iterator[None]:
@@ -303,15 +303,8 @@ class Pendant:
                 found.append(os.waitstatus_to_exitcode(status))
             return bool(pid)
 
-        wait(ended, "the pendant ends")
+        wait_until(ended, "the pendant ends")
         return found[0]
-
-
-def wait(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.01)
 
 
 ARROW = b"\x1b[C"

@@ -6,9 +6,9 @@ import msgspec
 import pytest
 from chromium import Page, needs_chromium
 from panel.fake_robot import FakeRobot
-from panel.test_page import until as wait
 from trirail.panel.server import Panel
 from trirail.wire.vocabulary import Role
+from waiting import wait_until as wait
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
 

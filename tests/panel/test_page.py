@@ -7,7 +7,6 @@ import json
 import math
 import signal
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -17,26 +16,19 @@ from panel.fake_robot import FakeRobot
 from trirail.client.held_jog import TIMEOUT
 from trirail.errors import RefusalCode, RefusedError
 from trirail.panel.server import Panel
-from waiting import WITHIN
+from waiting import wait_until
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
 
 SIZES = {"desk": (1280, 800, False), "phone": (390, 844, True), "small phone": (375, 667, True)}
 
 
-def until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + WITHIN
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.005)
-
-
 def moves(robot: FakeRobot) -> None:
-    until(lambda: robot.velocity[0] > 0.0, "the robot moves")
+    wait_until(lambda: robot.velocity[0] > 0.0, "the robot moves")
 
 
 def stands(robot: FakeRobot) -> None:
-    until(lambda: not any(robot.velocity) and robot.goal is None, "the robot stands")
+    wait_until(lambda: not any(robot.velocity) and robot.goal is None, "the robot stands")
 
 
 # ---------------------------------------------------------------------- the dead man
@@ -47,7 +39,7 @@ def test_the_robot_moves_while_a_button_is_held(enabled: Page, robot: FakeRobot)
     before = robot.pose[0]
     enabled.press("[data-axis=x][data-sign='1']")
     moves(robot)
-    until(lambda: robot.pose[0] > before + 0.025 * 3 * TIMEOUT, "it goes on for longer than one time-out")
+    wait_until(lambda: robot.pose[0] > before + 0.025 * 3 * TIMEOUT, "it goes on for longer than one time-out")
     enabled.let_go()
     stands(robot)
     assert len({goal.id for goal in robot.sent}) == 1
@@ -62,7 +54,7 @@ def test_the_robot_moves_while_a_button_is_held(enabled: Page, robot: FakeRobot)
 )
 def test_keys_jog_while_they_are_down(enabled: Page, robot: FakeRobot, key: str, axis: int, sign: int) -> None:
     enabled.key_down(key)
-    until(lambda: bool(robot.sent), "it moves")
+    wait_until(lambda: bool(robot.sent), "it moves")
     moved = (robot.sent[0].x, robot.sent[0].y, robot.sent[0].phi)
     assert [math.copysign(1.0, value) if value else 0.0 for value in moved] == [sign * (k == axis) for k in range(3)]
     enabled.key_up(key)
@@ -74,9 +66,9 @@ def test_two_buttons_at_once_are_one_jog_and_each_ends_by_itself(enabled: Page, 
     enabled.key_down("ArrowRight")
     moves(robot)
     enabled.press("[data-axis=phi][data-sign='-1']")
-    until(lambda: robot.velocity[2] < 0.0 < robot.velocity[0], "both")
+    wait_until(lambda: robot.velocity[2] < 0.0 < robot.velocity[0], "both")
     enabled.key_up("ArrowRight")
-    until(lambda: robot.velocity[0] == 0.0 and robot.velocity[2] < 0.0, "the button alone")
+    wait_until(lambda: robot.velocity[0] == 0.0 and robot.velocity[2] < 0.0, "the button alone")
     enabled.let_go()
     stands(robot)
     assert len({goal.id for goal in robot.sent}) == 1
@@ -205,7 +197,7 @@ def test_stop_from_wherever_one_is(enabled: Page, robot: FakeRobot, by: str) -> 
     else:
         enabled.evaluate("document.querySelector('[data-command=disable]').focus()" if "button" in by else "0")
         enabled.type_key(by.split(maxsplit=1)[0])
-    until(lambda: "stop" in robot.commands, "a stop")
+    wait_until(lambda: "stop" in robot.commands, "a stop")
     stands(robot)
     enabled.evaluate("new Promise((done) => setTimeout(done, 300))")
     stands(robot)
@@ -219,10 +211,10 @@ def test_stop_waits_for_no_command_under_way(enabled: Page, robot: FakeRobot) ->
         enabled.key_down("ArrowRight")
         enabled.until("!document.querySelector('[data-command=pause]').disabled")
         enabled.click("[data-command=pause]")
-        until(lambda: "pause" in robot.commands, "pause is under way")
+        wait_until(lambda: "pause" in robot.commands, "pause is under way")
         enabled.click("#stop")
         stands(robot)
-        until(lambda: "stop" in robot.commands, "a stop")
+        wait_until(lambda: "stop" in robot.commands, "a stop")
     enabled.key_up("ArrowRight")
 
 
@@ -231,7 +223,7 @@ def test_two_tabs_show_the_same_and_either_stops(browser: Page, enabled: Page, p
     other.open(panel.url)
     other.until("document.querySelector('#mode-name').textContent === 'holding'")
     other.press("[data-axis=y][data-sign='1']")
-    until(lambda: robot.velocity[1] > 0.0, "the second tab moves it")
+    wait_until(lambda: robot.velocity[1] > 0.0, "the second tab moves it")
     enabled.until("document.querySelector('#mode-name').textContent === 'moving'")
     enabled.click("#stop")
     stands(robot)
@@ -267,7 +259,7 @@ def test_the_override_is_shown_and_set(enabled: Page, robot: FakeRobot) -> None:
     enabled.evaluate("document.querySelector('#override').focus()")
     for _ in range(2):
         enabled.type_key("ArrowRight")  # moves the slider, not the robot
-    until(lambda: robot.share == 0.5, "both are sent")
+    wait_until(lambda: robot.share == 0.5, "both are sent")
     assert robot.sent == []
     robot.share = 0.8  # by somebody else
     enabled.until("document.querySelector('#override').value === '80'")
@@ -333,7 +325,9 @@ def test_the_last_minutes_are_drawn_and_a_silent_time_is_a_gap(enabled: Page, ro
         found: list[Any] = enabled.evaluate(f"(async () => {rows})()")
         return found
 
-    until(lambda: len(drawn_so_far()) > 3 and drawn_so_far()[-1][0] > drawn_so_far()[0][0] + 2.0, "the way is drawn")
+    wait_until(
+        lambda: len(drawn_so_far()) > 3 and drawn_so_far()[-1][0] > drawn_so_far()[0][0] + 2.0, "the way is drawn"
+    )
     enabled.key_up("ArrowRight")
     drawn = drawn_so_far()
     assert drawn[-1][1:3] == pytest.approx([5.0, math.degrees(0.1)])
@@ -397,7 +391,7 @@ def test_a_pose_is_dragged_on_the_drawing_and_moves_nothing_before_it_is_told(en
     enabled.until("document.querySelector('#going').dataset.may === 'yes'")
     assert robot.pose == before
     enabled.click("#go")
-    until(lambda: robot.pose != before, "it goes there")
+    wait_until(lambda: robot.pose != before, "it goes there")
     assert robot.pose == pytest.approx((before[0] + 0.02, before[1] + 0.01, before[2]), abs=1e-6)
 
 
@@ -412,14 +406,14 @@ def test_a_step_is_one_move_for_one_press(
     before = robot.pose
     enabled.click("[data-step='2']")
     enabled.press(button)
-    until(lambda: robot.pose != before, "it steps")
+    wait_until(lambda: robot.pose != before, "it steps")
     time.sleep(2 * TIMEOUT)  # held for longer: no more steps, and no jog
     enabled.let_go(button)
     assert robot.pose == pytest.approx(tuple(a + b for a, b in zip(before, by, strict=True)), abs=1e-12)
     assert not robot.sent
     enabled.click("[data-step='0']")
     enabled.press(button)
-    until(lambda: bool(robot.sent), "it jogs")
+    wait_until(lambda: bool(robot.sent), "it jogs")
     enabled.let_go(button)
 
 
@@ -448,7 +442,7 @@ def test_only_a_robot_that_homes_has_the_button(page: Page, browser: Page) -> No
         other.click("[data-command=enable]")
         other.until("document.querySelector('#mode-name').textContent === 'holding'")
         other.click("[data-command=home]")
-        until(lambda: homing.commands == ["enable", "home"], "homing")
+        wait_until(lambda: homing.commands == ["enable", "home"], "homing")
         other.close()
 
 

@@ -10,11 +10,12 @@ import pytest
 from chromium import Page, needs_chromium
 from panel.conftest import SHOWN
 from panel.fake_robot import FakeRobot
-from panel.test_page import moves, stands, typed, until
+from panel.test_page import moves, stands, typed
 from trirail.errors import RefusalCode, RefusedError
 from trirail.panel.server import Panel
 from trirail.wire.state import GoalState, Pose
 from trirail.wire.vocabulary import Command, Mode
+from waiting import wait_until
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
 
@@ -190,13 +191,13 @@ def test_the_speed_governs_goals_as_it_does_jogs(enabled: Page, robot: FakeRobot
     enabled.evaluate(f"document.querySelector('#speed').value = {speed}")
     typed(enabled, "1", "2", "3")
     enabled.click("#go")
-    until(lambda: len(robot.speeds) == 1, "it goes")
+    wait_until(lambda: len(robot.speeds) == 1, "it goes")
     enabled.click("[data-pose=park]")
-    until(lambda: len(robot.speeds) == 2, "to a pose")
+    wait_until(lambda: len(robot.speeds) == 2, "to a pose")
     enabled.click("[data-step='1']")
     enabled.until("!document.querySelector('.hold').disabled")
     enabled.click(RIGHT)
-    until(lambda: len(robot.speeds) == 3, "by a step")
+    wait_until(lambda: len(robot.speeds) == 3, "by a step")
     assert robot.speeds == [(0.01, 0.1, 1.0)[speed // 3]] * 3
 
 
@@ -239,7 +240,7 @@ def test_what_would_lose_a_pose_asks_first(enabled: Page, robot: FakeRobot, what
     assert robot.named["pick"] == old
     time.sleep(0.6)
     enabled.click(f"#{what}")
-    until(lambda: robot.named.get("pick") != old, "it is answered")
+    wait_until(lambda: robot.named.get("pick") != old, "it is answered")
     assert robot.named.get("pick") == (robot.pose if what == "teach" else None)
 
 
@@ -302,7 +303,7 @@ def test_a_stage_is_shown_in_micrometres_and_gone_to_in_them(browser: Page, robo
         page.until_equal("document.querySelector('#to-x').value", "1234.5")
         typed(page, "250", "0.5 mm", "0")
         page.click("#go")
-        until(lambda: bool(robot.moved_to), "it goes")
+        wait_until(lambda: bool(robot.moved_to), "it goes")
         assert robot.moved_to[0][0] == pytest.approx((250e-6, 0.5e-3, 0.0))
         assert page.text("[data-step='1']").split() == ["1", "µm", "0.0001°"]
         page.close()

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from panel.fake_robot import FakeRobot
 from panel.test_page import typed
-from panel.test_page import until as wait
 from telemetry.test_sessions import record
 from trirail.errors import RefusalCode, RefusedError
 from trirail.motion.runs import centre_motion, rest, tool_motion
 from trirail.panel.recordings import Recordings
 from trirail.panel.server import Panel
+from waiting import wait_until as wait
 
 pytestmark = [pytest.mark.viewer, needs_chromium]
 

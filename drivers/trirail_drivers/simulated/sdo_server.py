@@ -22,8 +22,6 @@ from trirail_drivers.simulated.dictionary import (
 from trirail_drivers.simulated.sdo_block import CRC_WANTED, BlockDownload, BlockUpload
 
 UNKNOWN_COMMAND: Final = 0x05040001
-ABORTED: Final = 0x80
-"""First byte of an abort."""
 
 _HEADER: Final = Struct("<BHB4s")
 _EXPEDITED, _SIZED, _UNUSED_AT = 0x02, 0x01, 2

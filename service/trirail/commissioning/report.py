@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import datetime
-import os
 from pathlib import Path
 
 import msgspec
 from msgspec import Struct
+from trirail_drivers import files
 from trirail_drivers.errors import FileError
 
 from trirail.commissioning.judgement import Changes, Judgement, Verdict
@@ -141,9 +141,7 @@ def now() -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.new")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
+        files.replace(path, text.encode())
     except OSError as error:
         raise FileError(f"{path}: {error.strerror}") from error

@@ -76,27 +76,20 @@ TRIM_ABOVE: Final = 8_000_000
 class HeapTrim:
     """Periodic check that trims the heap after a burst of messages. Otherwise malloc would not return free memory."""
 
-    def __init__(
-        self,
-        trim: Callable[[], None] = return_free_memory,
-        resident: Callable[[], int] | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._trim, self._clock = trim, clock
-        self._resident = resident or _resident
-        self._least = self._resident()
-        self._due = clock()
+    def __init__(self) -> None:
+        self._least = _resident()
+        self._due = time.monotonic()
 
     def poll(self) -> None:
         """Trim the heap if the resident memory is TRIM_ABOVE larger than its smallest value; check every TRIM_EVERY."""
-        now = self._clock()
+        now = time.monotonic()
         if now < self._due:
             return
         self._due = now + TRIM_EVERY
-        resident = self._resident()
+        resident = _resident()
         self._least = min(self._least, resident)
         if resident > self._least + TRIM_ABOVE:
-            self._trim()
+            return_free_memory()
 
 
 def _resident() -> int:
