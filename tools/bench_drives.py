@@ -1,6 +1,6 @@
-"""Simulated drives on a bus between processes with third-party listeners, to measure the frames that the loop sends.
+"""Simulated drives on a bus between processes, to which other programs can listen to measure the loop's frames.
 
-python tools/bench_drives.py CONFIG PATH        real-time if permitted, away from the loop's processor
+python tools/bench_drives.py CONFIG PATH        real-time if permitted, on another processor than the loop
 
 tools/virtual_drives.py is the version for users: it accepts faults and reports the drives' states.
 """
@@ -20,9 +20,9 @@ from trirail_drivers.bus.unixbus import UnixBus
 from trirail_drivers.connection.opening import simulated_bus
 
 PRIORITY = 70
-"""Priority for SCHED_FIFO, below the loop's 80."""
+"""Priority for SCHED_FIFO, below the loop's priority of 80."""
 POLL = 0.01
-"""Polling interval of the drives' own timers without frames [s]."""
+"""Interval at which the drives' timers are polled while no frame arrives [s]."""
 
 
 def main() -> None:

@@ -1,7 +1,8 @@
-"""Intervals of SYNC at a receiver: trirail's loop, python-canopen's own periodic SYNC, and LinuxCNC's servo thread.
+"""Intervals between SYNCs at a receiver, for trirail's loop and for python-canopen's periodic SYNC.
 
-trirail and python-canopen send over the same bus between processes, with the same drives; the receiver is a third
-party there, and uses the kernel's time of arrival. python-canopen runs unchanged, and with the loop's privileges.
+Both send on the same kind of bus between processes, with the same drives. The receiver is another program on this bus,
+and uses the kernel's time of arrival. python-canopen is measured unchanged, and with the privileges of trirail's loop.
+LinuxCNC's servo thread is only mentioned, since LinuxCNC measures it itself.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ PRIORITY = 80
 
 
 def measure(seconds: float) -> dict[str, Any]:
-    """Listen to each for `seconds`; return the deviations of SYNC's interval from its period [µs]."""
+    """Listen to each program for `seconds`; return the deviations of the SYNC intervals from the period [µs]."""
     return {
         "rate_hz": RATE,
         "quantiles": QUANTILES,
@@ -66,14 +67,14 @@ def _deviations(arrivals: list[float]) -> list[float]:
 
 
 def _linuxcnc() -> str:
-    """Return whether LinuxCNC's servo thread can be compared on this machine, in words."""
+    """Return a sentence that states whether LinuxCNC's servo thread can be compared on this machine."""
     if shutil.which("halrun") is None:
         return "not installed (Debian's package is linuxcnc-uspace): no servo thread to compare with"
     return "installed: run its latency-histogram beside this, it measures its servo thread itself"
 
 
 def _send_sync(path: str, seconds: float, real_time: bool) -> None:
-    """Send python-canopen's periodic SYNC on the bus for `seconds`."""
+    """Let python-canopen send its periodic SYNC on the bus for `seconds`."""
     import canopen
 
     if real_time:
