@@ -1,7 +1,7 @@
 """Second robot in the emulated machine, on vcan0 at another rate, with one drive that is homed and a third-party drive.
 
-To save time, its service starts while the first service ends, since neither robot is then in motion. At this time the
-bus of the second robot is down; later the bus is lost at rest and in motion. The service must survive all of this.
+Its service starts while the first service ends, since both are slow and neither robot is in motion then. At this time
+the bus of the second robot is down; later the bus is lost at rest and in motion. The service must survive every loss.
 """
 
 from __future__ import annotations

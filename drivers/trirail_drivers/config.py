@@ -102,7 +102,7 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
     acceleration: Acceleration
     """Homing acceleration, object 609Ah [m/s²]."""
     timeout: Annotated[float, Meta(ge=0.01, le=180.0)] = 60.0
-    """Longest duration of homing [s]; it limits the travel of a slider that reaches no switch."""
+    """Longest duration of homing [s], which limits the travel of a slider that reaches no switch."""
 
     def __post_init__(self) -> None:
         if self.method == 0:
@@ -178,8 +178,8 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     statusword.
     """
     allow_replacement: bool = False
-    """Whether a drive with another serial number or firmware may replace it while the service runs; otherwise it is
-    refused until the service is restarted."""
+    """Whether a drive with another serial number or firmware may replace this drive while the service runs. Otherwise
+    another drive is refused until the service is restarted."""
     write: tuple[ObjectWrite, ...] = ()
     """Manufacturer-specific objects to write at set-up."""
 
@@ -218,9 +218,9 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     missed_positions: Annotated[int, Meta(ge=1, le=1000)] = 3
     """Number of consecutive cycles without a position from a drive after which the drive is lost."""
     following_error: Distance = 0.005
-    """Window of the following error [m] that the drives monitor, object 6065h; for ODrives, the driver monitors it. It
-    must be wider than `[limits.slider] following_error`, so that the service stops all three drives before one of them
-    faults.
+    """Window of the following error [m] that the drives monitor, object 6065h; for ODrives, the driver monitors it. The
+    window must be wider than `[limits.slider] following_error`, so that the service stops all three drives before a
+    drive reports a fault.
     """
     quick_stop_deceleration: Acceleration = 10.0
     """Deceleration of the quick-stop ramp [m/s²], object 6085h; for ODrives, the driver generates the ramp."""

@@ -54,7 +54,7 @@ class DriveAbsentError(DriveTimeout):
 
 
 class ConfigurationRefused(DriveError):
-    """A drive did not keep a written value: a different value was read back."""
+    """A drive did not accept a written value: a different value was read back."""
 
     def __init__(
         self, drive: str, name: str, index: int, subindex: int, wanted: object, read_back: object, seconds: float

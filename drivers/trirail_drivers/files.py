@@ -15,7 +15,7 @@ from typing import BinaryIO
 from trirail_drivers.errors import FileError
 
 LARGEST_TEXT = 16_000_000
-"""Maximum size of a text file that is read [bytes]; it holds some hundred thousand points of a trajectory."""
+"""Maximum size of a text file that is read [bytes], enough for some hundred thousand points of a trajectory."""
 
 _KINDS = {
     stat.S_IFIFO: "a FIFO",

@@ -145,7 +145,7 @@ class SocketFrames:
         return BusAccess(self._socket.fileno())
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take frames back: `receive` returns those after the first `handled`, and then raises `error` (errno.h)."""
+        """Take frames back: `receive` returns all except the first `handled`, and then raises `error` (errno.h)."""
         self._returned.extend(arrived.unpacked(handled, number))
         self._error = error
 
@@ -181,7 +181,7 @@ class PythonCanFrames:
         self._marks_own = not isinstance(bus, SocketcanBus)
         self._poll: select.poll | None = None
         self._unanswered = 0
-        """Number of sent frames whose acknowledgement the interface may still return as None."""
+        """Number of sent frames for which the interface may still return None as the acknowledgement."""
         with contextlib.suppress(NotImplementedError, can.CanOperationError):
             descriptor = bus.fileno()
             self._poll = select.poll()

@@ -61,7 +61,7 @@ class Frame:
         return frame
 
     def fill(self, layout: Struct, *values: int) -> None:
-        """Replace the data and keep its length. Raises struct.error if the layout cannot hold a value."""
+        """Replace the data by data of the same length. Raises struct.error if a value does not fit into the layout."""
         layout.pack_into(self.packed, DATA_AT, *values)
 
     def message(self) -> can.Message:

@@ -32,7 +32,7 @@ Handler = Callable[[bytearray, float], None]
 
 
 class Listener(Protocol):
-    """Drive that receives frames, as far as the bus has to know it."""
+    """Drive whose frames the bus passes to a handler."""
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
         """Latch a fault of the drive."""
@@ -190,7 +190,7 @@ class Wire:
     def send(self, frame: Frame) -> bool:
         """Send a frame without waiting; return whether the bus accepted it.
 
-        A frame that a full queue refuses is dropped; this becomes a fault only after UNSENT_CYCLES cycles.
+        A frame is dropped if the transmit queue is full. A full queue becomes a fault only after UNSENT_CYCLES cycles.
         """
         try:
             self._frames.send(frame)

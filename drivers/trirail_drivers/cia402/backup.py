@@ -269,7 +269,7 @@ async def _write_one(remote: Remote, key: Key, wanted: Parameter, held: Paramete
 
 
 async def _read_held(remote: Remote, parameters: Mapping[Key, Parameter], progress: _Progress) -> dict[Key, Parameter]:
-    """Return the current values of the given parameters, without those that cannot be read from the drive."""
+    """Return the current values of the given parameters, except for parameters that cannot be read from the drive."""
     progress.doing = "reading parameters"
     held = {}
     for number, (key, each) in enumerate(parameters.items()):

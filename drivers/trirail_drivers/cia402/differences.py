@@ -15,7 +15,7 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 
 class Difference(NamedTuple):
-    """Object of a drive whose value must be changed."""
+    """Object of a drive that must be changed, with its present and its required value."""
 
     object: str
     """Index and subindex, such as 6085:00."""

@@ -26,7 +26,7 @@ HOMING = 6
 _MODE, _MODE_DISPLAY, _STATUSWORD = 0x6060, 0x6061, 0x6041
 
 FRESH_ANSWERS: Final = 4
-"""Number of answers to SYNCs after the end of homing after which a position is certain to be relative to home.
+"""Number of answers to SYNCs to wait for after homing. The next position is certain to be relative to home.
 
 One answer may still be waiting for the bus, and one may be assigned to the wrong SYNC.
 """

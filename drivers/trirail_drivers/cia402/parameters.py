@@ -103,7 +103,7 @@ def decode(data_type: int, data: bytes) -> Value:
 
 
 def encode(data_type: int, value: Value, where: str = "") -> bytes:
-    """Encode a value for transfer by SDO. Raises ValueError if the data type cannot hold it."""
+    """Encode a value for transfer by SDO. Raises ValueError if the data type does not allow the value."""
     try:
         data = bytes(_variable(data_type).encode_raw(value))
         if data_type in FLOAT_TYPES or decode(data_type, data) == value:

@@ -129,7 +129,7 @@ _WORDS: Final = {
 }
 _WRITTEN: Final = re.compile(r"(?:(\d+(?:\.\d+)?(?:e-?\d+)?) +)?(rpm|[a-zµ]+/(?:s|min|h))((?:/(?:s|min|h))?|2)")
 FACTORS: Final = 1e-9, 1e9
-"""Bounds of the factor before a unit. No drive needs a factor outside, and floats are exact enough within."""
+"""Bounds of the factor before a unit. All drives' factors are far within the bounds, and the bounds within floats."""
 _SECONDS: Final = {symbol: seconds for seconds, symbol in _TIMES.values()}
 
 

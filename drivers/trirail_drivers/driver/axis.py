@@ -108,7 +108,7 @@ class Axis(Answers):
 
     @property
     def outputs_pending(self) -> bool:
-        """Whether the wanted outputs have not been sent yet, or differ from those sent last."""
+        """Whether the wanted outputs differ from the outputs sent last, or no outputs have been sent yet."""
         return self.has_outputs and self.outputs != self.outputs_sent
 
     @classmethod

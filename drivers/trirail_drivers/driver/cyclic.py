@@ -100,13 +100,13 @@ class Cyclic:
 
 @runtime_checkable
 class Lender(Protocol):
-    """DriveGroup whose cycles can be run by compiled code, using tables."""
+    """DriveGroup that lends its tables to compiled code, which then runs the cycles."""
 
     def lend(self) -> Cyclic | None:
         """Return the tables between two cycles, or None if the tables do not suffice for the next cycle.
 
-        While they are lent, the caller may only call commands such as `disable` or `quick_stop`; it then calls
-        `reclaim` before the next cycle.
+        While the tables are lent, the caller may only call commands such as `disable` or `quick_stop`. After such a
+        command, the caller must call `reclaim` before the next cycle.
         """
 
     def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
