@@ -1,6 +1,6 @@
 """Benchmarks: `python tools/bench.py loop`, `latency`, …, each with --json for programs; `all` is `make bench`.
 
-Speed is given as a ratio within one run, because machines differ.
+Speeds are stated as ratios of two measurements in the same run, because machines differ.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from cyclopts import App
 
 app = App(help="Speed, as ratios within one run: the machines this runs on are not alike.")
 
-# Each command imports its benchmark itself: `frames` also runs in an emulated machine, where imports are slow.
+# Each command imports only its own benchmark: `frames` also runs in an emulated machine, in which imports are slow.
 
 
 def report(results: dict[str, Any], json: bool) -> None:
-    """Print the results, as one JSON object or in lines; a list of numbers gives the values at `quantiles`."""
+    """Print the results as lines, or as one JSON object. A list of numbers contains the values at `quantiles`."""
     print(json_format.dumps(results) if json else "\n".join(lines(results)))
 
 
@@ -40,7 +40,7 @@ def lines(results: dict[str, Any], indent: str = "") -> Iterator[str]:
 
 @app.command
 def loop(*, seconds: float = 60.0, rates: tuple[int, ...] = (1000, 2000), runs: int = 5, json: bool = False) -> None:
-    """Run the whole service, goals without pause; time its loop beside cyclictest and the bare loop, at each rate."""
+    """Run the whole service under continuous goals; compare its loop with cyclictest and a bare loop at each rate."""
     import bench_loop
 
     report(bench_loop.measure(seconds, rates, runs), json)
@@ -48,7 +48,7 @@ def loop(*, seconds: float = 60.0, rates: tuple[int, ...] = (1000, 2000), runs: 
 
 @app.command
 def latency(*, goals: int = 100, json: bool = False) -> None:
-    """Time from a goal's put to the first setpoint that it changes on the bus, at rest and in motion."""
+    """Measure the time from the sending of a goal to the first setpoint that it changes on the bus."""
     import bench_latency
     import bench_rig
 
@@ -58,7 +58,7 @@ def latency(*, goals: int = 100, json: bool = False) -> None:
 
 @app.command
 def fairness(*, goals: int = 1000, json: bool = False) -> None:
-    """Time until one user's goals and stops are answered, quiet and while another floods, and the ratio of the two."""
+    """Measure the response times to one user's goals and stops, with and without a flood of another user's messages."""
     import bench_fairness
     import bench_rig
 
@@ -68,7 +68,7 @@ def fairness(*, goals: int = 1000, json: bool = False) -> None:
 
 @app.command
 def frames(*, cycles: int = 3000, json: bool = False) -> None:
-    """Time one cycle's frames by python-can, and on the bus's own socket."""
+    """Measure the time to send and receive one cycle's frames, by python-can and directly on the socket of the bus."""
     import bench_frames
 
     report(bench_frames.measure(cycles), json)
@@ -76,7 +76,7 @@ def frames(*, cycles: int = 3000, json: bool = False) -> None:
 
 @app.command
 def peers(*, seconds: float = 15.0, json: bool = False) -> None:
-    """Measure the intervals of SYNC beside python-canopen's, on the same bus."""
+    """Measure the intervals between SYNCs, and those of python-canopen on the same kind of bus."""
     import bench_peers
 
     report(bench_peers.measure(seconds), json)
@@ -84,7 +84,7 @@ def peers(*, seconds: float = 15.0, json: bool = False) -> None:
 
 @app.command
 def outputs(*, pulses: int = 20, tries: int = 10, json: bool = False) -> None:
-    """Compare where outputs switch with their marks, and with a client that watches the state; time the switch."""
+    """Compare the places where outputs switch by marks and by a client that watches the state; time the switching."""
     import bench_outputs
     import bench_rig
 
@@ -94,7 +94,7 @@ def outputs(*, pulses: int = 20, tries: int = 10, json: bool = False) -> None:
 
 @app.command
 def kinematics(*, json: bool = False) -> None:
-    """Time the recursion against a straightforward numpy port of the paper's matrices."""
+    """Compare the speed of the compiled recursion with that of a plain numpy port of the paper's matrices."""
     import bench_kinematics
 
     report(bench_kinematics.measure(), json)
@@ -102,9 +102,10 @@ def kinematics(*, json: bool = False) -> None:
 
 @app.command
 def align(*, parts: int = 200, goals: int = 20, stages: int = 20, json: bool = False) -> None:
-    """Align seeded parts on computed stages of both kinds, by right and wrong models, and time it on a service.
+    """Align random parts on computed stages of both kinds, with correct and wrong models; time it on a running service.
 
-    Then calibrate the geometry of `stages` stages of each kind by their cameras, and align all over their travel.
+    Then calibrate the geometry of `stages` stages of each kind by their cameras, and align parts anywhere in the
+    travel.
     """
     import bench_align
     import bench_geometry
@@ -116,7 +117,7 @@ def align(*, parts: int = 200, goals: int = 20, stages: int = 20, json: bool = F
 
 @app.command
 def start(*, json: bool = False) -> None:
-    """Time the start of a service on simulated drives, and weigh its processes."""
+    """Measure the time that a service on simulated drives takes to start, and the memory of its processes."""
     import bench_start
 
     report(bench_start.measure(), json)
@@ -124,12 +125,12 @@ def start(*, json: bool = False) -> None:
 
 @app.command(name="all")
 def everything(*, brief: bool = False, json: bool = False) -> None:
-    """Run all of these, under ten minutes, and end with one table against the aims; `brief` only for a look."""
+    """Run all benchmarks in less than ten minutes; print a table of results and aims. `brief`: a quick trial."""
     import bench_aims
 
     bench_aims.main(brief, json)
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(os.EX_TEMPFAIL))  # so that its services end with it
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(os.EX_TEMPFAIL))  # so that its services end, too
     app()

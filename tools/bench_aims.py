@@ -1,4 +1,4 @@
-"""All benchmarks in sequence, and a table of their results against the service's aims."""
+"""Run of all benchmarks one after the other, and a table that compares the results with the service's aims."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMMANDS = {
     "outputs": ("--tries", "5"),
     "start": (),
 }
-"""Benchmarks and their options: together under ten minutes."""
+"""Benchmarks and their options; together they take less than ten minutes."""
 BRIEF = {
     "fairness": ("--goals", "20"),
     "frames": ("--cycles", "50"),
@@ -35,14 +35,16 @@ BRIEF = {
 
 
 class Aim(NamedTuple):
-    """Row of the table."""
+    """Aim of the service: one row of the table."""
 
     name: str
     before: str
-    """Figure of an earlier version."""
+    """Result of an earlier version."""
     aim: tuple[float, ...]
     measured: Callable[[Results], tuple[float, ...]]
-    """Function that returns one number per limit of `aim`, not to exceed it; none if the rate was not kept."""
+    """Function that returns one number for each limit in `aim`, which it must not exceed; no numbers if the service
+    could not keep the rate.
+    """
 
 
 def at(results: Results, rate: int) -> Results:
@@ -51,7 +53,7 @@ def at(results: Results, rate: int) -> Results:
 
 
 def _missed(results: Results, rate: int, of: int | None = None) -> tuple[float, ...]:
-    """Return the missed ticks in excess of those that the machine itself lost, in total or per `of` cycles."""
+    """Return the number of missed ticks, minus the ticks that the machine itself lost, in total or per `of` cycles."""
     loop = at(results, rate)
     if "not_kept" in loop:
         return ()
@@ -60,7 +62,7 @@ def _missed(results: Results, rate: int, of: int | None = None) -> tuple[float, 
 
 
 def _cycle_to_bare(results: Results, rate: int) -> tuple[float, ...]:
-    """Return the ratios of the service's whole cycle to that of the bare loop, p50, p99 and p99.9."""
+    """Return the duration of the service's cycle divided by that of the bare loop's cycle, at p50, p99 and p99.9."""
     return tuple(at(results, rate).get("to_bare", {}).get("cycle", ())[:3])
 
 
@@ -155,7 +157,7 @@ AIMS = (
 
 
 def table(results: Results) -> list[dict[str, Any]]:
-    """Return each measured aim with its results, and whether it is met."""
+    """Return a row for each aim that was measured, with the results and whether the aim is met."""
     rows = []
     for aim in AIMS:
         try:
@@ -168,7 +170,7 @@ def table(results: Results) -> list[dict[str, Any]]:
 
 
 def measure(brief: bool) -> Results:
-    """Run each benchmark in a process of its own; return their results, the failed ones, and the table."""
+    """Run each benchmark in a separate process; return the results, the names of those that failed, and the table."""
     program = str(Path(__file__).with_name("bench.py"))
     results: Results = {}
     failed = []
@@ -185,7 +187,7 @@ def measure(brief: bool) -> Results:
 
 
 def main(brief: bool, json: bool = False) -> None:
-    """Run all; print the table, or everything as one JSON object. Exit with code 1 if a benchmark failed."""
+    """Run all benchmarks and print the table, or all results as one JSON object. Exit with code 1 if one failed."""
     results = measure(brief)
     if json:
         print(json_format.dumps(results))

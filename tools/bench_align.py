@@ -1,8 +1,9 @@
-"""Alignment of seeded parts on stages of both kinds: corrections, residuals, and the duration of one correction.
+"""Alignment of random parts on stages of both kinds: corrections, residuals, and the duration of one correction.
 
-The stage is computed, without timing: a commanded pose is inverted with the commander's model, sliders move to whole
-counts, and the table is where the loops of the stage as built close. The residuals thus contain only kinematics,
-calibration and cameras, not errors of drives. Durations come from a running service on simulated drives with lag.
+The stage is computed, without timing. The commander's model converts a commanded pose into slider positions, the
+sliders move to whole counts, and the kinematics of the stage as built determine where the table then is. The residuals
+thus contain only errors of the kinematics, the calibration and the cameras, not those of drives. The durations are
+measured with a running service on simulated drives with lag.
 """
 
 from __future__ import annotations
@@ -45,12 +46,14 @@ NOISE = 0.1
 COUNT = 1e-7
 OFF, TURNED = 1e-3, math.radians(0.5)
 PLACES, ANGLES = 50e-6, 0.1e-3
-"""Maximum deviations of legs as built from their configuration, in each coordinate [m] and angle [rad]."""
+"""Maximum differences between the legs as built and as configured, in each coordinate [m] and angle [rad]."""
 DISTORTION, AXIS_OFF = 0.005, 150.0
-"""Maximum distortion at the edge of a picture, as a share, and of the lens's axis from its middle [pixel]."""
+"""Maximum distortion at the edge of a picture, as a fraction, and maximum distance of the lens's axis from the middle
+of the picture [pixel].
+"""
 TOLERANCE, ARC = 1e-6, math.radians(5.0 / 3600.0)
 PICTURES_PER_PLACE = 4
-"""Pictures averaged at each place: for calibration, targets and parts, unless a case uses one."""
+"""Number of pictures that are averaged at each place, for calibration, targets and parts, unless a case uses one."""
 PART: dict[str, Pair] = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
 FILES = {"3-PRP": "uvw.toml", "3-PPR": "uvw-ppr.toml"}
 AIMS = {
@@ -60,12 +63,12 @@ AIMS = {
 
 
 class ComputedStage:
-    """A stage as built, commanded through a model of it, and two cameras above it."""
+    """Stage as built that is commanded through a model, which may be wrong, with two cameras above it."""
 
     def __init__(self, built: Geometry, model: Model, rng: np.random.Generator, field: Pair | None = None) -> None:
         self._built, self.model, self._rng, self._field = built, model, rng, field
         self.scales = np.zeros(3)
-        """Relative errors of the encoders' scales."""
+        """Relative error of each encoder's scale."""
         self.views = {name: _view(rng, place, field) for name, place in PART.items()}
         self.part: Mapping[str, Pair] = PART
         self.pose: Triple = (0.0, 0.0, 0.0)
@@ -73,17 +76,17 @@ class ComputedStage:
 
     @property
     def sliders(self) -> Floats:
-        """Slider positions by their encoders, (3,) [m]."""
+        """Slider positions as the encoders show them, (3,) [m]."""
         return np.asarray(np.round(self.model(np.array(self.pose)) / COUNT) * COUNT)
 
     @property
     def true(self) -> Triple:
-        """True pose."""
+        """True pose of the table [m, m, rad]."""
         x, y, phi = forward(self._built, self.sliders * (1.0 + self.scales)).tolist()
         return x, y, phi
 
     def pixels(self, noise: float) -> dict[str, Pair]:
-        """Return the pixel coordinates of the part's marks, with `noise` [pixels]."""
+        """Return the pixel coordinates of the part's marks that are in their pictures, with `noise` [pixels]."""
         pose = self.true
         exact = {
             name: project_points(self.views[name], to_base_frame(q, pose)[None])[0] for name, q in self.part.items()
@@ -95,7 +98,7 @@ class ComputedStage:
         return self._field is None or (0.0 <= u < self._field[0] and 0.0 <= v < self._field[1])
 
     def move(self, motion: StageMotion) -> None:
-        """Move to a pose, or relative about a point, according to the model."""
+        """Move to a pose, or by a relative motion about a point, according to the model."""
         if motion.tool is None:
             self.pose = motion.by
             return
@@ -123,7 +126,7 @@ class ComputedStage:
 
 
 def measure(parts: int, goals: int) -> dict[str, Any]:
-    """Return the results of `parts` parts for each kind and case, and the duration of a service's corrections."""
+    """Return the results of `parts` parts for each kind of stage and each case, and the durations on a service."""
     results: dict[str, Any] = {"aims": [f"{name}: {aim}, {share:.0%}" for name, (aim, share) in AIMS.items()]}
     results |= computed(parts)
     results["seconds of a correction, a service"] = seconds(goals)
@@ -131,7 +134,7 @@ def measure(parts: int, goals: int) -> dict[str, Any]:
 
 
 def computed(parts: int) -> dict[str, Any]:
-    """Return the results of `parts` parts for each kind and case."""
+    """Return the results of `parts` parts for each kind of stage and each case."""
     results: dict[str, Any] = {}
     for kind, file in FILES.items():
         ideal = geometry(load(SIM.with_name(file)).geometry)
@@ -185,13 +188,13 @@ def _case(
 
 
 def distance_left(stage: ComputedStage, aim: Floats) -> tuple[float, float]:
-    """Return the true distance of the farthest mark from its place [m], and the angular error of the part [rad]."""
+    """Return the true distance of the worst mark from its target [m], and the angular error of the part [rad]."""
     at = np.array([to_base_frame(q, stage.true) for q in stage.part.values()])
     return float(np.linalg.norm(at - aim, axis=1).max()), abs(fit_rigid_motion(at, aim).turn)
 
 
 def small_angles(robot: Geometry) -> Model:
-    """Return the small-angle model of most programs for such stages: each slider by x - y' phi or y + x' phi."""
+    """Return the small-angle model that most programs for such stages use: slider = x - y' phi, or y + x' phi."""
     middle = inverse(robot, np.zeros(3)).position
     rows = []
     for leg in robot.each:
@@ -202,7 +205,7 @@ def small_angles(robot: Geometry) -> Model:
 
 
 def _view(rng: np.random.Generator, place: Pair, field: Pair | None = None) -> CameraView:
-    """Return a camera above a place: with a `field` its long side is along y, and its lens bends the picture."""
+    """Return a camera above a place. With a `field`, its long side is along y, and its lens distorts the picture."""
     mirror = np.diag([1.0, rng.choice([-1.0, 1.0])])
     turn = rng.uniform(-math.pi, math.pi) if field is None else math.pi / 2.0 + rng.uniform(-0.05, 0.05)
     matrix = SCALE * rotation_matrix(turn) @ mirror @ (np.eye(2) + rng.uniform(-0.01, 0.01, (2, 2)))
@@ -216,7 +219,7 @@ def _view(rng: np.random.Generator, place: Pair, field: Pair | None = None) -> C
 
 
 def seconds(goals: int) -> dict[str, Any]:
-    """Return the durations of corrections by 0.5 mm on a running service, without camera time [s]."""
+    """Return the durations of corrections by 0.5 mm on a running service, without the time of the cameras [s]."""
     with tempfile.TemporaryDirectory(prefix="trirail-") as name:
         folder = Path(name)
         locator = f"unixsock-stream/{folder}/zenoh"

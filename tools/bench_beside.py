@@ -1,7 +1,7 @@
-"""Lateness of the machine itself during a benchmark, by cyclictest or, without it, by a loop that only sleeps.
+"""Lateness of the machine itself during a benchmark, measured by cyclictest or else by a loop that only sleeps.
 
-Both sleep to absolute deadlines with SCHED_FIFO on the loop's processor, one priority above it, with its period. A
-wake-up later than a period means ticks in which no program could have run.
+Both programs sleep until absolute deadlines with SCHED_FIFO, on the processor and with the period of the service's
+loop, one priority above the loop. A wake-up that is later than a period means ticks in which no program could have run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_LATENESS_US = 100_000
 
 
 class Beside:
-    """A measurement of the machine's own lateness, which ends by itself after `seconds`."""
+    """Measurement of the machine's own lateness in a separate process, which ends by itself after `seconds`."""
 
     def __init__(self, seconds: float, period_us: int, priority: int, result: Path) -> None:
         self.period_us = period_us
@@ -41,19 +41,19 @@ class Beside:
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
 
     def lateness(self) -> NDArray[np.float64]:
-        """Wait for its end; return the lateness of each wake-up [µs]."""
+        """Wait for the end of the measurement; return the lateness of each wake-up [µs]."""
         self._process.wait(60)
         result = json.loads(self._result.read_text(encoding="utf-8"))
         counts = result["thread"]["0"]["histogram"] if "thread" in result else result
         return np.repeat([float(value) for value in counts], list(counts.values()))
 
     def ticks_lost(self, lateness: NDArray[np.float64]) -> int:
-        """Return the number of ticks lost in sleeps longer than a period."""
+        """Return the number of ticks that were lost because a wake-up was more than a period late."""
         return int(np.sum(lateness // self.period_us))
 
 
 def main() -> None:
-    """Sleep from deadline to deadline; write a histogram of the lateness."""
+    """Sleep from deadline to deadline, and write a histogram of the lateness to the given file."""
     seconds, period_us, priority, processor = (float(value) for value in sys.argv[1:5])
     signal.signal(signal.SIGTERM, _end)
     try:

@@ -1,4 +1,4 @@
-"""Simulated drives on a bus between processes with third-party listeners, to measure the frames that the loop sends.
+"""Simulated drives on a bus between processes, to which other programs can listen to measure the loop's frames.
 
 python tools/bench_drives.py CONFIG PATH [TIMES]    real-time if permitted, away from the loop's processor
 
@@ -29,7 +29,7 @@ PRIORITY = 75
 """Priority for SCHED_FIFO: below the loop's 80 and above the planner's 70, which plans on the same processor. With the
 planner's own priority, frames waited for the planner: 700 µs at each goal."""
 POLL = 0.01
-"""Polling interval of the drives' own timers without frames [s]."""
+"""Interval at which the drives' timers are polled while no frame arrives [s]."""
 
 
 def main() -> None:

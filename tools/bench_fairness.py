@@ -1,9 +1,10 @@
-"""Effect of one user's flood on another: response times of goals and stops, alternately without and with the flood.
+"""Effect of one user's flood of messages on another user: response times to goals and stops with and without the flood.
 
-The flood comes from user eve, from processes with the lowest priority, as if on another machine. They send goals that
-are planned and refused, commands, queries and junk, with as many unanswered messages at a time as the service permits.
-User ann sends a goal from standstill, stops the robot, and stops it again. Measured are the acceptance of the goal and
-the execution of the second stop, with the robot at rest.
+The flood comes from user eve. Its processes have the lowest priority, as if they ran on another machine. They send
+goals that are planned and refused, commands, queries and junk, with as many unanswered messages at a time as the
+service permits. User ann sends a goal from standstill, stops the robot, and stops it again. Measured are the times
+until the goal is accepted and until the second stop, of a robot at rest, is executed. Phases with and without flood
+alternate.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from trirail.wire import zenoh_session
 
 FLOODERS = 2
 SESSIONS = 8
-"""Number of sessions per flooding process."""
+"""Number of sessions of each flooding process."""
 PENDING = 100
-"""Maximum number of unanswered messages per flooding process."""
+"""Maximum number of unanswered messages of each flooding process."""
 ALTERNATIONS = 10
-"""Number of alternations of quiet and flood, so that other load of the machine affects both."""
+"""Number of phases without and with flood, which alternate so that other load of the machine affects both equally."""
 SETTLE = 0.5
 """Time from the beginning or end of a flood to the measurement [s]."""
 BEGIN = 60.0
@@ -47,7 +48,7 @@ MESSAGES: tuple[tuple[str, bytes], ...] = (
 
 
 def flood(locator: str, on: Event, sent: Any) -> None:
-    """Flood while `on` is set, until this process is killed; count messages in `sent`."""
+    """Flood the service while `on` is set, until this process is killed; count the messages in `sent`."""
     os.nice(19)
     choice, pending = random.Random(os.getpid()), threading.Semaphore(PENDING)
     sessions = [zenoh_session.open_client(locator) for _ in range(SESSIONS)]
@@ -65,7 +66,7 @@ def flood(locator: str, on: Event, sent: Any) -> None:
 
 @contextlib.contextmanager
 def flooders(locator: str) -> Iterator[tuple[Event, Any]]:
-    """Run the flooding processes, initially silent; yield the event that starts them and the count of messages."""
+    """Run the flooding processes, which wait at first; yield the event that starts them and the count of messages."""
     context = multiprocessing.get_context("spawn")
     on, sent = context.Event(), context.Value("Q", 0)
     processes = [context.Process(target=flood, args=(locator, on, sent), daemon=True) for _ in range(FLOODERS)]
@@ -80,7 +81,7 @@ def flooders(locator: str) -> Iterator[tuple[Event, Any]]:
 
 
 def measure(made: Rig, goals: int, rounds: int = ALTERNATIONS) -> dict[str, Any]:
-    """Measure `goals` goals and stops, half of them flooded; return milliseconds at QUANTILES."""
+    """Measure `goals` goals and stops, half of them during the flood; return the times at QUANTILES [ms]."""
     choice = random.Random(7)
     took: dict[str, list[float]] = {
         f"{what}_{when}_ms": [] for what in ("goal", "stop") for when in ("quiet", "flooded")
@@ -110,7 +111,7 @@ def measure(made: Rig, goals: int, rounds: int = ALTERNATIONS) -> dict[str, Any]
 
 
 def _set_on(on: Event, sent: Any) -> None:
-    """Start the flood and wait for its first message, since low-priority processes start late on a busy machine."""
+    """Start the flood and wait for its first message: on a busy machine, processes of low priority start late."""
     before, deadline = sent.value, time.monotonic() + BEGIN
     on.set()
     while sent.value == before:
@@ -120,7 +121,7 @@ def _set_on(on: Event, sent: Any) -> None:
 
 
 def _each(robot: Robot, choice: random.Random) -> tuple[float, float]:
-    """Send a goal from standstill and stop it; return the times for its acceptance and a stop at standstill [s]."""
+    """Send a goal from standstill, and stop twice; return the times of the acceptance and of the second stop [s]."""
     time.sleep(choice.uniform(0.0, 0.01))  # at any phase of the cycle, and of the flood
     accepted = _timed(lambda: robot.move_to(x=choice.uniform(-0.05, 0.05), y=choice.uniform(-0.05, 0.05), phi=0.0))
     robot.stop()

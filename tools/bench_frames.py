@@ -1,7 +1,7 @@
-"""Cost of one cycle's frames, by python-can's SocketCAN and directly on its socket like the drivers, in one run.
+"""Time to send and receive one cycle's frames, by python-can's SocketCAN and, like the drivers, directly on its socket.
 
 A cycle sends SYNC and three setpoints, finds the bus empty, receives three positions, and finds the bus empty again.
-The bus is a virtual one of the kernel if possible, else python-can's SocketCAN code over a pair of unix sockets.
+The bus is a virtual CAN bus of the kernel if possible, otherwise python-can's SocketCAN code on a pair of unix sockets.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NODES = range(1, 1 + len(NAMES))
 
 
 class Loopback(SocketcanBus):
-    """python-can's SocketCAN over any socket of `struct can_frame`."""
+    """python-can's SocketCAN bus on any socket that carries `struct can_frame`."""
 
     def __init__(self, carrier: socket.socket) -> None:
         self.socket = carrier
@@ -39,11 +39,11 @@ class Loopback(SocketcanBus):
         can.BusABC.__init__(self, channel=self.channel)
 
     def _apply_filters(self, filters: can.typechecking.CanFilters | None) -> None:
-        """Do nothing: only the kernel's CAN sockets filter identifiers."""
+        """Do nothing, since only the kernel's CAN sockets can filter identifiers."""
 
 
 class Listener:
-    """Decoder of positions, like that of a drive's axis."""
+    """Decoder of positions, which does the same work as a drive's axis."""
 
     def __init__(self) -> None:
         self.heard = 0
@@ -55,9 +55,9 @@ class Listener:
 
 
 def measure(cycles: int) -> dict[str, Any]:
-    """Return the time for one cycle's frames by either method [µs], and their ratio."""
+    """Return the time for one cycle's frames with each method [µs], and the ratio of the two times."""
     with _bus() as (kind, bus, far):
-        # Only frames are compared here: the processing of their contents, in the cycle, is the same for both.
+        # Only the transfer of frames is compared: both methods process the contents in the same way.
         ways: dict[str, FrameIO] = {"python_can": PythonCanFrames(bus), "socket": SocketFrames(bus.socket)}
         times: dict[str, list[float]] = {name: [] for name in ways}
         sync, setpoints = Frame(layout.SYNC), [Frame(layout.RPDO2 + node, bytes(8)) for node in NODES]

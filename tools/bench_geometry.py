@@ -1,8 +1,9 @@
-"""Geometry of computed stages by their own cameras, and corrections anywhere in the travel before and after it.
+"""Calibration of the geometry of computed stages by their own cameras, and corrections before and after it.
 
-A stage differs from its configuration in every leg and in the scale of each encoder; lenses distort. The pictures are
-as large as the travel wants: 9344 × 7000 pixels of 3.75 µm, a sensor of 65 megapixels at 1:1. A correction takes the
-part from a pose of the stage to another, both anywhere in its travel. The remaining error is that of the real stage.
+A stage differs from its configuration in every leg and in the scale of each encoder, and the lenses distort. The
+pictures are large enough for the travel: 9344 × 7000 pixels of 3.75 µm, a sensor of 65 megapixels at 1:1. A correction
+moves the part from one pose of the stage to another, both anywhere in the travel. The remaining error is that of the
+stage as built.
 """
 
 from __future__ import annotations
@@ -49,15 +50,15 @@ from trirail.kinematics.geometry import Geometry, Room, travels
 from trirail.kinematics.robot import inverse
 
 SCALES = 200e-6
-"""Maximum relative error of an encoder's scale."""
+"""Maximum relative error of the scale of an encoder."""
 FIELD = (9344.0, 7000.0)
 CODES: tuple[CodeFamily, ...] = ("4x4_50", "apriltag_36h11")
 MARK_SIDE = 300e-6
-"""Size of the marks that are compared [m]."""
+"""Size of the marks whose errors are compared [m]."""
 PLACES_OF_STAGE = 4
-"""Corrections on each stage."""
+"""Number of corrections on each stage."""
 MARGIN = 0.95
-"""Share of the travel in which corrections begin and end."""
+"""Fraction of the travel within which corrections begin and end."""
 AIM = "at least 95 % within 1 µm and 5 arcsec after one correction, never more than three"
 
 
@@ -67,9 +68,10 @@ def measure(stages: int) -> dict[str, Any]:
 
 
 def marks(count: int) -> dict[str, Any]:
-    """Return the errors of codes and of discs of the same size in `count` pictures each, root mean square [pixel].
+    """Return the position errors of codes and of discs of the same size, as root mean square [pixel].
 
-    The marks are 300 µm (80 pixels), dark, turned at random, in uneven light, with noise of 4 of 255.
+    Each kind of mark is measured in `count` pictures. The marks are 300 µm (80 pixels) wide, dark, and turned at
+    random. The light is uneven, and the noise is 4 of 255 grey levels.
     """
     errors: dict[str, list[Floats]] = {}
     for seed in range(count):
@@ -138,7 +140,7 @@ def _kind(file: str, stages: int) -> dict[str, Any]:
 
 
 def _way(rng: np.random.Generator, robot: Geometry, limits: Room, stage: ComputedStage) -> tuple[Floats, Floats]:
-    """Return two poses anywhere in the travel at which all marks are in their pictures."""
+    """Return two random poses in the travel at which all marks are in their pictures."""
     low, high = np.array(limits.low), np.array(limits.high)
     poses: list[Floats] = []
     while len(poses) < 2:
@@ -152,14 +154,17 @@ def _way(rng: np.random.Generator, robot: Geometry, limits: Room, stage: Compute
 def _correct(
     stage: ComputedStage, cameras: CameraCalibration, begin: Floats, end: Floats, pictures: int
 ) -> tuple[float, float, int]:
-    """Return distance [m] and angle [rad] after the first correction from a pose to another, and their number."""
+    """Align a part from one pose to another; return the errors after the first correction, and their number.
+
+    The errors are a distance [m] and an angle [rad]. The number of corrections is 0 if the target was not reached.
+    """
     stage.pose = (float(end[0]), float(end[1]), float(end[2]))
     views = [stage.pixels(NOISE) for _ in range(PICTURES_PER_PLACE)]
     targets = {name: tuple(np.mean([view[name] for view in views], axis=0).tolist()) for name in PART}
     aim = np.array([to_base_frame(q, stage.true) for q in PART.values()])
     stage.pose = (float(begin[0]), float(begin[1]), float(begin[2]))
     after: list[tuple[float, float]] = []
-    # As after the first part: an unconfirmed calibration would divide a long first correction.
+    # The calibration counts as confirmed, as after a first part: otherwise a long first correction would be divided.
     task = AlignmentTask(structs.replace(cameras, confirmed=True), targets, looks=pictures)
     result = stage.drive(align(task), lambda: after.append(distance_left(stage, aim)))
     return *after[0], len(result.corrections) if result.reached else 0

@@ -28,7 +28,7 @@ R_3 = 0.5 * L0 * np.array([0.0, 1.0, -math.sqrt(3) / 3])
 
 
 def numpy_port(pose: Array, velocity: Array, acceleration: Array) -> Array:
-    """Return the output of inverse_into, (6, 3), for the symmetric robot, by (2) to (19) as in the paper."""
+    """Return the output of inverse_into, (6, 3), for the symmetric robot, from equations (2) to (19) of the paper."""
     out = np.empty((6, 3))
     phi, omega, epsilon = pose[2], velocity[2], acceleration[2]
     centre = np.array([pose[0], pose[1], 0.0])
@@ -60,7 +60,7 @@ def _theta(angle: float) -> Array:
 
 
 def measure() -> dict[str, float]:
-    """Return microseconds per call, ratios to the numpy port, and millions of poses per second, on this core."""
+    """Return the time per call [µs], the ratios to the numpy port, and the poses per second [1e6/s] on this core."""
     warm_up()
     geometry = Geometry.symmetric(L0)
     legs, motion, out = geometry.packed(), np.stack([POSE, VELOCITY, ACCELERATION]), np.empty((6, 3))
@@ -90,7 +90,7 @@ def measure() -> dict[str, float]:
 
 
 def _seconds(call: Callable[[], object]) -> float:
-    """Return the minimum time of a call over five runs of a fifth of a second [s]."""
+    """Return the shortest time of a call [s] in five runs, each of which takes at least a fifth of a second."""
     timer = timeit.Timer(call)
     number, _ = timer.autorange()
     return min(timer.repeat(repeat=5, number=number)) / number

@@ -1,8 +1,9 @@
-"""Time from a goal's put to the first setpoint that it changes, as seen by a third party on the bus.
+"""Time from the sending of a goal to the first setpoint that the goal changes, as seen by a listener on the bus.
 
-At rest and in motion. In motion the robot cruises on a straight line, with constant velocity feed-forward of each
-slider until the goal that turns it back changes that. Setpoints have the kernel's time of arrival at the third party,
-to which the drives' process forwards them; the time of a goal is taken before the client's call.
+The time is measured at rest and in motion. In motion, the robot moves along a straight line at constant speed, so that
+the velocity feed-forward of each slider is constant until a goal reverses the motion. The process of the drives
+forwards the setpoints to the listener, where the kernel records the time of arrival. The time of a goal is that before
+the client's call.
 """
 
 from __future__ import annotations
@@ -27,25 +28,25 @@ from trirail_drivers.interface import NAMES
 
 SETPOINTS = {layout.RPDO2 + node for node in range(1, 1 + len(NAMES))}
 STEADY = 20
-"""Maximum change of the feed-forward in a cruise, by rounding at 1e7 counts per metre [counts/s]."""
+"""Maximum change of the feed-forward by rounding, at constant speed and 1e7 counts per metre [counts/s]."""
 CHANGE_TIMEOUT_S = 0.1
-"""Time limit for a change; goals without one are left out, and counted [s]."""
+"""Time limit for a change of the setpoints [s]. Goals without a change in this time are counted but not averaged."""
 END = 0.08
-"""Coordinate x of the goals, at which motions reverse [m]."""
+"""Largest x coordinate of the goals, between -END and END [m]."""
 
 
 class Setpoint(NamedTuple):
-    """A setpoint on the bus."""
+    """Setpoint that was sent on the bus."""
 
     t: float
     """Time since 1970 [s]."""
     identifier: int
     velocity: int
-    """Feed-forward [counts/s]."""
+    """Velocity feed-forward [counts/s]."""
 
 
 class Listener:
-    """A third party on the bus, which keeps every setpoint with its time of arrival."""
+    """Listener on the bus, which stores every frame with its time of arrival."""
 
     def __init__(self, path: str) -> None:
         self._bus = UnixBus(path)
@@ -85,7 +86,7 @@ class Listener:
 
 @contextlib.contextmanager
 def listener(path: str) -> Iterator[Listener]:
-    """Run a third party on a bus."""
+    """Run a listener on the bus at `path`."""
     made = Listener(path)
     try:
         yield made
@@ -94,11 +95,11 @@ def listener(path: str) -> Iterator[Listener]:
 
 
 Measured = Callable[[Robot, Listener, random.Random], float | None]
-"""Function that measures one goal [s]; None if it changed nothing."""
+"""Function that measures the time for one goal [s]; it returns None if the goal changed no setpoint in time."""
 
 
 def measure(made: Rig, goals: int) -> dict[str, Any]:
-    """Send `goals` goals at rest, and as many in motion; return milliseconds at QUANTILES."""
+    """Send `goals` goals at rest, and as many in motion; return the times at QUANTILES [ms]."""
     chance = random.Random(3)
     with listener(made.bus) as heard:
         at_rest = _each(goals, made.robot, heard, chance, _at_rest)
@@ -113,7 +114,7 @@ def measure(made: Rig, goals: int) -> dict[str, Any]:
 
 
 def _each(goals: int, robot: Robot, heard: Listener, chance: random.Random, measured: Measured) -> list[float | None]:
-    """Measure `goals` goals; one during which a stall of the machine faults the drives counts as without effect."""
+    """Measure `goals` goals. A goal counts as without effect if a stall of the machine causes a fault of the drives."""
     latencies: list[float | None] = []
     ready = False
     for _ in range(goals):
@@ -144,7 +145,7 @@ def _at_rest(robot: Robot, heard: Listener, chance: random.Random) -> float | No
 
 
 def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | None:
-    """Measure a goal that reverses the cruise of a previous one."""
+    """Measure a goal that reverses the motion of a previous goal."""
     state = robot.state()
     side = 1.0 if state.commanded.pose[0] < 0.0 else -1.0
     robot.move_to(x=side * END, y=0.0, phi=0.0)
@@ -161,7 +162,7 @@ def _in_motion(robot: Robot, heard: Listener, chance: random.Random) -> float | 
 
 
 def first_change(setpoints: list[Setpoint], put: float) -> float | None:
-    """Return the time from the put to the first setpoint with a different feed-forward [s]; None if there is none."""
+    """Return the time from `put` to the first setpoint with a different feed-forward [s]; None if there is none."""
     steady = {one.identifier: one.velocity for one in setpoints if one.t <= put}
     for one in setpoints:
         if one.t <= put or one.identifier not in steady:

@@ -1,11 +1,14 @@
 """Real-time performance of the loop in a complete service: cost of a cycle, lateness and missed ticks.
 
 The service runs as for a user, with gateway, recorder and a client that watches every cycle, under continuous goals.
-cyclictest runs in the same minute on the same processor, one priority above the loop, in as many runs as lateness is
-compared in. The simulated drives are a process of the service, real-time on the other processor, so that a cycle
-contains only the loop; if a virtual machine stalls one of the two, the other waits. Faults are counted and reset.
-Before and after the service, the bare loop runs with only a cycle's frames, as in trirail doctor, beside cyclictest:
-its time is the machine's share. A rate that the service cannot keep is reported as such.
+The measurement is divided into several runs. In each run, cyclictest runs at the same time on the same processor, one
+priority above the loop, to measure the lateness of the machine. The simulated drives are a process of the service,
+which runs in real time on the other processor, so that a cycle contains only the loop. If a virtual machine stalls one
+of the two processors, the other waits. Faults are counted and reset.
+
+Before and after the service, a bare loop that only exchanges a cycle's frames, as in trirail doctor, runs together with
+cyclictest. The time of the bare loop is the machine's share of the service's time. If the service cannot keep a rate,
+the report says so.
 """
 
 from __future__ import annotations
@@ -30,15 +33,15 @@ from trirail.wire.records import PART_NAMES, Part, unpack
 from trirail.wire.vocabulary import Mode
 
 MOST_FAULTS = 0.2
-"""Maximum number of faults per second at a rate that counts as kept [1/s]."""
+"""Maximum number of faults per second at which the service still counts as able to keep the rate [1/s]."""
 BARE = 1.0 / 6.0
-"""Duration of the bare loop before the service, and again after it, as a share of the service's."""
+"""Duration of the bare loop before the service, and again after it, as a fraction of the service's duration."""
 SETTLE = 2.0
-"""Duration of goals before the measurement, to exclude one-time effects [s]."""
+"""Duration for which goals are sent before the measurement, to exclude one-time effects [s]."""
 
 
 def measure(seconds: float, rates: tuple[int, ...], runs: int) -> dict[str, Any]:
-    """Measure each rate [Hz] for `seconds` in total over `runs`; return microseconds at QUANTILES, and counts."""
+    """Measure each rate [Hz] for `seconds`, divided into `runs` runs; return times at QUANTILES [µs], and counts."""
     return {"quantiles": QUANTILES, "rates": [_measure_rate(rate, seconds, runs) for rate in rates]}
 
 
@@ -56,7 +59,7 @@ def _measure_rate(rate: int, seconds: float, runs: int) -> dict[str, Any]:
 
 
 def with_ratios(service: dict[str, Any], bare: dict[str, Any]) -> dict[str, Any]:
-    """Return the results of a service's loop and of the bare one, and their ratios if the service kept the rate."""
+    """Return the results of the service's loop and of the bare loop, and their ratios if the service kept the rate."""
     results = {**service, "bare": bare}
     if "not_kept" not in service:
         pairs = {what: zip(service[what], bare[what], strict=True) for what in ("cycle", "lateness")}
@@ -107,17 +110,17 @@ def _service(rate: int, seconds: float, runs: int, folder: Path) -> dict[str, An
 
 
 def _bare(rate: int, seconds: float, result: Path) -> tuple[bare_loop.Cycles, int]:
-    """Measure the bare loop in a process of its own; return its cycles and the ticks that the machine lost."""
+    """Measure the bare loop in a separate process; return its cycles and the number of ticks that the machine lost."""
     loop = load(SIM).loop
     with ProcessPoolExecutor(1, get_context("spawn"), bare_loop.prepare) as alone:
-        alone.submit(os.getpid).result()  # it has compiled
+        alone.submit(os.getpid).result()  # wait until it has compiled the loop
         beside = Beside(seconds, 1_000_000 // rate, loop.priority, result)
         cycles = alone.submit(bare_loop.measure_alone, loop, rate, seconds).result()
     return cycles, beside.ticks_lost(beside.lateness())
 
 
 def together(parts: list[tuple[bare_loop.Cycles, int]]) -> dict[str, Any]:
-    """Return the results of all runs of the bare loop, and the ticks that the machine lost in total."""
+    """Return the combined results of all runs of the bare loop, and the total number of ticks that the machine lost."""
     return {
         "cycles": sum(len(cycles.work) for cycles, _ in parts),
         "answers": sum(cycles.answers for cycles, _ in parts),
@@ -129,7 +132,7 @@ def together(parts: list[tuple[bare_loop.Cycles, int]]) -> dict[str, Any]:
 
 
 class Faults:
-    """Counter of faults, which resets them so that the measurement continues: any stall faults external drives."""
+    """Counter of faults, which also resets them, since every stall of the machine causes a fault of the drives."""
 
     def __init__(self, robot: Robot) -> None:
         self.told: list[str] = []
@@ -137,8 +140,8 @@ class Faults:
         self._robot = robot
 
     def mend(self) -> None:
-        """Power up again if the robot is in fault."""
-        with contextlib.suppress(TrirailError):  # its cause may last: the next goal is refused too
+        """If the robot is in fault, reset the fault and power the robot up again."""
+        with contextlib.suppress(TrirailError):  # the cause may persist; then the next goal is refused too
             state = self._robot.state()
             if state.mode == Mode.FAULT:
                 self._robot.reset()
@@ -147,7 +150,7 @@ class Faults:
 
 
 def _collect(made: Rig, seconds: float, faults: Faults) -> tuple[NDArray[np.void], int]:
-    """Keep the robot in motion; return the record of every cycle, and the number of accepted goals."""
+    """Send goals continuously; return the record of every cycle, and the number of accepted goals."""
     batches: list[bytes] = []
     with made.robot.records(batches.append):
         accepted = without_pause(made.robot, seconds, faults.mend)
@@ -157,7 +160,7 @@ def _collect(made: Rig, seconds: float, faults: Faults) -> tuple[NDArray[np.void
 
 
 def _lateness(rows: NDArray[np.void], period_us: int) -> NDArray[np.float64]:
-    """Return the lateness of each cycle of a run, including preceding missed ticks, (n,) [µs]."""
+    """Return the lateness of each cycle of a run, including the ticks missed before the cycle, (n,) [µs]."""
     lateness: NDArray[np.float64] = rows["lateness_ns"] / 1000.0 + _missed(rows) * period_us
     return lateness
 
@@ -167,7 +170,7 @@ def _missed(rows: NDArray[np.void]) -> NDArray[np.int64]:
 
 
 def _run(rows: NDArray[np.void], beside: NDArray[np.float64], of: Beside, period_us: int) -> dict[str, Any]:
-    """Return the lateness of one run and that of the machine itself."""
+    """Return the lateness of the loop in one run, that of the machine itself, and their ratio."""
     lateness = quantiles(_lateness(rows, period_us))
     own = quantiles(beside)
     return {

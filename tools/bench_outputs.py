@@ -1,11 +1,11 @@
-"""Outputs on the path: places at which they switch, beside a client that watches the state; and the time of a cycle.
+"""Outputs on the path: the places at which they switch, compared with a client, and the time that switching takes.
 
-A pulse's place is compared with the commanded pose of the setpoint that its output came with. The client does what
-users of a robot without marks do: it sends `set_output` once the state is behind the place. The record of each cycle
-shows where an output took effect.
+The place of a pulse is compared with the commanded pose of the setpoint with which its output was sent. The client does
+what users of a robot without marks do: it watches the state, and sends `set_output` once the robot has passed the
+place. The record of each cycle shows where an output took effect.
 
-The time is that of the compiled switch alone, in each cycle of a path, beside two calls of the clock. The program
-sleeps between cycles, as the loop does: caches are as cold as there.
+The time is that of the compiled switching function alone, in each cycle of a path, and includes two calls of the clock.
+The program sleeps between cycles, as the loop does, so that the processor's caches are as cold as in the loop.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from trirail.wire.marks import Mark
 from trirail.wire.records import DTYPE, unpack
 
 SECTIONS: Final = '[outputs.valve]\ndrive = "A"\nbit = 16\n'
-"""Sections of the configuration."""
+"""Sections that are added to the configuration."""
 FIRST_BIT: Final = 16
 BIT: Final = 1 << FIRST_BIT
 SPEEDS: Final = (0.01, 0.1, 0.25)
@@ -39,15 +39,15 @@ SPEEDS: Final = (0.01, 0.1, 0.25)
 TRAVELS: Final = (0.02, 0.1, 0.2)
 """Length of the path at each speed, along x [m]."""
 CRUISE: Final = 0.3
-"""Share of the path at each end that is left for its acceleration."""
+"""Fraction of the path at each end that has no marks, since the robot accelerates or brakes there."""
 TIMED_OUTPUTS: Final = (0, 1, 8)
-"""Numbers of outputs for which the switch is timed."""
+"""Numbers of outputs for which the switching function is timed."""
 PASSES: Final = 2
-"""Number of times that the path is run for that."""
+"""Number of times that the path is repeated to time the switching function."""
 
 
 def measure(made: Rig, pulses: int, tries: int) -> dict[str, Any]:
-    """Return the errors of place at each speed [µm], of `pulses` marks and of `tries` by a client; and the times."""
+    """Return the position errors of `pulses` marks and of `tries` attempts by a client at each speed, and the times."""
     robot = DrawnRobot.from_info(made.robot.info())
     limit, rate_hz = robot.limits.platform.velocity[0], robot.rate_hz
     rows = []
@@ -66,7 +66,7 @@ def measure(made: Rig, pulses: int, tries: int) -> dict[str, Any]:
 
 
 def _errors_of_marks(robot: Robot, travel: float, speed: float, pulses: int) -> list[float]:
-    """Return how far from their places the pulses of one goal have begun [µm]."""
+    """Return the distance between the intended and the actual beginning of each pulse of one goal [µm]."""
     robot.move_to(x=-travel / 2.0, y=0.0, phi=0.0).wait()
     length = travel * (1.0 - 2.0 * CRUISE)
     increment, begin = length / pulses, travel * CRUISE
@@ -78,7 +78,7 @@ def _errors_of_marks(robot: Robot, travel: float, speed: float, pulses: int) -> 
 
 
 def _error_of_client(robot: Robot, travel: float, speed: float) -> float:
-    """Return how far from the middle of the path a client has switched that watches the state [µm]."""
+    """Return the distance from the middle of the path at which a client that watches the state has switched [µm]."""
     robot.move_to(x=-travel / 2.0, y=0.0, phi=0.0).wait()
     robot.set_output("valve", False)
     batches: list[bytes] = []
@@ -97,7 +97,7 @@ def _error_of_client(robot: Robot, travel: float, speed: float) -> float:
 
 
 def times(passes: int) -> list[dict[str, Any]]:
-    """Return the times of the switch in each cycle of a path with 100 pulses of each output [µm]."""
+    """Return the times of the switching function in the cycles of a path with 100 pulses of each output [µm]."""
     return [_times(count, passes) for count in TIMED_OUTPUTS]
 
 
@@ -141,7 +141,7 @@ def _timed(
     durations: NDArray[np.int64],
     moment: NDArray[np.int64],
 ) -> int:
-    """Write the duration of the switch in each cycle [ns]; return the number of switches."""
+    """Write the duration of the switching function in each cycle [ns]; return how many times outputs switched."""
     switched = 0
     due = now_ns(moment)
     for cycle in range(len(durations)):

@@ -95,7 +95,7 @@ def _deviations(arrivals: list[float]) -> list[float]:
 
 
 def _linuxcnc() -> str:
-    """Return whether LinuxCNC's servo thread can be compared on this machine, in words."""
+    """Return a sentence that states whether LinuxCNC's servo thread can be compared on this machine."""
     if shutil.which("halrun") is None:
         return "not installed (Debian's package is linuxcnc-uspace): no servo thread to compare with"
     return "installed: run its latency-histogram beside this, it measures its servo thread itself"

@@ -1,4 +1,4 @@
-"""Service under test, on its own simulated drives or on a bus with listeners, and continuous goals."""
+"""Service for the benchmarks, on its own simulated drives or on a bus with listeners, and continuous goals for it."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from trirail.client.client import Robot
 from trirail.errors import TrirailError
 
 GOALS_HZ = 20.0
-"""Rate of goals "without pause": each goal replaces the previous one before its end [1/s]."""
+"""Rate of the continuous goals [1/s], so high that each goal replaces the previous goal before that has ended."""
 SPAN = (0.05, 0.05, 0.4)
-"""Maximum distance of goals from the centre [m, m, rad]."""
+"""Maximum distance of the goals from the centre in each coordinate [m, m, rad]."""
 BITRATE = 8_000_000
-"""Bitrate of the virtual bus, high enough for its load not to limit the measured rates [bit/s]."""
+"""Bit rate of the virtual bus [bit/s], so high that the bus load does not limit the measured rates."""
 
 
 QUANTILES = (50.0, 99.0, 99.9, 100.0)
 
 
 class Rig(NamedTuple):
-    """A running service and a client of it."""
+    """Running service, and a client of this service."""
 
     robot: Robot
     locator: str
     bus: str
-    """Path of the bus between processes; "" if the bus is the service's own."""
+    """Path of the bus between processes; "" if the service simulates the drives itself."""
 
 
 def quantiles(values: list[float] | NDArray[np.float64]) -> list[float]:
@@ -48,7 +48,7 @@ def quantiles(values: list[float] | NDArray[np.float64]) -> list[float]:
 
 @contextlib.contextmanager
 def rig(rate_hz: int, own: bool = False, sections: str = "", times: Path | None = None) -> Iterator[Rig]:
-    """Run an enabled service at a rate, on its `own` simulated drives or on some on a bus with listeners.
+    """Run an enabled service at a rate, on its `own` simulated drives or on drives on a bus with listeners.
 
     `sections` are added to its configuration. The drives on the bus write the arrivals of SYNC to `times` at the end.
     """
@@ -64,12 +64,12 @@ def rig(rate_hz: int, own: bool = False, sections: str = "", times: Path | None 
         robot = stack.enter_context(Robot("demo", locator, user="bench"))
         robot.enable()
         yield Rig(robot, locator, bus)
-        with contextlib.suppress(TrirailError):  # it may be in fault, which is reported elsewhere
+        with contextlib.suppress(TrirailError):  # the robot may be in fault, which is reported elsewhere
             robot.disable()
 
 
 def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
-    """Write the configuration; return its file and the locator of the service."""
+    """Write the configuration of a service; return the file and the locator of the service."""
     config, locator = own_service.private(folder)
     text = config.read_text(encoding="utf-8")
     changes = {"rate_hz": str(rate_hz), "bitrate": str(BITRATE)}
@@ -85,7 +85,7 @@ def configured(folder: Path, rate_hz: int, own: bool) -> tuple[Path, str]:
 
 @contextlib.contextmanager
 def drives(config: Path, bus: str, times: Path | None = None) -> Iterator[None]:
-    """Run the drives of a configuration in a process of their own, which writes the arrivals of SYNC to `times`."""
+    """Run the drives of a configuration in a separate process, which writes the arrivals of SYNC to `times`."""
     command = [sys.executable, str(Path(__file__).with_name("bench_drives.py")), str(config), bus]
     if times is not None:
         command.append(str(times))
@@ -99,7 +99,10 @@ def drives(config: Path, bus: str, times: Path | None = None) -> Iterator[None]:
 
 
 def without_pause(robot: Robot, seconds: float, refused: Callable[[], None] = lambda: None) -> int:
-    """Send GOALS_HZ goals per second for `seconds`; return how many were accepted. Call `refused` for others."""
+    """Send GOALS_HZ goals per second for `seconds`; return the number of accepted goals.
+
+    `refused` is called after each refused goal.
+    """
     choice, accepted = random.Random(1), 0
     due = began = time.monotonic()
     while time.monotonic() < began + seconds:

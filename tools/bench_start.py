@@ -1,4 +1,4 @@
-"""Cost of a start: time and processor time until the service is up, then the memory of each process."""
+"""Cost of a start: time and processor time until the service answers, and the memory of each process at rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from trirail.telemetry.sinks import free_port
 
 TICK = os.sysconf("SC_CLK_TCK")
 START_DURATION_S = 3.0
-"""Time after which the start has finished completely [s]."""
+"""Time after the service has first answered, until all work of the start is done [s]."""
 WATCHED = 5.0
 """Duration of the observation of a service at rest [s]."""
 
@@ -53,6 +53,6 @@ def _processor(pid: int) -> float:
 
 
 def _memory(pid: int) -> float:
-    """Return the memory of a process, with its share of memory common to several (PSS) [1e6 bytes]."""
+    """Return the memory of a process, including its share of memory that several processes use (PSS) [1e6 bytes]."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1024e-6

@@ -1,6 +1,6 @@
-"""Check of a log of the actual CAN frames against CiA 301, CiA 402 and the robot's limits.
+"""Check of a log of CAN frames against CiA 301, CiA 402 and the robot's limits.
 
-It has its own tables of the standards and shares no code with the driver except the layout of its PDOs.
+The check has its own tables of the standards, and shares no code with the driver except the layout of the frames.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ HELD = {
     "power": "controlwords and states in CiA 402's order, each state asked for, no power without a setpoint",
     "capture": "the service's own log has the same frames in the same order",
 }
-"""Properties that hold if `problems` and `differences` find nothing."""
+"""Properties that are proved if `problems` and `differences` find nothing."""
 
 STATES = {
     0x00: "not ready to switch on",
@@ -35,7 +35,9 @@ STATES = {
     0x0F: "fault reaction active",
     0x08: "fault",
 }
-"""Statusword 6041h: bits 0 to 3, 5 and 6; bit 5 has no meaning in the first state and in those with bit 3 or 6."""
+"""States by bits 0 to 3, 5 and 6 of the statusword 6041h. Bit 5 has no meaning in the first state, nor in the states
+with bit 3 or 6.
+"""
 
 ASKED_BY = {
     ("not ready to switch on", "switch on disabled"): None,
@@ -53,14 +55,14 @@ ASKED_BY = {
     ("fault reaction active", "fault"): None,
     ("fault", "switch on disabled"): {0x80},
 }
-"""Transitions of CiA 402, and the controlwords that command them; None for those that a drive makes by itself."""
+"""Controlwords that command each transition of CiA 402; None for a transition that a drive makes by itself."""
 
 ALLOWED_PREDECESSORS = {0x07: {0x06, 0x0F}, 0x0F: {0x07}}
-"""Controlwords that may precede each controlword on the way to power."""
+"""Controlwords that may precede each of these controlwords during a power-up."""
 
 
 class Frame(NamedTuple):
-    """A data frame with an 11-bit identifier."""
+    """Data frame with an 11-bit identifier."""
 
     t: float
     """Time since 1970 [s]."""
@@ -69,7 +71,7 @@ class Frame(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """A setpoint of one drive."""
+    """Setpoint of one drive."""
 
     t: float
     position: float
@@ -86,7 +88,7 @@ def read(path: Path) -> list[Frame]:
 
 
 def problems(log: Sequence[Frame], config: Config, missed: int, until: float) -> list[str]:
-    """Return the errors in the frames before the time `until`, one line each; the service reported `missed` ticks."""
+    """Return the errors in the frames before the time `until`, one line each; `missed` ticks were reported missing."""
     log = [frame for frame in log if frame.t < until]
     lines = sync_problems(log, config.period, missed, until)
     for name, drive in zip(NAMES, config.drives.each, strict=True):
@@ -96,7 +98,7 @@ def problems(log: Sequence[Frame], config: Config, missed: int, until: float) ->
 
 
 def sync_problems(log: Sequence[Frame], period: float, missed: int, until: float) -> list[str]:
-    """Return the errors of the SYNCs before the time `until`, for a cycle of `period` seconds."""
+    """Return the errors of the SYNCs before the time `until`, given the period [s] and the reported missed ticks."""
     syncs = [frame.t for frame in log if frame.identifier == layout.SYNC and frame.t < until]
     if len(syncs) < 3:
         return [f"SYNC: {len(syncs)} in the log: nothing ran"]
@@ -104,7 +106,10 @@ def sync_problems(log: Sequence[Frame], period: float, missed: int, until: float
 
 
 def differences(own: Sequence[Frame], log: Sequence[Frame], until: float) -> list[str]:
-    """Return the identifiers whose frames in the service's log, before `until`, are no contiguous run on the bus."""
+    """Return a line for each identifier whose frames in the service's log and on the bus differ before `until`.
+
+    The frames of the service's log must be a contiguous part of those on the bus.
+    """
     here, there = _by_identifier([frame for frame in own if frame.t < until]), _by_identifier(log)
     lines = []
     for identifier, frames in here.items():
@@ -117,7 +122,7 @@ def differences(own: Sequence[Frame], log: Sequence[Frame], until: float) -> lis
 
 
 def statistics(log: Sequence[Frame], config: Config, until: float) -> dict[str, float]:
-    """Return statistics: numbers of frames, and intervals of SYNC [ms]."""
+    """Return statistics of the frames before `until`: numbers of frames, and intervals between SYNCs [ms]."""
     log = [frame for frame in log if frame.t < until]
     syncs = [frame.t for frame in log if frame.identifier == layout.SYNC]
     intervals = sorted(after - before for before, after in itertools.pairwise(syncs))
@@ -139,10 +144,13 @@ def _by_identifier(log: Sequence[Frame]) -> dict[int, list[bytes]]:
 
 
 def _sync_problems(syncs: Sequence[float], period: float, missed: int) -> Iterator[str]:
-    """Yield deviations of the ticks from the grid that the first one starts: late ticks are skipped, not caught up."""
+    """Yield the deviations of the SYNCs from the grid of ticks that begins with the first SYNC.
+
+    A tick that is too late must be skipped, not caught up.
+    """
     began = syncs[0]
     for number, t in enumerate(syncs):
-        # No tick is earlier than its place on the grid minus the lateness of the first one.
+        # The grid begins late if the first tick was late, so later ticks may seem early by this lateness.
         if t - began < (number - 1) * period:
             early = number * period - (t - began)
             yield f"SYNC {number} comes {early:.4f} s too early: ticks were caught up in a burst"
@@ -165,7 +173,7 @@ def _setpoints(log: Sequence[Frame], drive: Drive) -> list[Setpoint]:
 
 
 def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> Iterator[str]:
-    """Yield violations of limits and continuity: each step is a velocity, each change of it an acceleration."""
+    """Yield violations of limits and of continuity: steps of position must fit the velocity and acceleration limits."""
     limits, period, leg = config.limits.slider, config.period, config.drives.each.index(drive)
     velocity, acceleration = limits.velocities[leg], limits.accelerations[leg]
     count = 1.0 / drive.counts_per_metre
@@ -183,7 +191,7 @@ def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> It
         step = after.position - before.position
         if abs(step) > velocity * period + 2 * count:
             yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}: {abs(step) / period:.3f} m/s"
-        # Velocity changes by at most a·T within the step, so that the step equals its mean times the period.
+        # The velocity changes by at most a·T within the step, so the step is about the mean velocity times the period.
         mean = 0.5 * (before.velocity + after.velocity) * period
         if abs(step - mean) > 0.25 * acceleration * period**2 + 3 * count:
             yield f"step of {step * 1e3:.4f} mm at {after.t:.6f}, but its feed-forward says {mean * 1e3:.4f} mm"
@@ -202,7 +210,7 @@ def _setpoint_problems(log: Sequence[Frame], drive: Drive, config: Config) -> It
 def _power_problems(log: Sequence[Frame], node: int) -> Iterator[str]:
     """Yield errors in the order of controlwords and in the resulting states."""
     word, state = 0x00, ""
-    words = {0x00}  # sent since the drive last reported a change
+    words = {0x00}  # controlwords sent since the drive last reported a change
     setpoint = started = False
     for frame in log:
         if frame.identifier == layout.NMT and frame.data[0] == layout.NMT_START and frame.data[1] in {0, node}:

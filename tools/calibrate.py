@@ -1,12 +1,12 @@
-"""Identification of a robot's geometry as built from measured poses, written as its [geometry] section.
+"""Identification of a robot's geometry as built from measured poses. The result is a [geometry] section.
 
 python tools/calibrate.py poses.csv --config robot.toml --output geometry.toml
 python tools/calibrate.py poses.csv --config robot.toml --map --output as_built.toml
 
-With --map it keeps the geometry and writes the map of the robot's remaining deviations from it, for [correction].
-The file has the columns x, y, phi, A, B, C: poses of the platform measured by an external instrument, and the slider
-readings there, in metres and radians. kinematics.calibration has the mathematics. The report goes to standard error.
-Needs trirail[analysis].
+With --map, the geometry stays as it is, and a map of the robot's deviations from it is written, for [correction].
+The file with the poses has the columns x, y, phi, A, B, C: poses of the platform that an external instrument has
+measured, and the slider positions at these poses, in metres and radians. The mathematics are described in
+kinematics.calibration. The report is written to standard error. Needs trirail[analysis].
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ counted from: both stay as in the starting geometry."""
 
 
 def read(path: Path, *, degrees: bool = False) -> tuple[Array, Array, list[int]]:
-    """Return poses (N, 3) and sliders (N, 3) in m and rad, and their line numbers.
+    """Read a file; return its poses, (N, 3) [m, m, rad], slider positions, (N, 3) [m], and line numbers.
 
     Raises FileError, or CalibrationError with the line of the error.
     """
@@ -75,7 +75,7 @@ def _numbers(names: Sequence[str], fields: Sequence[str], line: int, bare: str) 
 
 
 def section(geometry: Geometry) -> str:
-    """Return the [geometry] section of a configuration, exact to the last digit."""
+    """Return a geometry as the [geometry] section of a configuration, with all digits."""
     labels = ", ".join(f'"{label}"' for label in geometry.labels)
     lines = ["[geometry]", f'kind = "{geometry.kind}"', f"labels = [{labels}]"]
     for name, leg in zip(geometry.labels, geometry.each, strict=True):
@@ -86,7 +86,7 @@ def section(geometry: Geometry) -> str:
 
 
 def describe(result: Calibration, lines: Sequence[int]) -> str:
-    """Return the report as text."""
+    """Return the report on a calibration as text."""
     text = [f"{len(lines)} poses; the residuals are {result.misfit:.2f} times the stated noise", ""]
     text.append(f"{'residual':<36}{'rms':>10}{'greatest':>12}")
     for (name, unit, scale), column in zip(COORDINATES, np.abs(result.residuals.T), strict=True):
@@ -114,7 +114,7 @@ def describe(result: Calibration, lines: Sequence[int]) -> str:
 
 
 def calibrate(options: argparse.Namespace) -> None:
-    """Read, identify, report, write. Raises TrirailError."""
+    """Read the poses, identify the geometry or the map, report, and write the result. Raises TrirailError."""
     start = config.geometry(config.load(options.config).geometry)
     try:
         poses, sliders, lines = read(options.poses, degrees=options.deg)
@@ -134,7 +134,10 @@ def calibrate(options: argparse.Namespace) -> None:
 
 
 def map_text(options: argparse.Namespace, robot: Geometry, poses: Array, sliders: Array) -> str:
-    """Fit the map, report, and return its file. Raises CalibrationError, also if the service would refuse it."""
+    """Fit the map, print the report, and return the content of the map's file.
+
+    Raises CalibrationError if the map cannot be fitted, or if the service would refuse it.
+    """
     limits = config.load(options.config).limits
     try:
         fit = correction_fit.fit(robot, poses, sliders, config.room(limits), options.cells)
@@ -160,7 +163,7 @@ def describe_map(fit: correction_fit.Fit) -> str:
 
 
 def write(text: str, output: Path | None) -> None:
-    """Write to a file, or to standard output."""
+    """Write a text to a file or, without a file, to standard output. Raises CalibrationError."""
     if output is None:
         print(text, end="")
         return
@@ -181,7 +184,7 @@ def angle(text: str) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Calibrate; return the exit code."""
+    """Run the command line; return the exit code."""
     parser = argparse.ArgumentParser(description="Identifies the geometry of a robot as built from measured poses.")
     columns = f"CSV file with the columns {', '.join(COLUMNS)} [m, rad], or with units: 12.5um, 3arcsec"
     parser.add_argument("poses", type=Path, help=columns)

@@ -1,12 +1,12 @@
-"""Kill matrix: every process of the service killed, ended and frozen in every mode, with the drives in a process apart.
+"""Kill matrix: every process of the service is killed, ended and frozen in every mode. The drives run separately.
 
-python tools/chaos.py                   all of it, forty minutes
-python tools/chaos.py --sample 10       ten cases, drawn by --seed
+python tools/chaos.py                   all cases, forty minutes
+python tools/chaos.py --sample 10       ten cases, chosen at random by --seed
 python tools/chaos.py --only moving/loop/KILL
 
 Each case checks that the drives are at rest and unpowered, that no setpoint has jumped, that the goal has ended exactly
-once, that no process is left, that the ports are free, that the recording can be read, and that the next start works.
-The exit code is 1 if any check fails.
+once, that no process is left, that the ports are free, that the recording can be read, and that the service can start
+again. The exit code is 1 if any check fails.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ HARM: dict[str, tuple[signal.Signals, float | None]] = {
 }
 GOAL = "chaos"
 STANDS_AFTER = 3.0
-"""Time limit for standstill of a robot that no process can stop any more [s]."""
+"""Time after which a robot that no process can stop any more must be at rest [s]."""
 
 
 class Case(NamedTuple):
-    """Single disturbance of a process in a mode."""
+    """Disturbance of one process in one mode."""
 
     mode: str
     victim: str
@@ -53,14 +53,14 @@ class Case(NamedTuple):
 
     @property
     def ends_the_service(self) -> bool:
-        """Whether it ends the service."""
+        """Whether the disturbance ends the service."""
         if self.victim == "fork-server":
             return self.harm == "KILL"
         return self.victim == "loop" or (self.victim == "supervisor" and self.harm in ("KILL", "TERM"))
 
     @property
     def stops_the_robot(self) -> bool:
-        """Whether the robot must be at rest soon afterwards."""
+        """Whether the robot must be at rest soon after the disturbance."""
         return self.ends_the_service or self.victim == "gateway"
 
     @property
@@ -70,8 +70,8 @@ class Case(NamedTuple):
             return (0,) if self.harm not in {"KILL", "STOP"} else (-signal.SIGKILL,)
         if self.victim == "loop" or (self.victim, self.harm) == ("fork-server", "KILL"):
             return (1,)
-        # A recorder that is frozen as the service ends is killed and loses its data, which is a failure. A frozen
-        # fork server does not report how the others have ended, which may have been a failure.
+        # A recorder that is frozen when the service ends is killed and loses its data, which counts as a failure. A
+        # frozen fork server does not report how the other processes have ended, so the service may report a failure.
         return (0, 1) if self.victim in ("recorder", "fork-server") and self.harm == "STOP" else (0,)
 
     def __str__(self) -> str:
@@ -82,7 +82,7 @@ CASES = [Case(*case) for case in itertools.product(MODES, PROCESSES, HARM)]
 
 
 def enter_mode(mode: str, rig: Rig, robot: Robot, ask: Callable[[str], object]) -> None:
-    """Bring a disabled robot to a mode, by the goal GOAL if it needs one.
+    """Bring a disabled robot into a mode, with the goal GOAL if the mode requires a goal.
 
     `ask` sends a command and does not wait for its execution.
     """
@@ -107,7 +107,7 @@ def enter_mode(mode: str, rig: Rig, robot: Robot, ask: Callable[[str], object]) 
 
 
 def run(rig: Rig, case: Case) -> None:
-    """Apply a case to a service that is up and disabled, and check the outcome. Raises Failed."""
+    """Apply a case to a running service with a disabled robot, and check the outcome. Raises Failed."""
     heard: list[str] = []
     victim = rig.process(case.victim)
     faults = rig.major_faults()
@@ -135,7 +135,7 @@ def run(rig: Rig, case: Case) -> None:
     if rig.service.returncode not in case.exit_codes:
         raise Failed(f"exit code {rig.service.returncode}, expected was {case.exit_codes[0]}")
     wait_for(lambda: not rig.remains(), "all processes have ended")
-    time.sleep(max(0.0, stands_by - time.monotonic()))  # the service may have ended before the drives' watchdogs know
+    time.sleep(max(0.0, stands_by - time.monotonic()))  # the service may end before the drives' watchdogs react
     rig.check_rest()
     rig.check_unpowered()
     rig.check_setpoints()
@@ -145,7 +145,7 @@ def run(rig: Rig, case: Case) -> None:
 
 
 def _check_continues(rig: Rig, case: Case) -> list[str]:
-    """Check that the service continues and obeys a stop; return the reported end of the goal."""
+    """Check that the service continues and obeys a stop; return the reported outcomes of the goal."""
     if case.stops_the_robot:
         time.sleep(STANDS_AFTER)
         rig.check_rest()
@@ -168,7 +168,7 @@ def _wait_end(rig: Rig) -> None:
 
 
 def _check_goal(rig: Rig, case: Case, heard: list[str]) -> None:
-    """Check that the recording is readable and contains exactly one end of the goal."""
+    """Check that the recordings are readable and contain exactly one end of the goal. Raises Failed."""
     recorded: dict[int, str] = {}
     sent = False
     for recording in rig.recordings():
@@ -180,13 +180,13 @@ def _check_goal(rig: Rig, case: Case, heard: list[str]) -> None:
         return
     if len(heard) > 1 or len(recorded) > 1:
         raise Failed(f"the goal has ended more than once: {heard} {recorded}")
-    # Without a recorder, events are in no recording.
+    # If the recorder was the victim, the event may be missing in the recording.
     if not recorded and (case.victim != "recorder" or not heard):
         raise Failed("how the goal has ended is in no recording")
 
 
 def attempt(rig: Rig, case: Case) -> str:
-    """Return "ok" or the failure; leave a service that is up and disabled."""
+    """Run a case, and start a new service for the next one; return "ok" or a description of the failure."""
     outcome = "ok"
     try:
         run(rig, case)
@@ -209,7 +209,7 @@ def attempt(rig: Rig, case: Case) -> str:
 
 
 def main() -> int:
-    """Run the selected cases; print a table, or with --json one object."""
+    """Run the selected cases; print a table or, with --json, one JSON object; return the exit code."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--sample", type=int, help="number of random cases")
     arguments.add_argument("--seed", type=int, default=0, help="seed of the random choice")

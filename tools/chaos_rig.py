@@ -1,4 +1,4 @@
-"""Test rig of tools/chaos.py: drives in a process of their own, a service, and a listener on the bus."""
+"""Test rig of tools/chaos.py: drives in a separate process, a service, and a listener on the bus."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ EVENT_TIMEOUT_S = 20.0
 """Time limit for any expected event [s]."""
 PROCESSES = ("supervisor", "fork-server", "gateway", "loop", "planner", "recorder")
 NODES = (1, 2, 3)
-# Rate and watchdogs leave enough time for three processes on a machine that may be slow.
+# The rate is low and the watchdogs are slow, so that several processes have enough time even on a slow machine.
 CHANGES = {
     "rate_hz": "100",
     "missed_syncs": "30",
@@ -45,11 +45,11 @@ CHANGES = {
 
 
 class Failed(Exception):
-    """A requirement is violated."""
+    """A requirement of the kill matrix is violated."""
 
 
 def wait_for(condition: Callable[[], bool], what: str, within: float = EVENT_TIMEOUT_S) -> None:
-    """Wait until a condition holds. Raises Failed."""
+    """Wait until a condition is True. Raises Failed after `within` [s]; `what` describes the condition."""
     deadline = time.monotonic() + within
     while not condition():
         if time.monotonic() > deadline:
@@ -58,7 +58,7 @@ def wait_for(condition: Callable[[], bool], what: str, within: float = EVENT_TIM
 
 
 def _connect(path: Path, buses: list[UnixBus]) -> bool:
-    """Connect to a bus once it has a listener: its path exists earlier."""
+    """Try to connect to a bus; return whether it has succeeded. The path exists before somebody listens there."""
     try:
         buses.append(UnixBus(str(path)))
     except BusError:
@@ -67,7 +67,7 @@ def _connect(path: Path, buses: list[UnixBus]) -> bool:
 
 
 class Rig:
-    """Drives on a bus between processes, with successive services on it."""
+    """Drives on a bus between processes, and services that are started on this bus one after the other."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -119,7 +119,7 @@ class Rig:
     # ------------------------------------------------------------------ the service
 
     def start(self) -> None:
-        """Start a service, and wait until it is up."""
+        """Start a service on the bus, and forget the frames received up to now."""
         self._heard = []
         runtime = self.folder / "runtime"
         runtime.mkdir(exist_ok=True)
@@ -132,11 +132,11 @@ class Rig:
         return f"tcp/{LOOPBACK}:{self.ports[0]}"
 
     def robot(self) -> Robot:
-        """Return a client."""
+        """Return a client of the service."""
         return Robot("demo", self.locator, user="chaos")
 
     def served(self) -> Robot:
-        """Return a client once the service answers."""
+        """Wait until the service answers; return a client. Raises Failed."""
         deadline = time.monotonic() + EVENT_TIMEOUT_S
         while True:
             robot: Robot | None = None
@@ -170,14 +170,15 @@ class Rig:
         pids = []
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
-                # Forked processes have no arguments, and not necessarily an environment, of their own.
+                # Forked processes have the arguments, and sometimes the environment, of their parent. Therefore all
+                # processes are recognised by their standard output.
                 speaks_to = (entry / "fd" / "1").readlink()
                 if speaks_to.is_relative_to(self.folder) and b"virtual_drives" not in (entry / "cmdline").read_bytes():
                     pids.append(int(entry.name))
         return pids
 
     def clean_up(self) -> None:
-        """Remove everything that a service could leave to the next one."""
+        """Remove everything that one service could leave behind for the next: processes and recordings."""
         for process in self.remains():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
@@ -195,7 +196,7 @@ class Rig:
                 continue
             try:
                 recordings.append(read(file))
-            except EmptyRecordingError:  # a recorder that replaced a dead one just before the service ended
+            except EmptyRecordingError:  # of a recorder that was restarted just before the service ended
                 continue
             except ServiceError as error:
                 raise Failed(str(error)) from error
@@ -232,7 +233,7 @@ class Rig:
                     self._heard.append(message)
 
     def ask(self, node: int, index: int) -> int:
-        """Read an object of a drive by SDO."""
+        """Read the value of a drive's object by SDO. Raises Failed if the drive does not answer."""
         with self._lock:
             begin = len(self._heard)
         request = struct.pack("<BHB4x", 0x40, index, 0)
@@ -254,7 +255,7 @@ class Rig:
         return answers()[0]
 
     def check_rest(self) -> None:
-        """Raise Failed if a drive moves."""
+        """Raise Failed if the position of a drive changes."""
         before = [self.ask(node, 0x6064) for node in NODES]
         time.sleep(0.2)
         moved = [self.ask(node, 0x6064) - position for node, position in zip(NODES, before, strict=True)]
@@ -268,7 +269,7 @@ class Rig:
             raise Failed(f"drives are enabled still: statuswords {words}")
 
     def check_setpoints(self) -> None:
-        """Raise Failed if the setpoints step, in position or in velocity."""
+        """Raise Failed if the position or the velocity of the setpoints jumps by more than the limits allow."""
         for node in NODES:
             for setpoints in self._followed(node):
                 step, bend = (np.abs(np.diff(setpoints, order)).max(initial=0.0) for order in (1, 2))
@@ -278,7 +279,10 @@ class Rig:
                     raise Failed(f"drive {node}: the velocity of setpoints steps by {bend / self.period:.3f} m/s")
 
     def _followed(self, node: int) -> list[np.ndarray[tuple[int], np.dtype[np.float64]]]:
-        """Return the setpoints of a drive while commanded to follow them [m]; otherwise they are measured positions."""
+        """Return the setpoints of a drive while it is commanded to follow them [m], one array for each power-up.
+
+        All other setpoints are measured positions, and may jump.
+        """
         runs: list[list[float]] = []
         state = 0
         with self._lock:
@@ -299,12 +303,12 @@ class Rig:
 def _python(*arguments: str) -> list[str]:
     from trirail.processes.operating_system import python
 
-    # A tool imports others from its own folder, which -P would exclude; the current folder is not on its path.
+    # The option -P of `python` is omitted: tools import other tools from their own folder, which -P would exclude.
     return [python()[0], *arguments]
 
 
 def states(robot: Robot, condition: Callable[[State], bool]) -> State:
-    """Return the first state that satisfies a condition. Raises Failed."""
+    """Wait for the first state that satisfies a condition, and return it. Raises Failed."""
     deadline = time.monotonic() + EVENT_TIMEOUT_S
     for state in robot.states(timeout=EVENT_TIMEOUT_S):
         if condition(state):

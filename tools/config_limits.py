@@ -1,7 +1,8 @@
 """Table of all limits and time-outs for configs/README.md, used by config_reference.py.
 
-A place is a key of the configuration, `section.key`, or a constant with its unit, `module:NAME s`. Both are looked up
-when the table is made, so that each exists, and a constant has its present value.
+The place of a limit is a key of the configuration, `section.key`, or a constant with its unit, `module:NAME s`. Keys
+and constants are looked up when the table is generated. This ensures that they exist, and that the table contains the
+present values of constants.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 
 class Bound(NamedTuple):
-    """Bounded quantity: its name, the places of its bound, and the reaction beyond it."""
+    """Quantity with a limit: its name, the places of the limit, and the reaction if the limit is exceeded."""
 
     name: str
     places: tuple[str, ...]
@@ -85,13 +86,13 @@ BOUNDS = (
 
 
 def table(known: set[str]) -> str:
-    """Return the table; `known` are the keys of the configuration. Raises KeyError for an unknown place."""
+    """Return the table, given the `known` keys of the configuration. Raises KeyError if a place does not exist."""
     rows = [f"| {name} | {_format_places(places, known)} | {beyond} |" for name, places, beyond in BOUNDS]
     return "\n".join([INTRODUCTION, "| bound | place | beyond it |", "|---|---|---|", *rows]) + "\n"
 
 
 def _format_places(places: tuple[str, ...], known: set[str]) -> str:
-    """Return places in words; a section is not repeated for the next place."""
+    """Return a description of places. A section is named only once if consecutive places are in the same section."""
     words, last = [], ""
     for place in places:
         module, _, constant = place.partition(":")

@@ -1,4 +1,4 @@
-"""Docstrings of a type's fields: the string below each in the source, which Python itself discards."""
+"""Docstrings of a type's fields: the string below each field in the source code, which Python itself discards."""
 
 from __future__ import annotations
 

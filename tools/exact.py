@@ -1,4 +1,4 @@
-"""Loop equation of a leg of either mechanism, solved in 60-digit arithmetic without code of the service."""
+"""Loop equation of a leg of either mechanism, solved with 60 digits and without any code of the service."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Point = tuple[Decimal, Decimal]
 
 
 def cos_sin(angle: float | Decimal) -> Point:
-    """Return cosine and sine from their series."""
+    """Return the cosine and the sine of an angle, computed from their power series."""
     with localcontext() as context:
         context.prec = DIGITS + 10
         x, term = Decimal(angle), Decimal(1)
@@ -32,8 +32,8 @@ def travels(
 ) -> tuple[Decimal, Decimal]:
     """Return the positions of slider and cross slide for a pose of the platform [m].
 
-    anchor + (home + slider) u(rail) + passive u(cross) = G + R(phi) held, with the cross slide's direction turned by
-    phi if it `turns`: Cramer's rule.
+    The equation is anchor + (home + slider) u(rail) + passive u(cross) = G + R(phi) held. If the cross slide `turns`
+    with the platform, phi is added to `cross_angle`. The solution uses Cramer's rule.
     """
     with localcontext() as context:
         context.prec = DIGITS

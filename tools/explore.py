@@ -4,9 +4,9 @@ python tools/explore.py 30                      half an hour
 python tools/explore.py 30 --only motion        tests whose name or file contains this
 python tools/explore.py 5 --seed 7              the same examples as an earlier run, until the time is over
 
-Each core repeats all tests in an order of its own, each time with twice the examples and another seed. Findings are
-printed at the end, with the lines that preserve them as examples; the next run tries them first. The exit code is 1 if
-there are findings.
+Each core repeats all tests in a different order, each time with twice as many examples and another seed. Findings are
+printed at the end, with the lines that preserve them as examples of the tests. The next run tries the findings first.
+The exit code is 1 if there are findings.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 NICE = 10
-"""Nice value, which gives other work of the machine precedence."""
+"""Nice value of the tests, which gives other programs on the machine precedence."""
 TIMEOUT = 600
-"""Time limit of a test that tries its usual number of examples and shrinks its findings [s]."""
+"""Time limit of a test with its usual number of examples, including the simplification of its findings [s]."""
 REPORT_PERIOD_S = 30.0
 """Interval of progress messages [s]."""
 GRACE = 20.0
@@ -40,18 +40,18 @@ GRACE = 20.0
 
 
 class Summary(NamedTuple):
-    """Examples tried and findings up to now."""
+    """Numbers of tests and of tried examples, and the findings up to now."""
 
     tests: int
     """Number of tests."""
     examples: Counter[str]
     """Number of examples by test."""
     findings: dict[str, dict[str, str]]
-    """First error, and the line that preserves it, by test."""
+    """First error of each failed test, and the line that preserves the example."""
 
     @classmethod
     def from_lines(cls, lines: Sequence[dict[str, Any]]) -> Summary:
-        """Summarise the output of rounds."""
+        """Return a summary of the output of all rounds."""
         examples: Counter[str] = Counter()
         findings: dict[str, dict[str, str]] = {}
         for line in lines:
@@ -76,7 +76,7 @@ class Summary(NamedTuple):
 
 
 class Core:
-    """Successive rounds of the generated tests, each in a process of its own."""
+    """Rounds of the generated tests on one core, each in a separate process."""
 
     def __init__(self, folder: Path, number: int, seed: int, only: str) -> None:
         self.found = folder / f"{number}.jsonl"
@@ -90,13 +90,13 @@ class Core:
         command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-k", self._only, f"--found={self.found}"]
         command += [f"--explore={self._chance.randrange(2**32)}", f"--effort={self._effort}"]
         command += [f"--timeout={TIMEOUT * self._effort}"]
-        with self._log.open("wb") as log:  # only this program handles Ctrl-C, and ends the rounds in order
+        with self._log.open("wb") as log:  # only this program handles Ctrl-C, and then ends the rounds
             self._process = subprocess.Popen(
                 ["nice", "-n", str(NICE), *command], cwd=ROOT, stdout=log, stderr=log, start_new_session=True
             )
 
     def continue_rounds(self) -> str | None:
-        """Start the next round if the last one is over; return the reason if none can start."""
+        """Start the next round if the last round has ended; return a reason if no further round can start."""
         code = self._process.poll()
         if code is None:
             return None
@@ -107,12 +107,12 @@ class Core:
         return None
 
     def interrupt(self) -> None:
-        """Ask the running test to clean up."""
+        """Interrupt the running test, which then cleans up."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGINT)
 
     def end(self) -> None:
-        """Wait for the end, up to a time limit."""
+        """Wait until the round has ended, and kill its processes after a time limit."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE)
         with contextlib.suppress(ProcessLookupError):
@@ -120,7 +120,7 @@ class Core:
         self._process.wait()
 
     def lines(self) -> list[dict[str, Any]]:
-        """Return the output of its rounds, without a line that is incomplete."""
+        """Return the output of all rounds, except for an incomplete last line."""
         if not self.found.exists():
             return []
         whole = self.found.read_text(encoding="utf-8").rpartition("\n")[0]
@@ -128,7 +128,7 @@ class Core:
 
 
 def explore(cores: Sequence[Core], seconds: float) -> str | None:
-    """Run for the given time and report progress; return the reason for an early end, "" for an interrupt."""
+    """Run for the given time [s] and report the progress; return the reason for an early end, "" for an interrupt."""
     begun = reported_at = time.monotonic()
     trouble = None
     try:
@@ -149,12 +149,12 @@ def explore(cores: Sequence[Core], seconds: float) -> str | None:
 
 
 def summary(cores: Sequence[Core]) -> Summary:
-    """Return the combined output of all explorers."""
+    """Return the summary of all cores."""
     return Summary.from_lines([line for core in cores for line in core.lines()])
 
 
 def main() -> int:
-    """Explore for the requested time; print the summary, or with --json one object."""
+    """Explore for the requested time; print the summary or, with --json, one JSON object; return the exit code."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("minutes", type=float)
     arguments.add_argument("--only", default="", help="tests whose name or file contains this, as pytest -k has it")
@@ -163,7 +163,7 @@ def main() -> int:
     options = arguments.parse_args()
     signal.signal(
         signal.SIGINT, signal.default_int_handler
-    )  # a shell ignores it for background jobs, and pytest inherits that
+    )  # a shell makes background jobs ignore SIGINT, and pytest would inherit this
     seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
     with tempfile.TemporaryDirectory(prefix="trirail-explore-") as folder:
         cores = [Core(Path(folder), number, seed, options.only) for number in range(os.cpu_count() or 1)]

@@ -1,9 +1,10 @@
 """Flood every port of a service with junk for a number of seconds, and check that the service keeps working.
 
-Two hundred client sessions send invalid messages, twenty subscribe and never read, and TCP connections stay half open
-on the Zenoh port, on Rerun's and on that of the operator's page. Meanwhile a user moves the robot and stops it.
-Afterwards the same processes must be alive, the robot must move to a goal, the page must be served, and the growth of
-the log must be bounded. Then users of every role flood a service one after the other, and its memory must be bounded.
+There are two hundred client sessions: most send invalid messages, and twenty subscribe and never read. Many TCP
+connections to the ports of Zenoh, of Rerun and of the operator's page stay half open. At the same time, a user moves
+the robot and stops it. Afterwards the same processes must be alive, the robot must move to a goal, the page must be
+served, and the growth of the log must be limited. Then users of every role flood a service one after the other, and the
+memory of the service must stay limited.
 """
 
 from __future__ import annotations
@@ -46,25 +47,25 @@ SESSIONS = 200
 DEAF = 20
 """Number of sessions that subscribe to everything and never read."""
 HALF_OPEN = 150
-"""Number of TCP connections per port that send nothing sensible."""
+"""Number of TCP connections to each port that send nothing or junk."""
 SENDERS = 4
 PENDING = 200
 """Maximum number of unanswered queries of one sender."""
 GROWS_BY_MB = 128.0
-"""Maximum growth of a process by all sessions, and by a minute of cycles in the recorder [1e6 bytes]."""
+"""Maximum growth of a process's memory because of all sessions and, in the recorder, a minute of cycles [1e6 bytes]."""
 SAMPLES = 10
 """Number of memory samples during the flood."""
 LOG_BYTES, LOG_BYTES_A_SECOND = 100_000, 300
-"""Maximum growth of the log: a burst of lines, then one or two per second."""
+"""Maximum growth of the log [bytes, bytes/s]: a burst of lines, and then one or two lines per second."""
 STOP_WITHIN = 5.0
-"""Time limit for the answer to a stop on a machine busy with the flood [s]."""
+"""Time limit for the answer to a stop, on a machine that is busy with the flood [s]."""
 
 ODD = ("\x1b[2J", "\u202e", "\0", "\n", "[/]", "\ue000", "😀", "'", "`", "%s", "{}")
 NUMBERS = (0.0, -0.0, 1e-310, 1e-17, 0.5, 1.0, 1e17, 1e300, -1e300)
 
 
 class Message(NamedTuple):
-    """Message to send, by a query or by a put."""
+    """Message that is sent by a Zenoh query or put."""
 
     key: str
     payload: bytes
@@ -106,7 +107,7 @@ JUNK: dict[str, Callable[[random.Random], Message]] = {
 
 
 class Flood:
-    """Sender of junk inside its context."""
+    """Context in which threads send junk to a service."""
 
     def __init__(self, locator: str, ports: tuple[int, ...], rate: float) -> None:
         self.sent: Counter[str] = Counter()
@@ -146,7 +147,7 @@ class Flood:
         for one in itertools.cycle(sessions):
             kind, make = rnd.choice(list(JUNK.items()))
             key, payload, encoding = make(rnd)
-            with contextlib.suppress(zenoh.ZError):  # a connection that the service has ended
+            with contextlib.suppress(zenoh.ZError):  # the service may have closed the connection
                 if kind == "states" or rnd.random() < 0.3:
                     one.put(key, payload, encoding=encoding)
                 elif pending.acquire(timeout=5.0):
@@ -174,13 +175,13 @@ class Flood:
 
 
 def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, deaf: bool, results: Connection) -> None:
-    """Flood from a separate process: readers that never read block Zenoh's threads in the whole process."""
+    """Flood a service from a separate process: sessions that never read block Zenoh's threads in the whole process."""
     if deaf:
         kept = [zenoh_session.open_client(locator) for _ in range(DEAF)]
         subscribed = [one.declare_subscriber("trirail/**", zenoh.handlers.FifoChannel(1)) for one in kept]
         time.sleep(seconds)
         results.send((Counter({"deaf": len(subscribed)}), 0))
-        os._exit(0)  # closing a blocked session would block too
+        os._exit(0)  # to close a blocked session would also block
     flood = Flood(locator, ports, rate)
     with flood:
         time.sleep(seconds)
@@ -190,7 +191,7 @@ def _flood(locator: str, ports: tuple[int, ...], rate: float, seconds: float, de
 
 @contextlib.contextmanager
 def sampled(pids: dict[str, int], every: float) -> Iterator[list[dict[str, float]]]:
-    """Sample the memory of processes at an interval [s]; yield the samples."""
+    """Sample the memory of processes at the interval `every` [s]; yield the list of samples."""
     samples: list[dict[str, float]] = []
     over = threading.Event()
 
@@ -210,7 +211,7 @@ def sampled(pids: dict[str, int], every: float) -> Iterator[list[dict[str, float
 
 @contextlib.contextmanager
 def private_service(folder: Path) -> Iterator[tuple[own_service.Process, str, tuple[int, ...]]]:
-    """Run a service on TCP ports of its own; yield its process, its locator and the ports."""
+    """Run a service on unused TCP ports; yield its process, its locator and the ports."""
     zenoh_port, live_port = free_port(), free_port()
     config, private = own_service.private(folder, live_port)
     locator = f"tcp/127.0.0.1:{zenoh_port}"
@@ -232,7 +233,10 @@ def operators_page(locator: str) -> Iterator[str]:
 
 
 def use(locator: str, seconds: float) -> tuple[int, list[float]]:
-    """Connect, move the robot and stop it like a user; return accepted goals and the duration of each stop."""
+    """Connect, move the robot and stop it repeatedly, like a user.
+
+    Return the number of accepted goals and the time until each stop was answered [s].
+    """
     ends, accepted = time.monotonic() + seconds, 0
     stops: list[float] = []
     for number in itertools.count():
@@ -324,7 +328,7 @@ def _page_failures(page: str) -> Iterator[str]:
 
 
 def main() -> int:
-    """Run as the command line specifies; exit with code 1 on a failure."""
+    """Run as the command line specifies; return the exit code, which is 1 after a failure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("seconds", type=float)
     parser.add_argument("--rate", type=float, default=3000.0, help="messages a second at most, of all sessions")

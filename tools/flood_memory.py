@@ -1,6 +1,6 @@
-"""Memory of a service under floods by users of every role: growth is bounded, and ends with the flood.
+"""Memory of a service under floods of messages by users of every role: the growth must be limited and temporary.
 
-The service listens with TLS, and a separate process sends each flood with a real certificate: valid goals that are
+The service listens with TLS. A separate process with a valid certificate sends each flood: valid goals that are
 refused, junk, messages and attachments of 4 MiB, many ids, many names, silent subscribers, tokens and queriers.
 """
 
@@ -35,25 +35,26 @@ GROWS_BY: Final = 64.0
 KEEPS: Final = 20.0
 """Maximum growth that remains after the flood [1e6 bytes]."""
 RETURNS_WITHIN: Final = 20.0
-"""Time limit for that after the floods of a user: accepted queries are answered at a limited rate [s]."""
+"""Time limit for the memory to recover after the floods of a user [s]; accepted queries are answered at a limited rate.
+"""
 SAMPLE_EVERY: Final = 0.05
 """Interval of memory samples [s]."""
 RATE_HZ: Final = 100
 """Rate of the service's cycles [Hz]."""
 FIRST: Final = 2500
-"""Number of small messages before the large ones: more than the service queues for one user."""
+"""Number of small messages before the large messages. It is larger than the service's queue for one user."""
 PENDING: Final = 4000
 """Maximum number of unanswered queries of one flood."""
 USERS: Final = {"eva": "viewer", "ann": "operator", "max": "maintainer"}
 REVOKED: Final = "gone"
 
 LARGE: Final = bytes(MAX_TRANSPORT - 4096)
-"""Payload close to the largest message that the transport reassembles."""
+"""Payload that is nearly as large as the largest message that the transport reassembles."""
 REFUSED: Final = json.dumps({"kind": "pose", "x": 9.0, "y": 0.0, "phi": 0.0}).encode()
 
 
 class Query(NamedTuple):
-    """Query to send."""
+    """Query that a flood sends."""
 
     key: str
     payload: bytes | None = None
@@ -65,7 +66,7 @@ def _key(*parts: str) -> str:
 
 
 def _behind(small: Query, *large: Query) -> Iterator[Query]:
-    """Yield large messages after more small ones than the service queues for one user."""
+    """Yield enough small messages to fill the service's queue for one user, and then large messages."""
     yield from itertools.repeat(small, FIRST)
     yield from itertools.cycle(large)
 
@@ -141,7 +142,7 @@ DECLARATIONS: Final[dict[str, tuple[str, Callable[[zenoh.Session, threading.Even
 
 
 FLOODS: Final = dict(sorted((QUERIES | DECLARATIONS).items(), key=lambda flood: flood[1][0]))
-"""All floods by user."""
+"""All floods by name, sorted by user."""
 
 
 def _send(session: zenoh.Session, over: threading.Event, queries: Iterator[Query]) -> None:
@@ -151,12 +152,12 @@ def _send(session: zenoh.Session, over: threading.Event, queries: Iterator[Query
             return
         if pending.acquire(timeout=0.1):
             handler: Any = zenoh.handlers.Callback(lambda _: None, drop=pending.release, indirect=False)
-            with contextlib.suppress(zenoh.ZError):  # a connection that the service has ended
+            with contextlib.suppress(zenoh.ZError):  # the service may have closed the connection
                 session.get(query.key, handler, payload=query.payload, attachment=query.attachment, timeout=10.0)
 
 
 def _flood(name: str, locator: str, folder: str, seconds: float) -> None:
-    """Send a flood from a separate process: readers that never read block Zenoh's threads in the whole process."""
+    """Send a flood from a separate process: subscribers that never read block Zenoh's threads in the whole process."""
     user, _ = FLOODS[name]
     session = zenoh_session.open_client(locator, Credentials.read(Path(folder, user)))
     over = threading.Event()
@@ -165,7 +166,7 @@ def _flood(name: str, locator: str, folder: str, seconds: float) -> None:
         _send(session, over, QUERIES[name][1]())
     else:
         DECLARATIONS[name][1](session, over)
-    os._exit(0)  # closing a blocked session would block too
+    os._exit(0)  # to close a blocked session would also block
 
 
 @contextlib.contextmanager
@@ -186,14 +187,14 @@ def _service(folder: Path) -> Iterator[tuple[own_service.Process, str, Path]]:
     users = "\n".join(f'{user} = "{role}"' for user, role in USERS.items())
     tables = f'"{locator}"]\n[zenoh.tls]\ndirectory = "{keys.folder}"\n[zenoh.users]\n{users}\n'
     text = re.sub(rf'"{re.escape(private)}"\]', lambda _: tables, config.read_text())
-    # The recorder keeps the last minute of cycles: a low rate, so that the floods dominate its growth.
+    # The recorder stores the last minute of cycles. The rate is low so that mainly the floods make its memory grow.
     config.write_text(re.sub(r"^rate_hz = \d+", f"rate_hz = {RATE_HZ}", text, flags=re.MULTILINE))
     with own_service.service(config, folder / "flood.rrd") as process:
         yield process, locator, keys.folder / "users"
 
 
 def memory(pids: dict[str, int]) -> dict[str, float]:
-    """Return the memory of each process [1e6 bytes]."""
+    """Return the resident memory of each process [1e6 bytes]."""
     page = os.sysconf("SC_PAGE_SIZE")
     return {name: int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * page / 1e6 for name, pid in pids.items()}
 
@@ -204,7 +205,7 @@ def _most(of: dict[str, float], before: dict[str, float]) -> tuple[float, str]:
 
 
 def run(seconds: float, only: str = "") -> Iterator[str]:
-    """Send each flood for its share of the time; print the memory it took, and yield failures."""
+    """Send each flood for an equal part of the time; print the growth of the memory, and yield failures."""
     names = [name for name in FLOODS if only in name]
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
@@ -212,7 +213,7 @@ def run(seconds: float, only: str = "") -> Iterator[str]:
         pids = processes(service.pid)
         with Robot("demo", locator, tls=users / "max") as robot:
             robot.enable()
-            time.sleep(1.0)  # exclude the memory that the first messages take
+            time.sleep(1.0)  # exclude the memory that the first messages need
             before = memory(pids)
             for user, of_user in itertools.groupby(names, lambda name: FLOODS[name][0]):
                 for name in of_user:
@@ -227,7 +228,7 @@ def run(seconds: float, only: str = "") -> Iterator[str]:
 
 
 def _stays(flood: str, sender: BaseProcess, pids: dict[str, int], before: dict[str, float]) -> Iterator[str]:
-    """Sample the memory during a flood; yield processes that exceed the limit."""
+    """Sample the memory during a flood; yield a failure if a process exceeds the limit."""
     greatest = 0.0, ""
     while sender.is_alive():
         greatest = max(greatest, _most(memory(pids), before))
@@ -238,7 +239,7 @@ def _stays(flood: str, sender: BaseProcess, pids: dict[str, int], before: dict[s
 
 
 def _returns(user: str, pids: dict[str, int], before: dict[str, float]) -> Iterator[str]:
-    """Wait until the memory has recovered after the floods of a user; yield processes that exceed the limit."""
+    """Wait until the memory has recovered after the floods of a user; yield a failure if it does not."""
     ended = time.monotonic()
     while (left := _most(memory(pids), before))[0] > KEEPS and time.monotonic() < ended + RETURNS_WITHIN:
         time.sleep(SAMPLE_EVERY)

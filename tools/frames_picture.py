@@ -1,6 +1,8 @@
-"""The picture of the frames, tools/pictures/frames.png: which way x, y, φ and the sliders count. Needs matplotlib.
+"""Picture of the frames, tools/pictures/frames.png: the positive directions of x, y, φ and the sliders.
 
 python tools/frames_picture.py [FILE]
+
+Needs matplotlib.
 """
 
 from __future__ import annotations
@@ -24,13 +26,13 @@ FILE = Path(__file__).parent / "pictures/frames.png"
 INK, GREY, RAIL, PLATFORM, BASE, SLIDER = "#1f2933", "#7b8794", "#d3d9e0", "#f0772b", "#2166ac", "#1b7f4d"
 DASHES = (0, (4, 3))
 MOVED = 60.0, 30.0, 20.0
-"""The pose of the second panel [mm, °]."""
+"""Pose of the robot in the second panel [mm, mm, °]."""
 ARC_ANGLES_DEG = 112.0, 200.0
-"""Begin and end of the arc of +φ [°]."""
+"""Beginning and end of the arc that shows +φ [°]."""
 
 
 def draw(file: Path) -> None:
-    """Draw the robot at its centre and moved, in millimetres, with all that is counted."""
+    """Draw the robot at its centre and at another pose, in millimetres, with its coordinates."""
     limits = load(SIM).limits.slider
     robot = Geometry.symmetric(0.3)
     parts = RobotParts.from_geometry(robot, limits)
@@ -51,7 +53,7 @@ def draw(file: Path) -> None:
 
 
 def _robot(panel: Axes, robot: Geometry, parts: RobotParts, pose: tuple[float, float, float]) -> None:
-    """Draw rails, platform and sliders, each with where it is."""
+    """Draw the rails, the platform and the sliders, and write the position of each slider next to it."""
     for rail in parts.rails:
         panel.plot(*(1e3 * rail.T), color=RAIL, linewidth=7.0, solid_capstyle="round", zorder=1)
     for line in part_positions.transform_lines(parts.outline, pose):
@@ -67,7 +69,7 @@ def _robot(panel: Axes, robot: Geometry, parts: RobotParts, pose: tuple[float, f
 
 
 def _directions(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
-    """Draw the base frame, and the way in which each slider and the angle rise."""
+    """Draw the base frame, and the directions in which the slider positions and the angle increase."""
     _axes(panel, (0.0, 0.0), 0.0, 100.0, BASE, ("+x", "+y"))
     _text(panel, (8.0, -17.0), "O = G", INK, ha="left")
     for leg, outward in zip(robot.legs, _outward(parts), strict=True):
@@ -83,7 +85,7 @@ def _directions(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
 
 
 def _pose(panel: Axes) -> None:
-    """Draw the base frame, the platform's own, and x, y and φ between them."""
+    """Draw the base frame, the frame of the platform, and x, y and φ between these frames."""
     x, y, phi = MOVED
     _axes(panel, (0.0, 0.0), 0.0, 150.0, BASE, ("+x", "+y"))
     _axes(panel, (x, y), phi, 100.0, PLATFORM, ("", ""))
@@ -119,7 +121,7 @@ def _text(panel: Axes, at: ArrayLike, words: str, colour: str, ha: str = "center
 
 
 def _outward(parts: RobotParts) -> Points:
-    """Return unit vectors from the middle of the robot across each rail, (3, 2)."""
+    """Return the unit vector from the middle of the robot towards each rail, (3, 2)."""
     away = parts.names - parts.names.mean(axis=0)
     out: Points = away / np.linalg.norm(away, axis=1, keepdims=True)
     return out

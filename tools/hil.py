@@ -3,9 +3,9 @@
 python tools/hil.py               boots Debian's kernel in QEMU with two CAN cards on one bus; takes minutes
 make hil                          the same, and installs missing packages if possible
 
-In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1 and a client; then a second one on
-vcan0 at another rate, with a drive that is homed and a third-party one; then pytest runs the tests marked vcan.
-tools/bus_log.py and Wireshark's dissector check the frames on both buses, outside the machine.
+In the machine, tools/hil_guest.py runs the service on can0, virtual drives on can1, and a client. Then it runs a second
+service on vcan0 at another rate, with one drive that is homed and one third-party drive. Then pytest runs the tests
+marked vcan. Outside the machine, tools/bus_log.py and Wireshark's dissector check the frames on both buses.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from hil_needs import Failed, install, last, requirements
 from trirail.config import Config, load
 
 CHANGES = {
-    # The emulated processor is ten to twenty times slower than the real one.
+    # The emulated processor is ten to twenty times slower than the host's.
     "rate_hz = 1000": "rate_hz = 20",
     "heartbeat = 0.1": "heartbeat = 1.0",
     "enable_timeout = 5.0": "enable_timeout = 30.0",
-    # Feedback is one SYNC old and a setpoint one ahead, which alone is 10 mm at 0.1 m/s and 20 Hz.
+    # The feedback is one SYNC old, and the setpoint is one SYNC ahead: alone 10 mm at 0.1 m/s and 20 Hz.
     "following_error = 0.002 ": "following_error = 0.03 ",
     "following_error = 0.0025": "following_error = 0.04",
     "live_port = 9876": "live_port = 0",
     "[watchdogs]\n": "[watchdogs]\ngateway_timeout = 3.0\n",
 }
-"""Differences of the machine's configuration from configs/socketcan.toml."""
+"""Differences between the configuration of the emulated machine and configs/socketcan.toml."""
 LOGS = ("service", "drives", "second-service", "second-drives", "foreign")
-"""Logs shown after a failed run."""
+"""Names of the logs that are printed after a failed run."""
 NOT_SHOWN = (
     "lateness, jitter and 1 kHz: the processor is emulated, ten to twenty times slower and without a clock of its own",
     "bit errors, arbitration, a bus that is full, error-passive and bus-off: the emulated cards delay nothing, and "
@@ -55,11 +55,11 @@ NOT_SHOWN = (
 
 
 class Stalled(Failed):
-    """A card lost frames, because more arrived during a stall of the host than its 64 bytes of memory hold."""
+    """A card lost frames, because its 64 bytes of memory were too small for the frames of a stall of the host."""
 
 
 def main() -> int:
-    """Run the test; return exit code 0 only if all checks passed."""
+    """Run the test; return the exit code, which is 0 only if all checks passed."""
     parser = argparse.ArgumentParser(description="The service on real SocketCAN, in a machine that QEMU emulates.")
     parser.add_argument("--install", action="store_true", help="install missing Debian packages first (as root)")
     parser.add_argument("--timeout", type=float, default=1500.0, help="of the whole run [s]; default 1500")
@@ -123,7 +123,10 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 
 def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict[str, Any]) -> None:
-    """Boot, run both robots and the tests, check the frames. Raises Failed, or Stalled if a retry makes sense."""
+    """Boot the machine, run both robots and the tests in it, and check the frames.
+
+    Raises Failed, or Stalled if a second attempt may succeed.
+    """
     config = configure(folder)
     say("compiling the kinematics for the emulated processor, beside what follows")
     with compiling(folder):
@@ -144,7 +147,7 @@ def run(folder: Path, kernel: Path, deadline: float, say: Progress, report: dict
 
 
 def judge(folder: Path, config: Config, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:
-    """Check the results of the machine. Raises Failed."""
+    """Check the results from the machine. Raises Failed."""
     if result["failure"]:
         raise Failed(f"{result['failure']}{_logs(folder, *LOGS)}")
     code = (folder / "vcan.code").read_text().strip() if (folder / "vcan.code").exists() else "none"
@@ -161,13 +164,16 @@ def judge(folder: Path, config: Config, result: dict[str, Any], say: Progress, r
 
 
 def configure(folder: Path) -> Config:
-    """Write the machine's configurations: configs/socketcan.toml with CHANGES, and from it that of the second robot."""
+    """Write the configurations of both robots; return that of the first robot.
+
+    It is configs/socketcan.toml with CHANGES. The configuration of the second robot is derived from it.
+    """
     text = (ROOT / "configs/socketcan.toml").read_text()
     memory = "/dev/shm"
     changes = CHANGES | {
         'listen = ["tcp/127.0.0.1:7447"]': f'listen = ["unixsock-stream/{memory}/zenoh"]',
         'directory = "recordings"': f'directory = "{memory}/recordings"',
-        # A stall of the host affects the drives like the loop, so it must not count as a loss of SYNC.
+        # A stall of the host delays the drives as well as the loop, so it must not count as a loss of SYNC.
         "[drives]\n": "[can.simulated]\nmissed_syncs = 40\n\n[drives]\nsdo_timeout = 10.0\n",
     }
     for before, after in changes.items():
@@ -189,7 +195,7 @@ def _result(folder: Path) -> dict[str, Any]:
 
 
 def _price(folder: Path) -> dict[str, Any]:
-    """Return the results of tools/bench.py for a cycle's frames in the machine."""
+    """Return the results of `tools/bench.py frames` in the machine."""
     try:
         return json.loads((folder / "price.json").read_text())  # type: ignore[no-any-return]
     except (FileNotFoundError, json.JSONDecodeError):
@@ -197,7 +203,7 @@ def _price(folder: Path) -> dict[str, Any]:
 
 
 def check_frames(folder: Path, config: Config, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:
-    """Check the frames that candump saw on can1, and those that the service reports as sent and received."""
+    """Check the frames that candump recorded on can1, and the service's own log of its frames. Raises Failed."""
     frames = bus_log.read(folder / "bus.log")
     own = bus_log.read(folder / "service-frames.log")
     until, missed = result["cut"], result["loops"][f"{config.loop.rate_hz} Hz"]["overruns"]
@@ -217,7 +223,7 @@ def check_frames(folder: Path, config: Config, result: dict[str, Any], say: Prog
 
 
 def _check_second(folder: Path, result: dict[str, Any], say: Progress, report: dict[str, Any]) -> None:
-    """Check the second robot's frames: its SYNC, and all of them as decoded by Wireshark."""
+    """Check the second robot's SYNCs, and all its frames as decoded by Wireshark. Raises Failed."""
     config, until = load(folder / "second.toml"), result["second_cut"]
     path, missed = folder / "second-bus.log", result["loops"][f"{config.loop.rate_hz} Hz"]["overruns"]
     dissected = hil_dissector.dissect(path)
@@ -238,7 +244,10 @@ def _check_outputs(
     say: Progress,
     report: dict[str, Any],
 ) -> None:
-    """Check a goal's switches in the frames that Wireshark decodes, and that the drive took each at the next SYNC."""
+    """Check the times at which a goal switched an output, in the frames decoded by Wireshark. Raises Failed.
+
+    The drive must apply each switch at the next SYNC.
+    """
     calm = [frame for frame in frames if frame.t < until]
     seen = hil_dissector.switches(calm, config.drives.C.node, hil_second.VALVE)
     cycles = [(row["cycle"], row["value"]) for row in table]
@@ -254,7 +263,7 @@ def _check_outputs(
 
 
 def _logs(folder: Path, *names: str) -> str:
-    """Return the ends of some logs as text."""
+    """Return the last lines of some logs as text."""
     logs = ((name, folder / f"{name}.log") for name in names)
     return "".join(
         f"\n--- {name}.log\n{last(path.read_text(errors='replace'))}" for name, path in logs if path.exists()

@@ -1,6 +1,7 @@
 """Check of a log of CAN frames by Wireshark's CANopen dissector, which knows CiA 301 but not trirail.
 
-`tshark` decodes the log; the checks use only its fields (names: `tshark -G fields`), no data packed by trirail.
+`tshark` decodes the log. The checks use only the fields that it prints (names: `tshark -G fields`), and no code of
+trirail.
 """
 
 from __future__ import annotations
@@ -30,16 +31,16 @@ FIELDS = (
     "canopen.pdo.data.bytes",
 )
 SDO_ANSWER, SDO_REQUEST, EMERGENCY, ERROR_CONTROL = 0xB, 0xC, 0x1, 0xE
-"""Function codes, bits 7 to 10 of an identifier (CiA 301, 7.3.3)."""
+"""Function codes, which are bits 7 to 10 of an identifier (CiA 301, 7.3.3)."""
 SYNC, RPDO3 = 0x1, 0x8
-"""Function codes of the SYNC, which has node 0, and of the PDO that takes digital outputs."""
+"""Function codes of SYNC, whose node id is 0, and of the PDO with digital outputs."""
 BOOT_UP, OPERATIONAL = 0x0, 0x5
 START, ALL_NODES = 0x01, 0
-"""Values of an NMT command (CiA 301, 7.2.8.3.1)."""
+"""Command specifier and node id of an NMT command (CiA 301, 7.2.8.3.1)."""
 
 
 class Dissected(NamedTuple):
-    """Frame as decoded by the dissector; None for fields that it does not have."""
+    """Frame as decoded by the dissector. A field that the frame does not have is None."""
 
     t: float
     """Time since 1970 [s]."""
@@ -50,18 +51,18 @@ class Dissected(NamedTuple):
     """Index and sub-index of an SDO."""
     abort: int | None
     emergency: int | None
-    """Error code of an EMCY, unless it is "no error"."""
+    """Error code of an EMCY; 0 means "no error"."""
     state: int | None
-    """NMT state in a heartbeat or boot-up."""
+    """NMT state in a heartbeat or boot-up message."""
     command: int | None
     commanded: int | None
-    """NMT command, and the node that it addresses."""
+    """NMT command, and the node id that it addresses."""
     data: bytes = b""
     """Data of a PDO."""
 
 
 def dissect(log: Path) -> list[Dissected]:
-    """Decode a log in candump's format by tshark. Raises Failed if that is not possible."""
+    """Decode a log in candump's format by tshark. Raises Failed if tshark cannot read it."""
     command = ["tshark", "-r", str(log), "-d", "can.subdissector,canopen", "-T", "fields", "-E", "occurrence=f"]
     for field in FIELDS:
         command += ["-e", field]
@@ -74,25 +75,26 @@ def dissect(log: Path) -> list[Dissected]:
 def problems(frames: Sequence[Dissected], until: float) -> list[str]:
     """Return the errors, one line each.
 
-    All frames must be readable. Before the time `until`, without disturbances, each node must receive one request at a
-    time, and stay operational and free of errors; later, a deaf node receives a stop without a wait for its answer.
+    All frames must be readable. Before the time `until` there are no disturbances: each node must answer every request
+    for the right object, stay operational, and report no errors. Later these rules do not apply, since a node that
+    receives nothing is sent a stop without a wait for its answer.
     """
     calm = [frame for frame in frames if frame.t < until]
     return [*_unreadable(frames), *_unanswered(calm), *_fallen(calm)]
 
 
 class Switch(NamedTuple):
-    """PDO with another value of a digital output."""
+    """PDO that changes a digital output."""
 
     sync: int
-    """Number of SYNCs before it in the log."""
+    """Number of SYNCs before the PDO in the log."""
     on: bool
     next_sync: float
-    """Time of the SYNC after it, at which the drive takes it [s since 1970]."""
+    """Time of the SYNC after the PDO, at which the drive applies the output [s since 1970]."""
 
 
 def switches(frames: Sequence[Dissected], node: int, output: int) -> list[Switch]:
-    """Return the PDOs of a node that changed an output, a bit of 60FEh:01; it is off before."""
+    """Return the PDOs to a node that changed an output, a bit of 60FEh:01. The output is off at first."""
     changes: list[Switch] = []
     pending: list[bool] = []
     on, syncs = False, 0
@@ -108,7 +110,7 @@ def switches(frames: Sequence[Dissected], node: int, output: int) -> list[Switch
 
 
 def statistics(frames: Sequence[Dissected]) -> dict[str, int]:
-    """Return statistics: numbers of frames by kind, as the dissector decodes them."""
+    """Return statistics: the number of frames of each kind, as decoded by the dissector."""
     kinds = Counter("other" if frame.function is None else _KINDS.get(frame.function, "other") for frame in frames)
     return dict(sorted(kinds.items()))
 
@@ -124,7 +126,7 @@ def _unreadable(frames: Sequence[Dissected]) -> Iterator[str]:
 
 
 def _unanswered(frames: Sequence[Dissected]) -> Iterator[str]:
-    """Yield first segments of SDOs without an answer or abort for the same object."""
+    """Yield a line for each SDO request that has no answer, or an answer for a different object."""
     asked: dict[int, Dissected] = {}
     for frame in frames:
         if frame.entry is None or frame.node is None:
@@ -137,7 +139,7 @@ def _unanswered(frames: Sequence[Dissected]) -> Iterator[str]:
 
 
 def _fallen(frames: Sequence[Dissected]) -> Iterator[str]:
-    """Yield nodes that leave operational without a command, or send an EMCY."""
+    """Yield a line for each node that leaves NMT operational without a command, or sends an EMCY."""
     operational: set[int] = set()
     for frame in frames:
         if frame.command not in (None, START):

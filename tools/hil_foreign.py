@@ -1,9 +1,9 @@
 """Third-party drive on a bus in real time: python-canopen's LocalNode with the dictionary of a real drive.
 
-python tools/hil_foreign.py CONFIG --interface socketcan --channel vcan0    is drive C of that configuration
+python tools/hil_foreign.py CONFIG --interface socketcan --channel vcan0    drive C of that configuration
 
-tests/drivers/foreign.py assembles it from parts outside this project: canopen serves SDO, python-can carries the
-frames, and its servo uses only its own units. tools/hil.py runs it in its machine.
+tests/drivers/foreign.py assembles the drive from parts outside this project: canopen answers SDO requests, python-can
+transmits the frames, and the servo uses only its own units. tools/hil.py runs this program in its emulated machine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hil_second import COUNTS, MAKE, REVOLUTIONS
 from virtual_drives import bus_to_be_on
 
 STEP = 0.005
-"""Polling interval of its own timers without frames [s]."""
+"""Interval at which the drive's timers are polled while no frame arrives [s]."""
 NAMES = {
     DISABLED: "switch on disabled",
     READY: "ready to switch on",
@@ -40,7 +40,7 @@ NAMES = {
 
 
 class LastingBus(can.BusABC):
-    """A bus that may be down: then nothing arrives, frames are lost, and only the drive's watchdogs act."""
+    """Bus that may be down. While it is down, no frame arrives, sent frames are lost, and only the watchdogs act."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
@@ -48,12 +48,12 @@ class LastingBus(can.BusABC):
         super().__init__(channel=self.channel_info)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame."""
+        """Send a frame, or drop it if the bus is down."""
         with suppress(can.CanOperationError):
             self._bus.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Return the next frame."""
+        """Return the next frame, or None if no frame arrives in time."""
         try:
             return self._bus.recv(timeout)
         except can.CanOperationError:
@@ -67,9 +67,10 @@ class LastingBus(can.BusABC):
 
 
 def serve(bus: can.BusABC, node: int, say: Callable[[str], None], going: Callable[[], bool]) -> None:
-    """Run a drive on a bus while `going`; print each change of its state with the position of its slider.
+    """Run a drive on a bus while `going` returns True.
 
-    Each change of its digital outputs is another line: bits of 60FEh:01, number of the SYNC, and wall-clock time [s].
+    Print a line for each change of the drive's state, with the position of the slider, and for each change of the
+    digital outputs, with the bits of 60FEh:01, the number of the SYNC, and the wall-clock time [s].
     """
     rpm = 60.0 * REVOLUTIONS
     drive = ForeignDrive(MAKE, node, bus, time.monotonic, Truth(COUNTS, rpm, rpm))

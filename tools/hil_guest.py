@@ -1,6 +1,8 @@
-"""Program of tools/hil.py inside the machine: a service on can0, its drives on can1, a client; then a second robot.
+"""Program that tools/hil.py runs inside the emulated machine: a service on can0, its drives on can1, and a client.
 
 python tools/hil_guest.py FOLDER    as root; FOLDER has robot.toml and second.toml, and receives logs and result.json
+
+After this robot, the program runs a second robot.
 """
 
 from __future__ import annotations
@@ -18,15 +20,15 @@ from typing import Any
 from hil_programs import Machine
 
 LOGS = {"bus.log": "bus.log", "second-bus.log": "second-bus.log", "recordings/*.log": "service-frames.log"}
-"""Files copied out of memory, and their names on the host."""
+"""Files in memory that are copied to the host, and their names on the host."""
 
 CARDS = ("can0", "can1")
 
 
 def main() -> int:
-    """Run both robots; write logs and result.json."""
+    """Run both robots; write the logs and result.json; return the exit code."""
     folder, began = Path(sys.argv[1]), time.monotonic()
-    # The folder is on the host and slow to write: files written in motion go to memory first.
+    # The folder is on the host, and writing to it is slow. Files that are written in motion are first stored in memory.
     memory = Path(os.environ["TMPDIR"])
     result: dict[str, Any] = {"checks": {}, "failure": None, "loops": {}}
 
@@ -50,7 +52,7 @@ def main() -> int:
 
 def _run(machine: Machine, folder: Path, held: Callable[[str, str], None], result: dict[str, Any]) -> None:
     prepared = _compiled()
-    # Programs that start slowly on this machine start first, in parallel with this program's own imports.
+    # All programs start slowly on this machine. They start first, in parallel with this program's own imports.
     drives = machine.begin_drives("robot.toml", "can1")
     doctor = machine.doctor()
     machine.candump("can1", "bus.log")
@@ -64,7 +66,7 @@ def _run(machine: Machine, folder: Path, held: Callable[[str, str], None], resul
     held("doctor", doctor())
     machine.await_service(service)
     hil_scenario.disturbed(machine, load(folder / "robot.toml"), held, result)
-    # The second service starts while the first one writes its black boxes.
+    # The second service starts while the first service writes its black boxes.
     service.send_signal(signal.SIGTERM)
     second, drives = hil_second.begin(machine)
     machine.await_end(service, "the service")

@@ -18,17 +18,21 @@ from hil_needs import BIN, MODULES, SEARCH, Failed, busybox, last
 
 ROOT = Path(__file__).parents[1]
 PRECEDENCE = "-10"
-"""Nice value of the machine's session, if permitted."""
+"""Nice value of the emulated machine's session, if a change is permitted."""
 PORTABLE = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
-"""Settings of numba for any x86-64: the emulated processor lacks features of the host's and compiles for minutes."""
+"""Settings of numba that make it compile for any x86-64, since the emulated processor lacks features of the host's. It
+would also take minutes to compile itself.
+"""
 
 TESTS = ("tests/drivers/test_real_bus.py", "tests/drivers/test_frame_io.py")
 """Files with tests marked vcan."""
 
 COMPILED = "compiled"
-"""File with the outcome of compiling, for which the machine waits."""
+"""Name of the file with the outcome of compiling. The machine waits for this file."""
 CACHE = Path(sys.prefix) / "hil-numba"
-"""Compiled code, also for the next run: numba reuses code whose source has the same time and size."""
+"""Folder of the compiled code, which is also used in the next run: numba reuses code if the time and the size of its
+source have not changed.
+"""
 COMPILE = """
 import sys
 from pathlib import Path
@@ -44,8 +48,11 @@ finally:
 
 @contextlib.contextmanager
 def compiling(folder: Path) -> Iterator[None]:
-    """Compile the kinematics on the host in parallel, for the machine to load. Raises Failed at the end."""
-    (folder / COMPILED).unlink(missing_ok=True)  # from a previous run, in a folder that was kept
+    """Compile the kinematics on the host, in parallel with the context, so that the machine can load them.
+
+    Raises Failed at the end of the context if compiling has failed.
+    """
+    (folder / COMPILED).unlink(missing_ok=True)  # it may be left from a previous run
     with (folder / "compile.log").open("wb") as log:
         process = subprocess.Popen(
             (sys.executable, "-P", "-c", COMPILE, folder / COMPILED),
@@ -66,10 +73,10 @@ def compiling(folder: Path) -> Iterator[None]:
 
 
 def pack(folder: Path) -> tuple[Path, ...]:
-    """Write the files of Python and its packages into an image; return the folders in it.
+    """Write the files of Python and its packages into a disk image; return the folders in the image.
 
-    Our own modules stay on the host: numba discards compiled code if a file's time differs, and an image stores
-    whole seconds.
+    The modules of this project stay on the host: numba discards compiled code if the time of the source differs, and an
+    image stores times only in whole seconds.
     """
     library, packages = (Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib"))
     done = subprocess.run(
@@ -94,16 +101,16 @@ UNUSED = ("test", "rerun_cli", "scipy", "scipy.libs", "matplotlib", "mypy", "*__
 
 
 def can_interface(name: str) -> str:
-    """Return the shell commands by which the shipped unit brings a CAN interface up."""
+    """Return the shell commands with which the shipped systemd unit brings a CAN interface up."""
     lines = (ROOT / "configs" / "trirail-can@.service").read_text(encoding="utf-8").replace("%i", name).splitlines()
     setting = next(line.removeprefix("Environment=") for line in lines if line.startswith("Environment="))
     commands = [line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart=")]
-    # A command behind "-" may fail.
+    # A command with the prefix "-" may fail.
     return "\n".join([setting, *(f"{line[1:]} || true" if line.startswith("-") else line for line in commands)])
 
 
 def script(folder: Path, packed: tuple[Path, ...]) -> str:
-    """Return the script that the machine runs as root."""
+    """Return the shell script that the machine runs as root."""
     # The tree that virtme-ng mounts queries the host for every file at every import, which takes a minute for the
     # service. An image, whose blocks stay in memory, takes a third of that.
     binds = "\n".join(f"mount --bind /run/python{path} {path}" for path in packed)
@@ -141,7 +148,10 @@ echo ${{PIPESTATUS[0]}} > {folder}/vcan.code
 
 @contextlib.contextmanager
 def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[queue.Queue[str | None]]:
-    """Boot the machine; yield the queue of lines that it prints, None at its end. Leaving the context kills it."""
+    """Boot the machine; yield the queue of the lines that it prints, which ends with None.
+
+    The end of the context kills the machine.
+    """
     (folder / "machine.sh").write_text(script(folder, packed))
     devices = (
         f"-drive file={folder}/python.img,format=raw,if=virtio,readonly=on",
@@ -150,9 +160,9 @@ def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[qu
     )
     command = [
         *(str(BIN / "vng"), "--run", str(kernel), "--user", "root", "--cpus", "2", "--memory", "2G"),
-        # Emulated on purpose: the same everywhere, even if KVM is not available or hangs.
+        # KVM is not used, so that the machine is the same everywhere, even if KVM is not available or hangs.
         *("--disable-kvm", "--disable-microvm", "--force-9p", "--force-initramfs"),
-        *("--busybox", str(busybox())),  # otherwise it uses the first of that name, which may need libraries
+        *("--busybox", str(busybox())),  # otherwise vng uses the first of that name, which may need libraries
         *("--append", "mitigations=off", "--rwdir", str(folder), f"--qemu-opts={' '.join(devices)}"),
         *("--", f"bash {folder}/machine.sh"),
     ]
@@ -161,7 +171,7 @@ def machine(folder: Path, kernel: Path, packed: tuple[Path, ...]) -> Iterator[qu
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        start_new_session=True,  # to kill all of it together: virtme-ng, its shell, QEMU
+        start_new_session=True,  # so that virtme-ng, its shell and QEMU can be killed together
         env=os.environ | {"PATH": f"{BIN}:{SEARCH}"},
     )
     # The machine needs real time, so as root it gets precedence over other programs. Linux divides processor time
@@ -189,7 +199,7 @@ def _read(process: subprocess.Popen[bytes], lines: queue.Queue[str | None]) -> N
 
 
 def output_lines(lines: queue.Queue[str | None], deadline: float) -> Iterator[str]:
-    """Yield the machine's lines until it ends. Raises Failed at the deadline."""
+    """Yield the lines that the machine prints, until it ends. Raises Failed at the deadline."""
     newest = "nothing"
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Requirements of the emulated machine on this one: programs, a kernel with CAN, and their installation."""
+"""Requirements of the emulated machine on the host: programs and a kernel with CAN, and their installation."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ MODULES = (
     "drivers/block/virtio_blk",
     "fs/squashfs/squashfs",
 )
-"""Modules that the machine loads: drivers of the emulated cards, of CAN, of its disk."""
+"""Kernel modules that the machine loads: drivers of the emulated cards, of CAN, and of its disk."""
 DRIVERS = (*MODULES, "net/9p/9pnet_virtio", "fs/9p/9p")
-"""Drivers that a kernel must have; the last two give it access to the host's folders."""
+"""Drivers that a kernel must have. The last two give the machine access to the host's folders."""
 BUSYBOXES = ("busybox-static", "busybox.static", "busybox")
-"""Names of programs that may be linked statically, because the machine boots without libraries."""
+"""Names of busybox programs. One of them must be linked statically, because the machine boots without libraries."""
 PT_INTERP = 3
 """Type of the segment of an ELF file that names its dynamic linker (elf(5))."""
 
 PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "busybox": "busybox-static", "modprobe": "kmod", "udevadm": "udev"}
 PROGRAMS |= {"ip": "iproute2", "candump": "can-utils", "chrt": "util-linux", "mksquashfs": "squashfs-tools"}
 PROGRAMS |= {"tshark": "tshark"}
-"""Required programs, and the package of Debian and Ubuntu that contains each."""
+"""Required programs, and the package of Debian and Ubuntu that contains each program."""
 KERNELS = {"debian": "linux-image-amd64", "ubuntu": "linux-image-generic"}
-"""Package of a kernel with CAN and its drivers."""
+"""For each distribution, the package of a kernel with CAN and its drivers."""
 
 
 class Failed(Exception):
-    """A requirement is missing or a check failed; the message has the remedy or the log with details."""
+    """A requirement is missing or a check has failed; the message contains the remedy or the log with details."""
 
 
 def lacking() -> tuple[str, ...]:
-    """Return the Debian packages that are missing on this machine."""
+    """Return the packages that are missing on this host."""
     there = {program: shutil.which(program, path=SEARCH) for program in PROGRAMS} | {"busybox": busybox()}
     packages = [package for program, package in PROGRAMS.items() if there[program] is None]
     if not kernels():
@@ -51,7 +51,7 @@ def lacking() -> tuple[str, ...]:
 
 
 def busybox() -> str | None:
-    """Return the busybox that needs no library; None if there is none: that of initramfs-tools needs some."""
+    """Return the path of a statically linked busybox, or None. The busybox of initramfs-tools needs libraries."""
     paths = (shutil.which(name, path=folder) for name in BUSYBOXES for folder in SEARCH.split(":"))
     return next((path for path in paths if path is not None and is_static(Path(path))), None)
 
@@ -76,7 +76,7 @@ def is_static(file: Path) -> bool:
 
 
 def has_drivers(modules: Path) -> bool:
-    """Return whether a kernel's folder of modules contains all DRIVERS, or lists them as built in."""
+    """Return whether a kernel has all DRIVERS, as modules in its folder or built in."""
     try:
         built_in = (modules / "modules.builtin").read_text().split()
     except OSError:
@@ -85,7 +85,7 @@ def has_drivers(modules: Path) -> bool:
 
 
 def kernels(boot: Path = Path("/boot"), modules: Path = Path("/lib/modules")) -> list[Path]:
-    """Return the installed, readable kernels with the drivers, newest last."""
+    """Return the installed, readable kernels that have all DRIVERS, the newest last."""
     images = (
         image
         for image in boot.glob("vmlinuz-*")
@@ -95,7 +95,7 @@ def kernels(boot: Path = Path("/boot"), modules: Path = Path("/lib/modules")) ->
 
 
 def requirements() -> Path:
-    """Return the kernel to boot. Raises Failed with the package to install."""
+    """Return the kernel to boot. Raises Failed, which names the packages to install, if something is missing."""
     if packages := lacking():
         raise Failed(f"missing here: apt-get install {' '.join(packages)} (Debian, Ubuntu); or, as root: make hil")
     if not (BIN / "vng").exists():
@@ -104,7 +104,7 @@ def requirements() -> Path:
 
 
 def install(say: Callable[[str], None]) -> None:
-    """Install missing packages, as root with apt; otherwise `requirements` names them."""
+    """Install missing packages if this runs as root and apt is available; otherwise `requirements` names them."""
     packages = lacking()
     if not packages or os.geteuid() != 0 or shutil.which("apt-get") is None:
         return
@@ -131,5 +131,5 @@ def _distribution() -> str:
 
 
 def last(text: str, lines: int = 30) -> str:
-    """Return the end of a text."""
+    """Return the last lines of a text."""
     return "\n".join(text.splitlines()[-lines:])

@@ -1,4 +1,4 @@
-"""Programs inside the emulated machine: the doctor, drives, candump and the service, each with its log."""
+"""Programs that run inside the emulated machine: the doctor, drives, candump and the service, each with a log."""
 
 from __future__ import annotations
 
@@ -14,29 +14,31 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 STEP_TIMEOUT_S = 300.0
-"""Time limit of any step in this slow machine [s]; the whole run has a limit of its own, outside."""
+"""Time limit of each step in this slow machine [s]. The host limits the time of the whole run."""
 BUFFER = 8_000_000
-"""Receive buffer of candump's socket [bytes], large enough for every frame on a busy machine."""
+"""Receive buffer of candump's socket [bytes], so large that no frame is lost on a busy machine."""
 HEARTBEAT_TIMEOUT_S = 10.0
-"""Heartbeat time-out of a process in this slow machine [s]: while others start, it is scheduled late."""
+"""Heartbeat time-out of a process of the service [s]. In this slow machine, a process may have to wait long for the
+processor while others start.
+"""
 PATIENT = (
     "from trirail.cli import app; from trirail.processes import supervisor; "
     f"supervisor.START_WITHIN = supervisor.END_WITHIN = {STEP_TIMEOUT_S}; "
     f"supervisor.MAX_SILENCE_S = {HEARTBEAT_TIMEOUT_S}; app.main()"
 )
-"""`trirail` with longer time-outs: the interpreters alone take a minute to start here, and each fault's
-black box takes some seconds to write."""
+"""Program `trirail` with longer time-outs: in this machine, the interpreters alone take a minute to start, and the
+black box of each fault takes some seconds to write."""
 
 
 class Failed(Exception):
-    """A requirement is violated."""
+    """A step or a check has failed."""
 
 
 class Machine:
-    """Programs under test, each with its output in a log in `folder`; leaving the context ends them all."""
+    """Context in which programs run, each with its output in a log in `folder`; at its end, all programs are ended."""
 
     def __init__(self, folder: Path, memory: Path) -> None:
-        """`memory` is a folder with fast writes."""
+        """`memory` is a folder in memory, which is fast to write to."""
         self._folder = folder
         self._memory = memory
         self._systemd: dict[str, socket.socket] = {}
@@ -57,7 +59,7 @@ class Machine:
                 process.wait()
 
     def start(self, name: str, *command: object, **environment: str) -> subprocess.Popen[bytes]:
-        """Start a program with its output in NAME.log."""
+        """Start a program, and write its output to NAME.log."""
         with (self._folder / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(
                 [str(part) for part in command],
@@ -70,12 +72,12 @@ class Machine:
         return process
 
     def end(self, process: subprocess.Popen[bytes], name: str) -> None:
-        """End a program by SIGTERM. Raises Failed unless it ends as after a regular stop."""
+        """End a program by SIGTERM. Raises Failed unless it ends in time with exit code 0."""
         process.send_signal(signal.SIGTERM)
         self.await_end(process, name)
 
     def await_end(self, process: subprocess.Popen[bytes], name: str) -> None:
-        """Wait for the end of a program that received SIGTERM. Raises Failed unless it ends regularly."""
+        """Wait for the end of a program after SIGTERM. Raises Failed unless it ends in time with exit code 0."""
         wait_until(lambda: process.poll() is not None, f"{name} ends")
         if process.returncode != 0:
             raise Failed(f"{name} ended with exit code {process.returncode}, not 0, after SIGTERM")
@@ -85,9 +87,9 @@ class Machine:
         return (self._folder / f"{name}.log").read_text(errors="replace")
 
     def doctor(self) -> Callable[[], str]:
-        """Start `trirail doctor`; return a function that waits for it and returns its result for can0.
+        """Start `trirail doctor`; return a function that waits for its end and returns its findings on can0.
 
-        That function raises Failed unless all checks pass.
+        The returned function raises Failed unless all checks of can0 pass.
         """
         command = (sys.executable, "-P", "-m", "trirail", "doctor", self._folder / "robot.toml", "--quick", "--json")
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
@@ -103,7 +105,7 @@ class Machine:
         return verdict
 
     def candump(self, channel: str, name: str) -> None:
-        """Start the log NAME, in memory, of all frames on an interface."""
+        """Start to log all frames on an interface to the file `name` in memory."""
         with (self._memory / name).open("wb") as log:
             command = ("candump", "-L", "-D", "-r", str(BUFFER), channel)
             self._processes.append(subprocess.Popen(command, stdout=log))
@@ -116,7 +118,7 @@ class Machine:
         return self.begin("tools/virtual_drives.py", config, channel, name, *more)
 
     def restart_drives(self, config: str, channel: str, name: str, faults: str) -> None:
-        """Start virtual drives beside running services: they get their priority after their imports."""
+        """Start virtual drives while services run. They get their real-time priority only after their imports."""
         process = self.start(
             name,
             *(sys.executable, "tools/virtual_drives.py", self._folder / config),
@@ -127,7 +129,7 @@ class Machine:
 
     def begin(self, program: str, config: str, channel: str, name: str, *more: object) -> subprocess.Popen[bytes]:
         """Start a program that simulates a configuration's drives on an interface."""
-        # Real drives do not share a processor with a desktop: these have precedence over everything but the loop.
+        # Real drives share no processor with other programs, so these have precedence over everything but the loop.
         return self.start(
             name,
             *("chrt", "--fifo", "50", sys.executable, program, self._folder / config),
@@ -135,11 +137,11 @@ class Machine:
         )
 
     def await_drives(self, process: subprocess.Popen[bytes], name: str = "drives") -> None:
-        """Wait until the last of a program's drives reports its state."""
+        """Wait until a program has reported the state of drive C, the last of its drives."""
         wait_until(lambda: "C " in self.log(name), f"{name} are there", process)
 
     def begin_service(self, config: str, name: str = "service") -> subprocess.Popen[bytes]:
-        """Start the service, which notifies systemd, replaced by this program, when it is up."""
+        """Start the service. When it is up, it notifies systemd; here, this program receives the notification."""
         self._systemd[name] = systemd = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         address = self._memory / f"notify-{name}"
         systemd.bind(str(address))
@@ -148,18 +150,18 @@ class Machine:
         return self.start(name, *command, NOTIFY_SOCKET=str(address))
 
     def await_service(self, process: subprocess.Popen[bytes], name: str = "service") -> None:
-        """Wait until a started service is up."""
+        """Wait until a service that `begin_service` has started is up. Raises Failed."""
         with self._systemd.pop(name) as systemd:
             wait_until(lambda: _received(systemd) == "READY=1", f"{name} is up", process)
 
 
 def run(*command: str) -> None:
-    """Run a command to its end. Raises subprocess.SubprocessError if it fails."""
+    """Run a command, and wait for its end. Raises subprocess.SubprocessError if it fails."""
     subprocess.run(command, check=True)
 
 
 def wait_until(condition: Callable[[], bool], what: str, process: subprocess.Popen[bytes] | None = None) -> None:
-    """Wait for a condition. Raises Failed if it does not hold in time, or if the process ends first."""
+    """Wait until a condition is True. Raises Failed if that takes too long, or if the process ends first."""
     deadline = time.monotonic() + STEP_TIMEOUT_S
     while not condition():
         if process is not None and process.poll() is not None:

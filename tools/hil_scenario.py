@@ -1,4 +1,4 @@
-"""Scenario in the emulated machine, in order: motion, stops, and disturbances by other nodes on the bus."""
+"""Scenario of the first robot in the emulated machine: motion, stops, and disturbances on the bus, in this order."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ Held = Callable[[str, str], None]
 """Function that records a passed check and its details."""
 
 FLOOD_GAP = "4"
-"""Time between two frames of a flood [ms]: 250 per second, with the highest priority of foreign data frames."""
+"""Time between two frames of a flood [ms]. A flood thus has 250 frames per second; their priority is the highest that a
+data frame of another node can have.
+"""
 PRE_OPERATIONAL_B = "000#8002"
-"""NMT command that a foreign master would send to put drive B into pre-operational (CiA 301, 7.2.8.3.1)."""
+"""NMT command with which another master would switch drive B to pre-operational (CiA 301, 7.2.8.3.1)."""
 
 
 def disturbed(machine: Machine, config: Config, held: Held, result: dict[str, Any]) -> None:
-    """Move, stop, and apply disturbances: foreign nodes on the bus, and loss of either card in motion.
+    """Move and stop the robot, then disturb it: by other nodes on the bus, and by the loss of either card in motion.
 
-    `result` gets "cut": the time up to which the frames on the bus are those of an undisturbed robot.
+    "cut" in `result` is set to the time of the first disturbance. Until then, the frames on the bus must be perfect.
     """
     held("service", "up on can0, its drives set up and read back by SDO")
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
-        recover(robot)  # a stall of the machine at the start correctly faults, and is no error of the service
+        recover(robot)  # a stall of the machine at the start correctly causes a fault
         held("enable", "confirmed, the robot holds")
         moved = robot.move_to(x=0.01, y=-0.005, phi=0.05).wait(STEP_TIMEOUT_S)
         expect(moved, "done", robot)
@@ -67,7 +69,7 @@ def _stopped(robot: Robot, held: Held) -> None:
 
 
 def quick_stopped(robot: Robot, held: Held, name: str = "quick stop and reset") -> float:
-    """Stop by a quick stop in motion, reset and enable; return the time of the stop command [s since 1970]."""
+    """Quick-stop the robot in motion, reset and enable it; return the time of the stop command [s since 1970]."""
     goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
     wait_until_moving(robot, goal.id)
     at = time.time()
@@ -90,7 +92,7 @@ def _flooded(robot: Robot, held: Held) -> None:
 
 
 def _thrown_out(robot: Robot, held: Held) -> None:
-    """Take drive B out of operational in motion like a foreign master: the robot must stop and name the drive."""
+    """Switch drive B to pre-operational in motion, as another master could: the robot must stop and name the drive."""
     goal = robot.move_to(x=-0.08, y=0.0, phi=0.0)
     wait_until_moving(robot, goal.id)
     run("cansend", "can1", PRE_OPERATIONAL_B)
@@ -99,7 +101,7 @@ def _thrown_out(robot: Robot, held: Held) -> None:
 
 
 def _drives_link_down(robot: Robot, machine: Machine, held: Held) -> None:
-    """Take the drives' card down in motion: they must stop by themselves, and recover."""
+    """Switch the drives' CAN interface off in motion: the drives must stop by themselves, and recover afterwards."""
     goal = robot.move_to(x=0.08, y=0.0, phi=0.0)
     wait_until_moving(robot, goal.id)
     run("ip", "link", "set", "can1", "down")
@@ -120,7 +122,7 @@ def _link_down(robot: Robot, machine: Machine, held: Held) -> None:
 
 
 def _faulted(robot: Robot, result: Result, whose: str) -> str:
-    """Return the text of the fault. Raises Failed unless the goal ended by a fault that names its origin."""
+    """Return the text of the fault. Raises Failed unless the goal ended with a fault that names its origin `whose`."""
     expect(result, "faulted", robot)
     state = wait_for_state(robot, lambda state: state.mode == "fault", "fault")
     if not any(whose in fault for fault in state.faults):
@@ -129,7 +131,7 @@ def _faulted(robot: Robot, result: Result, whose: str) -> str:
 
 
 def recover(robot: Robot) -> None:
-    """Reset any fault as soon as its cause is gone, and enable as soon as the sliders are at rest."""
+    """Repeat reset and enable until both succeed: the cause of a fault must be gone, and the sliders at rest."""
 
     def enabled() -> bool:
         try:
@@ -144,7 +146,7 @@ def recover(robot: Robot) -> None:
 
 
 def wait_until_moving(robot: Robot, goal: str) -> None:
-    """Wait until a goal is well under way."""
+    """Wait until a goal has progressed by more than a fifth. Raises Failed."""
     wait_for_state(
         robot,
         lambda state: state.goal is not None and state.goal.id == goal and state.goal.progress > 0.2,
@@ -153,7 +155,7 @@ def wait_until_moving(robot: Robot, goal: str) -> None:
 
 
 def wait_for_state(robot: Robot, condition: Callable[[State], bool], what: str) -> State:
-    """Return the first state that satisfies a condition."""
+    """Wait for the first state that satisfies a condition, and return it. Raises Failed."""
     deadline = time.monotonic() + STEP_TIMEOUT_S
     for state in robot.states(timeout=STEP_TIMEOUT_S):
         if condition(state):
@@ -164,7 +166,7 @@ def wait_for_state(robot: Robot, condition: Callable[[State], bool], what: str) 
 
 
 def expect(result: Result, outcome: str, robot: Robot) -> None:
-    """Raise Failed unless a goal ended as it should."""
+    """Raise Failed unless a goal ended with the expected outcome."""
     if result.outcome != outcome:
         raise Failed(f"goal: {result.message}; expected {outcome}. {_about(robot.state())}")
 
@@ -174,13 +176,13 @@ def _about(state: State) -> str:
 
 
 def _in_fault(log: str) -> bool:
-    """Return whether the newest line of each drive reports fault, without power, caused by its watchdog."""
+    """Return whether the newest line of each drive reports a fault; in this scenario, its watchdog causes the fault."""
     newest = {line[0]: line for line in log.splitlines() if line[:2] in {"A ", "B ", "C "}}
     return len(newest) == 3 and all(line[2:].startswith("fault,") for line in newest.values())
 
 
 def loop_of(state: State) -> dict[str, Any]:
-    """Return the timing of the loop."""
+    """Return the numbers of cycles and of missed ticks, and the lateness of the loop."""
     loop = state.loop
     return {
         "cycles": loop.cycles,

@@ -1,7 +1,7 @@
-"""Second robot in the emulated machine: another rate, on vcan0, with a drive that needs homing and a third-party one.
+"""Second robot in the emulated machine, on vcan0 at another rate, with one drive that is homed and a third-party drive.
 
-Its service starts while the first one ends, because both are slow then, and neither is in motion. Its bus is down at
-that time, and is lost at rest and in motion later. The same service survives all of this.
+Its service starts while the first service ends, since both are slow and neither robot is in motion then. At this time
+the bus of the second robot is down; later the bus is lost at rest and in motion. The service must survive every loss.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from trirail.config import Config
 
 CHANNEL = "vcan0"
 MAKE = "maxon_epos4_compact50_5"
-"""Name in tests/data/drives of the drive that python-canopen serves as drive C."""
+"""Name in tests/data/drives of the drive that python-canopen simulates as drive C."""
 COUNTS = 819_200.0
-"""Counts per metre of drive C: 4096 per turn, a screw of 5 mm lead."""
+"""Counts per metre of drive C: 4096 counts per turn, and a screw with a lead of 5 mm."""
 REVOLUTIONS = 200.0
-"""Turns per metre of drive C, which uses rpm."""
+"""Revolutions per metre of drive C, whose velocities are in rpm."""
 CLOSE = 1e-4
 """Maximum deviation of a drive at rest from the position that the service reports [m]."""
 VALVE = 1 << 16
-"""Output of the foreign drive, as a bit of 60FEh:01."""
+"""Digital output of the third-party drive, as a bit of 60FEh:01."""
 PULSES = {"output": "valve", "start": 0.004, "end": 0.016, "increment": 0.005, "pulse_width": 0.3}
-"""Mark of a goal: three pulses of three cycles, seven cycles apart."""
+"""Mark of a goal: three pulses, each three cycles long, with seven cycles between the beginnings of pulses."""
 
 CHANGES = {
     'name = "robot"': 'name = "second"',
     "rate_hz = 20": "rate_hz = 10",
     'channel = "can0"': f'channel = "{CHANNEL}"',
-    # A setpoint one cycle ahead and feedback one cycle behind alone are 20 mm at 10 Hz and 0.1 m/s.
+    # The feedback is one SYNC old, and the setpoint is one SYNC ahead: alone 20 mm at 0.1 m/s and 10 Hz.
     "following_error = 0.03 ": "following_error = 0.06 ",
     "following_error = 0.04": "following_error = 0.08",
     "[can.simulated]\n": "[can.simulated]\nstart = [0.01, 0.0, 0.0]\n",
@@ -49,15 +49,15 @@ CHANGES = {
     "/zenoh": "/zenoh-second",
     "/recordings": "/recordings-second",
 }
-"""Differences of its configuration from that of the first robot."""
+"""Differences between the configurations of the second and the first robot."""
 DOWN = f"CAN bus {CHANNEL} is down: "
-"""Beginning of the fault while its bus is lost."""
+"""Beginning of the fault's text while the bus is lost."""
 FAULTS = "C silent\n"
-"""Faults of the virtual drives: the third is replaced by the foreign one."""
+"""Faults of the virtual drives: the third drive is silent, because the third-party drive replaces it."""
 
 
 def configure(first: str) -> str:
-    """Return the second robot's configuration, derived from that of the first."""
+    """Return the configuration of the second robot, given that of the first robot."""
     for before, after in CHANGES.items():
         if first.count(before) != 1:
             raise Failed(f"{before!r} is not there once; CHANGES of tools/hil_second.py needs it")
@@ -66,9 +66,9 @@ def configure(first: str) -> str:
 
 
 def begin(machine: Machine) -> tuple[Popen[bytes], Popen[bytes]]:
-    """Start its drives, its log of frames and its service, on a bus that is down; return service and virtual drives.
+    """Start the drives and the log of frames, switch the bus off, and start the service.
 
-    Waits only for the drives.
+    Return the processes of the service and of the virtual drives. This waits for the drives, but not for the service.
     """
     machine.candump(CHANNEL, "second-bus.log")
     virtual = machine.begin_drives("second.toml", CHANNEL, "second-drives", "second.faults")
@@ -87,9 +87,9 @@ def run(
     held: Held,
     result: dict[str, Any],
 ) -> None:
-    """Home, move, stop by a quick stop, lose the bus and the drives; the foreign drive must reach its target.
+    """Home, move and quick-stop the robot, check the position of the third-party drive, and lose bus and drives.
 
-    `virtual`: the process of its first two drives.
+    `virtual` is the process of the first two drives.
     """
     machine.await_service(service, "second-service")
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
@@ -124,24 +124,27 @@ def run(
 
 
 class Change(NamedTuple):
-    """Change of the foreign drive's outputs, as it prints it."""
+    """Change of the third-party drive's outputs, from a line that the drive has printed."""
 
     on: bool
     """Value of the valve."""
     sync: int
-    """Number of the SYNC at which they changed."""
+    """Number of the SYNC at which the outputs changed."""
     t: float
-    """Wall-clock time soon after it [s]."""
+    """Wall-clock time soon after the change [s]."""
 
 
 def changes(log: str) -> list[Change]:
-    """Return the changes of outputs in the foreign drive's log."""
+    """Return the changes of outputs in the log of the third-party drive."""
     lines = re.findall(r"^outputs ([0-9A-F]{8}) at SYNC (\d+), ([\d.]+)$", log, re.MULTILINE)
     return [Change(bool(int(bits, 16) & VALVE), int(sync), float(t)) for bits, sync, t in lines]
 
 
 def cycles_problem(cycles: Sequence[tuple[int, bool]], switched: Sequence[tuple[int, bool]]) -> str:
-    """Return what is wrong; "" where values switched as in a table, all equally many SYNCs after their cycle."""
+    """Return a description of the difference between a table of switches and the actual switches, or "".
+
+    There is no difference if the values are equal and all switches are delayed by the same number of SYNCs.
+    """
     expected, values = [on for _, on in cycles], [on for _, on in switched]
     if values != expected:
         return f"outputs have switched to {values}, in the table to {expected}"
@@ -150,9 +153,9 @@ def cycles_problem(cycles: Sequence[tuple[int, bool]], switched: Sequence[tuple[
 
 
 def _switched(robot: Robot, machine: Machine, held: Held) -> list[dict[str, Any]]:
-    """Switch an output of the foreign drive on the path of a goal; return the table of its switches.
+    """Switch an output of the third-party drive on the path of a goal; return the table of the switches.
 
-    Each must take effect equally many SYNCs after the cycle that the table has.
+    All switches must take effect the same number of SYNCs after their cycles in the goal's result.
     """
     before = len(changes(machine.log("foreign")))
     goal = robot.move_to(x=0.01, y=0.015, phi=0.05, speed=0.3, marks=[PULSES])
@@ -175,7 +178,7 @@ def _switched(robot: Robot, machine: Machine, held: Held) -> list[dict[str, Any]
 
 
 def _disturb(machine: Machine, virtual: Popen[bytes], config: Config, held: Held) -> None:
-    """Lose the bus at rest and in motion, then drives A and B; reset, enable, home and a goal suffice each time."""
+    """Lose the bus at rest and in motion, and then drives A and B. The robot must recover each time."""
     with Robot(config.robot.name, config.zenoh.listen[0]) as robot:
         robot.enable()
         held("bus lost at rest", _recovered(robot, lambda: _set_link("down"), lambda: _set_link("up"), DOWN))
@@ -192,7 +195,10 @@ def _disturb(machine: Machine, virtual: Popen[bytes], config: Config, held: Held
 
 
 def _recovered(robot: Robot, lose: Callable[[], object], restore: Callable[[], object], fault: str) -> str:
-    """Cause a loss and restore it; return the passed check. Raises Failed unless the `fault` begins as expected."""
+    """Cause a loss, restore, and let the robot recover; return a description.
+
+    The robot recovers by reset, enable, homing and a goal. Raises Failed if the fault does not begin with `fault`.
+    """
     lose()
     state = wait_for_state(robot, lambda state: state.mode == "fault", "fault")
     if not state.faults[0].startswith(fault):
@@ -210,7 +216,7 @@ def _set_link(state: str) -> None:
 
 
 def _at(machine: Machine) -> float | None:
-    """Return the position of the foreign drive [m], if its newest output reports no power."""
+    """Return the position of the third-party drive [m] if its newest line reports no power, otherwise None."""
     lines = [line for line in machine.log("foreign").splitlines() if line.startswith("C ")]
     logs = re.fullmatch(r"C switch on disabled, (-?[\d.]+) mm", lines[-1]) if lines else None
     return float(logs[1]) * 1e-3 if logs else None

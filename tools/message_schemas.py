@@ -1,7 +1,7 @@
 """JSON Schemas of the messages, for clients in other languages: python tools/message_schemas.py [--check].
 
-They are made from the types of trirail.wire and shipped in service/trirail/wire/schemas, one file for each
-kind of message. With --check nothing is written; exit 1 if a file is not what the types say.
+The schemas are generated from the types of trirail.wire, and shipped in service/trirail/wire/schemas, one file for each
+kind of message. With --check, nothing is written, and the exit code is 1 if a file differs from the types.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MESSAGES: dict[str, tuple[Any, str]] = {
     "alignment": (looks.AlignmentLook, "What is sent to alignment/<user>, and the reply where it is taken."),
     "info": (state.Info, "The reply to a query on info."),
 }
-"""Type of each message, and a description of where it is used, by file."""
+"""For each file, the type of the message, and a description of its use."""
 MODULES = (
     *(sys.modules[kind.__module__] for kind in goals.KINDS),
     goal_kind,
@@ -94,7 +94,7 @@ def _described(code: EventCode) -> str:
 
 
 def _anything(kind: type) -> dict[str, Any]:
-    """Allow every value if the type does, as in the limits and geometry of Info, which the configuration defines."""
+    """Return a schema without restrictions for `object`: the limits and the geometry in Info are as configured."""
     if kind is object:
         return {"description": "As in the configuration."}
     raise NotImplementedError
@@ -108,7 +108,7 @@ def stale(folder: Path = FOLDER) -> list[str]:
 
 
 def main() -> int:
-    """Write the files, or check them."""
+    """Write the files, or check them; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is not current")
     if parser.parse_args().check:

@@ -1,6 +1,6 @@
-"""A picture of the operator's page beside a running robot: python tools/panel_picture.py [OUT.png].
+"""Picture of the operator's page while a robot moves: python tools/panel_picture.py [OUT.png].
 
-A service on simulated drives of its own, enabled and moving, its page in Chromium, which has to be installed.
+The tool starts a service on simulated drives, moves the robot, and opens the page in Chromium, which must be installed.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from websockets.sync.client import connect
 OUT = Path(__file__).parent / "pictures" / "panel.png"
 SIZE = (1280, 800)
 TIMEOUT = 60.0
-"""Maximum time until the browser answers and the page shows the robot [s]."""
+"""Time limit until the browser answers and until the page shows the robot [s]."""
 READY = (
     "document.querySelector('.goal')?.getBoundingClientRect().width && document.querySelector('#people').textContent"
 )
-"""JavaScript condition for the picture: the page has loaded and the robot moves."""
+"""JavaScript condition for taking the picture: the page has loaded and shows the goal of the robot."""
 TOUR = ((0.03, 0.02, 0.2), (-0.03, 0.02, -0.2), (0.02, -0.03, 0.1), (0.0, 0.0, 0.0))
 
 
 def main() -> None:
-    """Write the picture."""
+    """Take the picture and write it to the file."""
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else OUT
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         raise SystemExit("no Chromium here: install it (Debian: apt-get install chromium)")
     with tempfile.TemporaryDirectory(prefix="trirail-", ignore_cleanup_errors=True) as folder:
         config, locator = own_service.private(Path(folder))
-        os.environ["STATE_DIRECTORY"] = folder  # keeps the taught poses apart from the user's
+        os.environ["STATE_DIRECTORY"] = folder  # separates the taught poses from the user's poses
         with own_service.service(config, Path(folder, "shown.rrd")), Robot("demo", locator, user="ann") as robot:
             robot.enable()
             for name in ("pick", "place"):
@@ -70,7 +70,7 @@ def main() -> None:
 
 @contextmanager
 def _page(browser: str, profile: Path, url: str) -> Iterator[Callable[..., dict[str, Any]]]:
-    """Open a page in a browser; yield a function that calls a method of the DevTools protocol on it."""
+    """Open a page in a browser; yield a function that calls a method of the DevTools protocol on the page."""
     width, height = SIZE
     flags = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--remote-debugging-port=0")
     command = [browser, *flags, f"--user-data-dir={profile}", f"--window-size={width},{height}", url]

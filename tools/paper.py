@@ -1,10 +1,11 @@
-"""Figures 3 to 11 of the paper by three methods: computed, from tables of 50 digits, and from the running service.
+"""Figures 3 to 11 of the paper by three methods: computed, from tables with 50 digits, and from the running service.
 
 python tools/paper.py --output DIR  (needs trirail[analysis])
 
-It draws the motion of the sliders in the paper's examples by equation (5) and the recursion, starts its own service on
-simulated drives that follows the same three motions, plots its recording over the curves, and prints the differences
-between the three. With --offline it starts no service.
+The tool computes the motion of the sliders in the paper's examples by equation (5) and the recursion, and draws it. It
+starts its own service on simulated drives, which follows the same three motions, and draws the setpoints of its
+recording over the curves. Finally it prints the differences between the three methods. With --offline it starts no
+service.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from trirail.errors import ServiceError, TrirailError
 
 
 class Comparison(NamedTuple):
-    """Maximum of a figure, and maximum differences over sliders and times, in its unit."""
+    """Maximum value of a figure, and maximum differences over all sliders and times, in the unit of the figure."""
 
     figure: int
     example: str
@@ -42,16 +43,16 @@ class Comparison(NamedTuple):
     unit: str
     greatest: float
     difference: float
-    """Difference between computed values and the table, at the table's times."""
+    """Difference between the computed values and the table, at the times of the table."""
     service: float | None
-    """Difference between the service's setpoints and computed values, at every cycle."""
+    """Difference between the service's setpoints and the computed values, in every cycle; None without a service."""
     measured: float | None
-    """Difference between measured and computed sliders; only for displacements, which drives measure."""
+    """Difference between measured and computed slider positions; None for velocities and accelerations."""
     picture: str
 
 
 def compare(pictures: Mapping[str, Path], service: Mapping[str, Driven]) -> list[Comparison]:
-    """Compare computed values with the tables, and with the service if it ran. Raises TrirailError."""
+    """Compare the computed values with the tables and, if the service ran, with the service. Raises TrirailError."""
     comparisons = []
     for number, example, quantity in figures():
         exact = tabulated(example)
@@ -80,7 +81,7 @@ def compare(pictures: Mapping[str, Path], service: Mapping[str, Driven]) -> list
 
 
 def over_all(comparisons: Sequence[Comparison], of: str) -> dict[str, float]:
-    """Return the maximum over the examples of one of the differences, for each quantity in its unit."""
+    """Return the maximum of the difference `of` over all examples, for each quantity in its unit."""
     greatest: dict[str, float] = {}
     for row in comparisons:
         value = getattr(row, of)
@@ -130,7 +131,7 @@ def _cell(value: float | None) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw and compare; return the exit code."""
+    """Draw the figures and compare the methods; return the exit code."""
     parser = argparse.ArgumentParser(
         description="Draws the paper's figures 3 to 11, as computed and as a service of its own on simulated drives "
         "runs them, and tells how far these are from each other and from tables of 50 digits."
@@ -170,7 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _driven(recording: Path, quiet: bool) -> dict[str, Driven]:
-    """Follow the motions by the service, with progress messages unless `quiet`; return its motions by name."""
+    """Let a service follow the motions, and print its progress unless `quiet`; return the motions by name."""
     try:
         recording.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Pictures of the paper's figures 3 to 11: computed values as lines, values of the running service as circles."""
+"""Pictures of the paper's figures 3 to 11, with computed values as lines and values of the service as circles."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ STYLE: dict[Any, Any] = {
     "lines.scale_dashes": False,
 }
 DASH = 9.0
-"""Length of the dashes in which curves that coincide, as all three do in the rotation, take turns [pt]."""
+"""Length of the dashes [pt]. Curves that coincide, as all three do in the rotation, are drawn as alternating dashes."""
 
 
 CIRCLES: dict[str, Any] = {
@@ -65,13 +65,13 @@ CIRCLES: dict[str, Any] = {
 }
 NOTE: dict[str, Any] = {"color": "#4b5563", "fontsize": 8.5}
 DOT = 0.125
-"""Time between the circles [s]."""
+"""Time between two circles [s]."""
 
 
 def plot(axes: Axes, quantity: Quantity, curves: Curves, service: Curves | None = None) -> None:
-    """Draw a quantity of the three sliders: computed as lines, by the service as circles.
+    """Draw a quantity of the three sliders: the computed values as lines, those of the service as circles.
 
-    Where the curves of several sliders are one, they share it: in dashes, and circles in turn.
+    If the curves of several sliders coincide, their dashes and circles alternate.
     """
     sliders = curves.values_of(quantity).T
     visible = 1e-3 * float(np.ptp(sliders))
@@ -88,7 +88,7 @@ def plot(axes: Axes, quantity: Quantity, curves: Curves, service: Curves | None 
 
 
 def draw(axes: Axes, title: str, quantity: Quantity, curves: Curves, service: Curves | None, difference: float) -> None:
-    """Draw one figure, with the difference between the service and the computed values."""
+    """Draw one figure, and write the difference between the service and the computed values below it."""
     axes.axhline(0.0, color="#9ca3af", linewidth=1.0)
     plot(axes, quantity, curves, service)
     axes.set_title(title, loc="left", pad=12.0)
@@ -111,7 +111,7 @@ def draw(axes: Axes, title: str, quantity: Quantity, curves: Curves, service: Cu
 
 
 def write(output: Path, curves: Mapping[Example, Curves], service: Mapping[str, Curves]) -> dict[str, Path]:
-    """Write a picture of each figure, and an overview of all. Raises ServiceError."""
+    """Write a picture of each figure and an overview; return the files by name. Raises ServiceError."""
     pictures = {}
     with matplotlib.rc_context(STYLE):
         overview = Figure(figsize=(15.0, 10.8))
@@ -138,7 +138,7 @@ def write(output: Path, curves: Mapping[Example, Curves], service: Mapping[str, 
 
 
 def _explain(picture: Figure) -> None:
-    """Say below a picture what lines and circles are."""
+    """Add a legend below a picture that explains lines and circles."""
     line = Line2D([], [], color=NOTE["color"])
     circle = Line2D([], [], color=NOTE["color"], **CIRCLES)
     words = ("computed by the recursion", f"setpoints of the running service, every {DOT * 1e3:g} ms")
@@ -146,7 +146,7 @@ def _explain(picture: Figure) -> None:
 
 
 def _power(value: float) -> str:
-    """Write a number as a decimal power."""
+    """Return a number as text with a power of ten."""
     if value == 0.0:
         return "0"
     digits, power = f"{value:.1e}".split("e")

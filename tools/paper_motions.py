@@ -1,4 +1,4 @@
-"""The paper's three motions, by equation (5): of the platform, of the sliders, and of the sliders to 50 digits."""
+"""The paper's three motions by equation (5): of the platform, and of the sliders, computed and from exact tables."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from trirail.kinematics.geometry import LEGS, Geometry
 from trirail.kinematics.robot import inverse
 
 L0 = 0.3
-"""Centre to summit of the fixed triangle [m]."""
+"""Distance between the centre and a vertex of the fixed triangle [m]."""
 DURATION = 3.0
-"""[s]"""
+"""Duration of each motion [s]."""
 TABLES = Path(__file__).resolve().parents[1] / "tests" / "data"
-"""The solution of the loop equations (11) for the three examples, to 50 digits."""
+"""Folder with the solutions of the loop equations (11) for the three examples, with 50 digits."""
 
 
 class Example(NamedTuple):
-    """A motion of the platform by equation (5), from the central configuration to twice `amplitude`."""
+    """Motion of the platform by equation (5), from the central configuration to twice the `amplitude`."""
 
     name: str
     title: str
@@ -34,13 +34,13 @@ class Quantity(NamedTuple):
     """Quantity of the sliders in a figure."""
 
     name: str
-    column: str  # in the tables, and with a slider's name
+    column: str  # in the tables, followed by the name of a slider
     symbol: str
     unit: str
 
 
 class Curves(NamedTuple):
-    """Motion of the three sliders over time, from any source: t (N,) [s], the others (N, 3) in m, m/s, m/s²."""
+    """Motion of the three sliders over time: t, (N,) [s], and the other fields, (N, 3) [m], [m/s], [m/s²]."""
 
     t: Array
     position: Array  # lambda_10
@@ -65,7 +65,7 @@ QUANTITIES = (  # in the order of the fields of Curves
 
 
 def platform(example: Example, t: Array) -> tuple[Array, Array, Array]:
-    """Return the platform's pose, velocity and acceleration at times t (N,) [s] by (5), (N, 3) each."""
+    """Return the pose, velocity and acceleration of the platform by equation (5) at times t, (N,) [s]; each (N, 3)."""
     w = math.pi / 3.0
     return (
         np.outer(1.0 - np.cos(w * t), example.amplitude),
@@ -75,13 +75,13 @@ def platform(example: Example, t: Array) -> tuple[Array, Array, Array]:
 
 
 def computed(example: Example, t: Array) -> Curves:
-    """Return the motion of the sliders at times t (N,) [s], by (5) and the inverse kinematics."""
+    """Return the motion of the sliders at times t, (N,) [s], by equation (5) and the inverse kinematics."""
     motion = inverse(Geometry.symmetric(L0), *platform(example, t))
     return Curves(t, motion.position, motion.velocity, motion.acceleration)
 
 
 def tabulated(example: Example) -> Curves:
-    """Return the exact motion of the sliders. Raises ServiceError if its table cannot be read."""
+    """Return the exact motion of the sliders from its table. Raises ServiceError if the table cannot be read."""
     path = TABLES / f"paper_{example.name}.csv"
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -96,12 +96,12 @@ def tabulated(example: Example) -> Curves:
 
 
 def figures() -> Iterator[tuple[int, Example, Quantity]]:
-    """Yield the paper's figures with their numbers."""
+    """Yield the number, the example and the quantity of each figure of the paper."""
     pairs = ((example, quantity) for example in EXAMPLES for quantity in QUANTITIES)
     for number, (example, quantity) in enumerate(pairs, start=3):
         yield number, example, quantity
 
 
 def greatest_difference(curves: Curves, reference: Curves, quantity: Quantity) -> float:
-    """Return the greatest difference of a quantity in its unit, over the sliders and the same times."""
+    """Return the maximum difference of a quantity between two motions at the same times, in the quantity's unit."""
     return float(np.max(np.abs(curves.values_of(quantity) - reference.values_of(quantity))))

@@ -1,9 +1,9 @@
-"""The paper's three motions by a running service, sent to it over Zenoh and read back from its recording.
+"""The paper's three motions, executed by a running service and read back from its recording.
 
-The service is private, on simulated drives (configs/sim.toml), on a socket in a temporary folder.
-It receives each motion of equation (5) as a timed trajectory. Equation (5) begins and ends with an acceleration at
-standstill of up to 0.032 m/s² at a slider: a jerk of 32 m/s³ for one cycle of 1 ms at either end, which the sliders'
-limit of 400 m/s³ in configs/sim.toml allows.
+A private service runs on simulated drives (configs/sim.toml), and listens on a socket in a temporary folder. It
+receives each motion of equation (5) over Zenoh as a timed trajectory. Equation (5) begins and ends at standstill with
+an acceleration, which is up to 0.032 m/s² at a slider. For one cycle of 1 ms at either end, this is a jerk of 32 m/s³,
+which the sliders' limit of 400 m/s³ in configs/sim.toml allows.
 """
 
 from __future__ import annotations
@@ -26,29 +26,31 @@ from trirail.wire.goals import TrajectoryPoint
 from trirail.wire.vocabulary import MODES, Mode
 
 SPACING = 0.02
-"""Time between the points of a trajectory [s]. The remainder of the service's quintics between them is
-f⁽⁶⁾ τ³ (h − τ)³ / 720 at a time τ of an interval h: in position, velocity and acceleration at most h⁶/46080,
-√5 h⁵/30000 and h⁴/1920 of the sixth derivative, here 5e-17 m, 9e-15 m/s and 3e-12 m/s². Rounding errors are not
-smaller, and grow with closer points."""
+"""Time between the points of a trajectory [s]. The error of the service's quintic polynomials between the points is
+f⁽⁶⁾ τ³ (h − τ)³ / 720 at the time τ in an interval of length h. In position, velocity and acceleration this is at most
+h⁶/46080, √5 h⁵/30000 and h⁴/1920 times the sixth derivative, here 5e-17 m, 9e-15 m/s and 3e-12 m/s². Rounding errors
+are not smaller than this, and would increase with closer points.
+"""
 MOTION_TIMEOUT_S = 60.0
-"""Time limit of a motion, which takes longer on a busy machine [s]."""
+"""Time limit of a motion [s]; a motion takes longer on a busy machine."""
 USER = "paper"
 REACHED_AFTER_CYCLES = 2
-"""Cycles from the one that writes a setpoint to the SYNC at which a drive should have reached it: the drive applies
-the setpoint at the SYNC in between (trirail.control.control.Control.observe)."""
+"""Number of cycles between the writing of a setpoint and the SYNC at which a drive should have reached the setpoint.
+The drive applies the setpoint at the SYNC in between (trirail.control.control.Control.observe).
+"""
 
 
 class Driven(NamedTuple):
-    """A motion executed by the service, at t = 1, 2, … periods."""
+    """Motion executed by the service, at t = 1, 2, … periods."""
 
     commanded: Curves
     """Setpoints of the sliders."""
     measured: Array
-    """Slider positions reported by the drives at the times of these setpoints, (N, 3) [m]."""
+    """Slider positions that the drives reported for the times of the setpoints, (N, 3) [m]."""
 
 
 def drive(recording: Path, say: Callable[[str], None]) -> dict[Example, Driven]:
-    """Follow the motions by a private service, recorded to a file; return its motions. Raises TrirailError."""
+    """Let a private service follow the motions and record them to a file; return the motions. Raises TrirailError."""
     period = load(SIM).period
     with tempfile.TemporaryDirectory(prefix="trirail-") as folder:
         config, locator = own_service.private(Path(folder))
@@ -68,7 +70,7 @@ def drive(recording: Path, say: Callable[[str], None]) -> dict[Example, Driven]:
 
 
 def points(example: Example) -> list[TrajectoryPoint]:
-    """Return a motion as a timed trajectory, exact in position, velocity and acceleration at its points."""
+    """Return a motion as a timed trajectory. Position, velocity and acceleration are exact at its points."""
     t = np.linspace(0.0, DURATION, round(DURATION / SPACING) + 1)
     rows = zip(t.tolist(), *(values.tolist() for values in platform(example, t)), strict=True)
     return [
@@ -78,13 +80,13 @@ def points(example: Example) -> list[TrajectoryPoint]:
 
 
 def driven(recording: Recording, goal: str, period: float) -> Driven:
-    """Extract the motion to a goal from a recording, in time with equation (5). Raises ServiceError.
+    """Extract the motion to a goal from a recording, with the times of equation (5). Raises ServiceError.
 
-    Nothing is fitted. The log names the goal and the cycle that started its motion. In that cycle the motion advanced
-    by one period for the first time (trirail.control.control.Control.solve), so its setpoints are those of t = 1
-    period, those of the k-th cycle of motion belong to t = k periods, and t = 0 is the standstill before. The motion
-    ends with its path, because it does not wait for the robot to settle.
-    The progress in each record confirms this timing throughout.
+    No times are fitted. The log names the goal and the cycle that started its motion. In that cycle the motion advanced
+    by one period for the first time (trirail.control.control.Control.solve), so its setpoints belong to t = 1 period.
+    The setpoints of the k-th cycle of motion belong to t = k periods, and t = 0 is the standstill before the motion.
+    The motion ends with its path, because the goal does not wait for the robot to settle. The progress in each record
+    confirms these times.
     """
     records = recording.records
     events = [(line.t, line.event) for line in recording.events if line.event is not None]
@@ -95,7 +97,7 @@ def driven(recording: Recording, goal: str, period: float) -> Driven:
     moving = records["mode"][first:] == MODES.index(Mode.MOVING)
     n = int(np.argmin(np.append(moving, False)))
     wanted = round(DURATION / period)
-    n -= n > wanted and records["progress"][first + n - 1] >= 1.0  # the cycle after its end, which detects the end
+    n -= n > wanted and records["progress"][first + n - 1] >= 1.0  # without the cycle that detects the end
     span = records[first : first + n + REACHED_AFTER_CYCLES]
     t = np.arange(1.0, n + 1.0) * period
     if n != wanted or not np.array_equal(np.diff(span["cycle"]), np.ones(n + REACHED_AFTER_CYCLES - 1)):

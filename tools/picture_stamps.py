@@ -1,7 +1,7 @@
 """Stamp the guides' pictures with a digest of their sources: python tools/picture_stamps.py, for make screenshots.
 
-A stamp is a digest of the files that determine a picture, in a text chunk of the PNG. A test compares them: if they
-differ, the picture is older than its subject.
+A stamp is a digest of the files that determine a picture, and is stored in a text chunk of the PNG. A test compares
+each stamp with the present digest. If they differ, the picture may be older than its subject.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def digest(name: str) -> str:
 
 
 def stamp(name: str) -> str | None:
-    """Return the digest stamped into a picture; None if there is none."""
+    """Return the digest that is stamped into a picture; None if the picture has no stamp."""
     with Image.open(PICTURES / f"{name}.png") as picture:
         keyword: str | None = picture.info.get(KEYWORD)
         return keyword

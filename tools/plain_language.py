@@ -1,10 +1,10 @@
-"""Find names and sentences that an engineer who is new to the project stumbles over.
+"""Find names and sentences that an engineer who is new to the project may not understand.
 
 python tools/plain_language.py                        list every place
-python tools/plain_language.py service/trirail/wire   list the places below a folder, or in a file
+python tools/plain_language.py service/trirail/wire   list the places in a folder or in a file
 
-Words, openings and phrases are in plain_language.toml. So are the exceptions, names that are keys of messages or
-recordings, with their reasons. tests/test_language.py fails if there is any other place.
+plain_language.toml lists the words, the beginnings of docstrings and the phrases to find. It also lists exceptions with
+their reasons: names that are keys of messages or recordings. tests/test_language.py fails if there is any other place.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Place(NamedTuple):
 
 
 class _Rules:
-    """Compiled word lists."""
+    """Word lists of plain_language.toml as sets and compiled patterns."""
 
     def __init__(self) -> None:
         lists = tomllib.loads(WORDS.read_text(encoding="utf-8"))
@@ -58,7 +58,7 @@ class _Rules:
         self.phrases = {name: re.compile(pattern) for name, pattern in lists["phrases"].items()}
 
     def names(self, node: ast.AST) -> Iterator[tuple[int, str, str]]:
-        """Yield line, rule and text of each name that a node introduces and a list contains."""
+        """Yield the line, rule and text of each name that a node defines and that is in one of the lists."""
         match node:
             case ast.ClassDef(name=name) if self.class_name.fullmatch(name):
                 yield node.lineno, "class", name
@@ -72,7 +72,7 @@ class _Rules:
                 yield node.lineno, "variable", name
 
     def sentences(self, line: int, text: str) -> Iterator[tuple[int, str, str]]:
-        """Yield line, rule and surroundings of each phrase in a text."""
+        """Yield the line, rule and context of each listed phrase in a text."""
         for rule, pattern in self.phrases.items():
             for hit in pattern.finditer(text):
                 yield line, rule, text[max(0, hit.start() - CONTEXT) : hit.end() + CONTEXT].strip()
@@ -84,7 +84,7 @@ def _rules() -> _Rules:
 
 
 def places_in_python(source: str) -> Iterator[tuple[int, str, str]]:
-    """Yield line, rule and text of each place in Python source."""
+    """Yield the line, rule and text of each place in Python source code."""
     rules, tree = _rules(), ast.parse(source)
     for statement in tree.body:
         targets = (
@@ -112,7 +112,7 @@ def places_in_python(source: str) -> Iterator[tuple[int, str, str]]:
 
 
 def places_in_guide(text: str) -> Iterator[tuple[int, str, str]]:
-    """Yield line, rule and text of each place in the prose of a Markdown page; code is left out."""
+    """Yield the line, rule and text of each place in a Markdown page, except in code."""
     fenced = False
     for number, line in enumerate(text.splitlines(), 1):
         fenced ^= line.lstrip().startswith("```")
@@ -121,21 +121,21 @@ def places_in_guide(text: str) -> Iterator[tuple[int, str, str]]:
 
 
 def places(file: str) -> list[Place]:
-    """Return the places of a file, given relative to the checkout."""
+    """Return the places in a file, whose path is relative to the checkout."""
     text = (ROOT / file).read_text(encoding="utf-8")
     look = places_in_guide if file.endswith(".md") else places_in_python
     return [Place(file, *place) for place in look(text)]
 
 
 def files() -> list[str]:
-    """Return the files to check: source, tools and guides."""
+    """Return the files to check: source code, tools and guides."""
     listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard", "*.py", "*.md"],
                             cwd=ROOT, capture_output=True, text=True, check=True)  # fmt: skip
     return sorted(file for file in listed.stdout.split() if not file.startswith("tests/") and (ROOT / file).exists())
 
 
 def exceptions() -> dict[str, str]:
-    """Return the reason for each permitted place, by file and text: "wire/packets.py: given"."""
+    """Return the reason for each permitted place, by file and text, such as "wire/packets.py: given"."""
     reasons: dict[str, str] = tomllib.loads(WORDS.read_text(encoding="utf-8"))["exceptions"]
     return reasons
 

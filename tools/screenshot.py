@@ -1,6 +1,6 @@
-"""A picture of a recording, as the Rerun viewer shows it: python tools/screenshot.py FILE.rrd OUT.png.
+"""Picture of a recording, as the Rerun viewer shows it: python tools/screenshot.py FILE.rrd OUT.png.
 
-Needs no display, only a Vulkan driver; on Debian, mesa-vulkan-drivers.
+Needs no display, but a Vulkan driver; on Debian, install mesa-vulkan-drivers.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from trirail.telemetry.sinks import free_port
 
 TIMEOUT = 60.0
 SETTLE = 2.0
-"""Time until the views show the loaded data [s]."""
+"""Time that the views need to show the loaded data [s]."""
 NOTICED = 5.0
-"""Time until the notices of the viewer disappear [s]."""
+"""Time after which the notices of the viewer have disappeared [s]."""
 TITLE_BAR = 36
-"""Height of the strip that the viewer keeps for the window's buttons [pixels]; there is nothing in it."""
+"""Height of the strip that the viewer reserves for the buttons of a window [pixels]. The strip is empty here."""
 
 
 def main() -> int:
-    """Take the picture; return the exit code."""
+    """Take the picture and write it to the file; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path, metavar="FILE.rrd")
     parser.add_argument("picture", type=Path, metavar="OUT.png")
@@ -51,7 +51,7 @@ def main() -> int:
 
 @contextmanager
 def viewer(recording: Path, width: int, height: int) -> Iterator[ViewerClient]:
-    """Run a viewer without a window until it has loaded a recording; yield a client of it."""
+    """Run a viewer without a window; yield a client of the viewer once it has loaded a recording."""
     port = free_port()
     command = python("-m", "rerun_cli", "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1")
     command += ["--window-size", f"{width}x{height + TITLE_BAR}", "--port", str(port), str(recording)]
@@ -67,14 +67,14 @@ def viewer(recording: Path, width: int, height: int) -> Iterator[ViewerClient]:
 
 
 def picture(client: ViewerClient) -> Image.Image:
-    """Take a picture of a viewer, without the strip for the window's buttons."""
+    """Return a picture of a viewer, without the strip for the buttons of a window."""
     time.sleep(SETTLE)
     whole = Image.open(io.BytesIO(client.take_screenshot()))
     return whole.crop((0, TITLE_BAR, whole.width, whole.height))
 
 
 def _connect(viewer: subprocess.Popen[str], url: str) -> ViewerClient:
-    """Return a client of the viewer, once it has loaded the recording."""
+    """Wait until the viewer has loaded the recording; return a client of the viewer."""
     deadline = time.monotonic() + TIMEOUT
     while time.monotonic() < deadline:
         if viewer.poll() is not None:

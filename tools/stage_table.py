@@ -1,11 +1,11 @@
-"""Numbers of a stage of either kind at some poses: closed form compared with 60 digits and with small angles.
+"""Kinematics of a stage at some poses, compared with 60-digit arithmetic and with small-angle equations.
 
 python tools/stage_table.py [CONFIG] [--pose X Y PHI] [--velocity VX VY W] [--json]
 
-Lengths and angles may have units, such as 1mm and 5arcsec. A row contains, for one pose and velocity of the platform,
-the positions of sliders and cross slides and the velocities of the sliders; the differences of all these, and of the
-pose returned by the forward kinematics, from 60-digit arithmetic; and the differences of the slider positions from
-those of the small-angle equations that most programs use.
+Lengths and angles may have units, such as 1mm and 5arcsec. Each row is for one pose and velocity of the platform. It
+contains the positions of the sliders and cross slides, and the velocities of the sliders. It also contains the maximum
+difference between these values and 60-digit arithmetic, including the pose that the forward kinematics return, and the
+maximum error of the slider positions by the small-angle equations that most programs use.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ POSES = tuple(
         (-3, 2, -5),
     )
 )
-"""Poses of the guide to the kinds, and some more [m, rad]."""
+"""Poses in the guide to the kinds of stages, and some others [m, m, rad]."""
 PLATFORM = 0.01, -0.005, 0.1
 """Velocity of the platform [m/s, m/s, rad/s]."""
 STEP = Decimal("1e-20")
-"""Step of the difference quotient for the 60-digit velocity [s]: its error is of order 1e-40."""
+"""Step of the difference quotient for the 60-digit velocity [s]. The error of the quotient is of the order of 1e-40."""
 
 
 class StageRow(NamedTuple):
-    """Row for one pose, (3,) each."""
+    """Row for one pose; each list has one number for each coordinate or slider."""
 
     pose: list[float]
     """Pose of the platform [m, m, rad]."""
@@ -64,9 +64,9 @@ class StageRow(NamedTuple):
     velocity: list[float]
     """Velocities of the sliders [m/s]."""
     difference: float
-    """Maximum difference from 60 digits, of sliders, cross slides [m], their velocities [m/s], and pose [m, rad]."""
+    """Maximum difference from 60-digit arithmetic in positions [m], velocities [m/s] and the pose [m, rad]."""
     small_angles: float
-    """Maximum difference of the sliders from those of the small-angle equations [m]."""
+    """Maximum error of the slider positions by the small-angle equations [m]."""
 
 
 def rows(robot: Geometry, poses: Sequence[Sequence[float]], velocity: Sequence[float]) -> list[StageRow]:
@@ -101,7 +101,7 @@ def rows(robot: Geometry, poses: Sequence[Sequence[float]], velocity: Sequence[f
 
 
 def _true(robot: Geometry, pose: Sequence[float], velocity: Sequence[float]) -> tuple[Array, Array]:
-    """Return the positions of sliders and cross slides, (2, 3) [m], and their velocities [m/s], by 60 digits."""
+    """Return the positions of sliders and cross slides, (2, 3) [m], and their velocities [m/s], with 60 digits."""
     with localcontext() as context:
         context.prec = exact.DIGITS
         after, before = (

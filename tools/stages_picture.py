@@ -1,4 +1,4 @@
-"""Picture of the two kinds of stages, tools/pictures/stages.svg, from the shipped geometries. Needs matplotlib.
+"""Picture of the two kinds of stages, tools/pictures/stages.svg, drawn from the shipped geometries. Needs matplotlib.
 
 python tools/stages_picture.py [FILE]
 """
@@ -23,7 +23,7 @@ from trirail.workspace.part_positions import RobotParts
 FILE = Path(__file__).parent / "pictures/stages.svg"
 INK, GREY, RAIL, TABLE, CARRIAGE, CROSS = "#1f2933", "#7b8794", "#d3d9e0", "#f0772b", "#1b7f4d", "#2166ac"
 TURNED = 0.0, 0.0, math.radians(12.0)
-"""Pose beyond the rotation limit of the shipped stages, to be visible [m, rad]."""
+"""Pose of the stages [m, m, rad]. To be visible, the angle exceeds the rotation limit of the shipped stages."""
 PANELS = (
     ("uvw", "kind 1, 3-PRP: the cross slides turn with the table"),
     ("uvw-ppr", "kind 2, 3-PPR: the cross slides keep their direction"),
@@ -33,8 +33,8 @@ SLIDE = 0.014
 
 
 def draw(file: Path) -> None:
-    """Draw both kinds, turned, in millimetres; turning parts are orange, the tables at zero are dashed."""
-    # Text as text and no date keep the file small, and identical for identical stages.
+    """Draw both kinds of stages with a turned table, in millimetres. Dashed lines show the tables at angle zero."""
+    # Text is stored as text, and no date is stored, so that the file is small and depends only on the stages.
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "stages"}):
         figure = Figure(figsize=(10.0, 5.2), layout="constrained")
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -74,7 +74,7 @@ def _stage(panel: Axes, robot: Geometry, parts: RobotParts) -> None:
 
 
 def _legend(panel: Axes) -> None:
-    """Draw the legend."""
+    """Draw the legend, which explains the symbols of the parts."""
     for style, colour, name in (
         ("s", CARRIAGE, "carriage, driven on its rail"),
         ("|", CROSS, "cross slide, not driven"),

@@ -3,7 +3,8 @@
 python tools/virtual_drives.py configs/sim.toml --interface unix --channel /tmp/can.sock
 python tools/virtual_drives.py configs/vcan.toml --interface socketcan --channel vcan0 --faults faults.txt
 
-Faults come from a file or the keyboard: `A silent for 0.5`, `with 0.01 C drop tpdo2`; `help` lists them.
+Faults are read from a file or from the keyboard, such as `A silent for 0.5` or `with 0.01 C drop tpdo2`. `help` lists
+all faults.
 """
 
 from __future__ import annotations
@@ -30,24 +31,24 @@ from trirail_drivers.simulated import SimulatedBus
 from trirail_drivers.simulated.faultlines import HELP, FaultSyntaxError
 
 _POLLS = 5
-"""Polls of the drives' own timers per cycle without frames."""
+"""Number of times per cycle that the drives' timers are polled while no frame arrives."""
 
 
 class Report:
-    """Printer of one line on stdout for each change of a drive's power state."""
+    """Printer of a line to standard output for each change of a drive's state."""
 
     def __init__(self, drives: Drives, bus: SimulatedBus) -> None:
         self._axes = list(zip(NAMES, drives.each, bus.drives, strict=True))
         self._said: dict[str, str] = {}
 
     def once(self, text: str) -> None:
-        """Print a text, the first time only."""
+        """Print a text, unless it has been printed before."""
         if text not in self._said:
             self._said[text] = text
             print_now(text)
 
     def update(self) -> None:
-        """Print the changes of state."""
+        """Print a line for each drive whose state has changed, with the position of its slider."""
         for name, axis, drive in self._axes:
             state = str(drive.state)
             if self._said.get(name) != state:
@@ -57,7 +58,7 @@ class Report:
 
 
 class Console:
-    """Non-blocking reader of typed lines."""
+    """Reader of the commands and faults that are typed, one on a line. It never waits."""
 
     def __init__(self, bus: SimulatedBus) -> None:
         self._faults = bus.faults
@@ -65,7 +66,7 @@ class Console:
         self._open = sys.stdin is not None
 
     def poll(self) -> None:
-        """Execute the lines that have arrived since the last call."""
+        """Execute the lines that have been typed since the last call."""
         if not self._open or not select.select([sys.stdin], [], [], 0.0)[0]:
             return
         chunk = os.read(sys.stdin.fileno(), 4096)
@@ -93,34 +94,34 @@ class Console:
 
 
 def bridge(wire: can.BusABC, drives: SimulatedBus, report: Report, console: Console, poll: float) -> None:
-    """Carry frames between a bus and the simulated drives until interrupted; poll their timers every `poll` [s]."""
+    """Pass frames between a bus and the simulated drives until interrupted; poll their timers every `poll` [s]."""
     while True:
         console.poll()
         try:
             frame = wire.recv(poll)
-        except can.CanOperationError as error:  # a bus that is down: the watchdogs run, and it may recover
+        except can.CanOperationError as error:  # the bus is down, but may recover; the watchdogs run
             report.once(f"cannot receive: {error}")
             frame = None
             time.sleep(poll)
         if frame is not None:
-            with contextlib.suppress(can.CanOperationError):  # bus-off: no receiver
+            with contextlib.suppress(can.CanOperationError):  # bus-off: nobody receives the frame
                 drives.send(frame)
         while (answer := drives.recv(0.0)) is not None:
             if not answer.is_error_frame or _carries_error_frames(wire):
                 try:
                     wire.send(answer)
-                except can.CanOperationError as error:  # a full queue or a bus that is down: drives continue
+                except can.CanOperationError as error:  # the queue is full or the bus is down
                     report.once(f"cannot send: {error}")
         report.update()
 
 
 def _carries_error_frames(wire: can.BusABC) -> bool:
-    """Return whether others receive error frames as such; a real controller would send a data frame instead."""
+    """Return whether a bus transmits error frames to other nodes; a real controller would send a data frame instead."""
     return isinstance(wire, UnixBus) or "vcan" in wire.channel_info or "virtual" in wire.channel_info.lower()
 
 
 def main() -> int:
-    """Run until SIGINT or SIGTERM."""
+    """Run the drives until SIGINT or SIGTERM; return the exit code."""
     arguments = argparse.ArgumentParser(description="Three CiA 402 drives, simulated, on a CAN bus.")
     arguments.add_argument("config", type=Path, help="configuration file with [can] and [drives]")
     arguments.add_argument("--interface", required=True, help='"unix" (listens), or a python-can interface')
@@ -151,7 +152,7 @@ def main() -> int:
 
 
 def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
-    """Return the bus of the drives, with the file's bitrate and options; on a unix socket, it is the listening end."""
+    """Open the bus of the drives with the configured bit rate and options; for "unix", open the listening end."""
     if interface == "unix":
         return UnixBus(channel, listen=True)
     section = msgspec.structs.replace(config.can, interface=interface, channel=channel)
@@ -159,7 +160,7 @@ def bus_to_be_on(interface: str, channel: str, config: Config) -> can.BusABC:
 
 
 def print_now(text: str) -> None:
-    """Print a line without buffering, also into a pipe."""
+    """Print a line immediately, even if standard output is a pipe."""
     print(text, flush=True)
 
 

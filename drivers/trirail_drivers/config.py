@@ -31,7 +31,7 @@ CountsPerMetre = Annotated[float, Meta(ge=1e-3, le=1e12)]
 
 
 class SimulatedSlider(Struct, frozen=True, forbid_unknown_fields=True):
-    """True axis of a simulated slider, which may differ from [drives]."""
+    """Actual axis of a simulated slider, which may differ from the settings in [drives]."""
 
     node: NodeId
     """Node id of the slider's drive."""
@@ -59,8 +59,8 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True):
     start: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     """Slider positions at power-on [m]."""
     built: tuple[SimulatedSlider, SimulatedSlider, SimulatedSlider] | None = None
-    """True axes of the simulated sliders where they differ from [drives]; `trirail commission` has to find these
-    differences.
+    """Actual axes of the simulated sliders, if they differ from the settings in [drives]. `trirail commission` has to
+    find these differences.
     """
 
 
@@ -77,7 +77,9 @@ class Can(Struct, frozen=True, forbid_unknown_fields=True):
     channel: Name = ""
     """Channel of the interface, such as `can0`."""
     bitrate: Annotated[int, Meta(ge=10_000, le=8_000_000)] = 1_000_000
-    """Bit rate [bit/s], used for the bus load and by interfaces that set it themselves; at most 1 Mbit/s on a wire."""
+    """Bit rate [bit/s], at most 1 Mbit/s on a physical bus. The bus load is calculated from this value, and interfaces
+    that set the bit rate themselves use it.
+    """
     options: dict[OptionName, bool | OptionNumber | Name] = {}
     """Options passed to python-can unchanged: `index` of gs_usb, `host` and `port` of socketcand, `tty_baudrate` of
     slcan.
@@ -100,7 +102,7 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
     acceleration: Acceleration
     """Homing acceleration, object 609Ah [m/s²]."""
     timeout: Annotated[float, Meta(ge=0.01, le=180.0)] = 60.0
-    """Longest duration of homing [s]; it limits the travel of a slider that reaches no switch."""
+    """Longest duration of homing [s], which limits the travel of a slider that reaches no switch."""
 
     def __post_init__(self) -> None:
         if self.method == 0:
@@ -108,8 +110,8 @@ class Homing(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ObjectWrite(Struct, frozen=True, forbid_unknown_fields=True):
-    """Manufacturer-specific object, written and read back at set-up. Objects that the set-up itself writes, the node
-    id, the bit rate and the storing of parameters are refused.
+    """Manufacturer-specific object that is written and read back at set-up. An object is refused if the set-up itself
+    writes it, if it changes the node id or the bit rate, or if it stores parameters.
     """
 
     object: Annotated[int, Meta(ge=0x1000, le=0xFFFF)]
@@ -153,8 +155,8 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     homing: Homing | None = None
     """Homing of the drive; None if its encoder is absolute."""
     eds: Name | None = None
-    """The manufacturer's EDS, relative to this file. It states the mappable objects, and the data types that the drive
-    does not report.
+    """Path of the manufacturer's EDS, relative to this file. The EDS states which objects can be mapped, and the data
+    types that the drive does not report.
     """
     velocity_unit: UnitName | None = None
     """Unit of velocity, such as "0.1 counts/s", "rpm", "deg/s" or "mm/s", for a drive that does not report it (60A9h,
@@ -167,15 +169,17 @@ class Drive(Struct, frozen=True, forbid_unknown_fields=True):
     report its counts per revolution.
     """
     endpoints: Name | None = None
-    """An ODrive's flat_endpoints.json, relative to this file, for firmware or hardware that trirail does not know."""
+    """Path of an ODrive's flat_endpoints.json, relative to this file, for firmware or hardware that trirail does not
+    know.
+    """
     accept_without: tuple[ProtectionName, ...] = ()
     """Protections that the drive is allowed to lack, from the tables in drivers/requirements.md: objects, such as
     ["1006", "6007"], or ODrive settings, such as ["enable_watchdog"]; "6041" if the drive never sets bit 12 of its
     statusword.
     """
     allow_replacement: bool = False
-    """Whether a drive with another serial number or firmware may replace it while the service runs; otherwise it is
-    refused until the service is restarted."""
+    """Whether a drive with another serial number or firmware may replace this drive while the service runs. Otherwise
+    another drive is refused until the service is restarted."""
     write: tuple[ObjectWrite, ...] = ()
     """Manufacturer-specific objects to write at set-up."""
 
@@ -214,9 +218,9 @@ class Drives(Struct, frozen=True, forbid_unknown_fields=True):
     missed_positions: Annotated[int, Meta(ge=1, le=1000)] = 3
     """Number of consecutive cycles without a position from a drive after which the drive is lost."""
     following_error: Distance = 0.005
-    """Window of the following error [m] that the drives monitor, object 6065h; for ODrives, the driver monitors it. It
-    must be wider than `[limits.slider] following_error`, so that the service stops all three drives before one of them
-    faults.
+    """Window of the following error [m] that the drives monitor, object 6065h; for ODrives, the driver monitors it. The
+    window must be wider than `[limits.slider] following_error`, so that the service stops all three drives before a
+    drive reports a fault.
     """
     quick_stop_deceleration: Acceleration = 10.0
     """Deceleration of the quick-stop ramp [m/s²], object 6085h; for ODrives, the driver generates the ramp."""

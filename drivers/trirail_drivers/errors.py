@@ -1,4 +1,4 @@
-"""Root of all trirail errors, and the errors of the drives."""
+"""Base class of all trirail errors, and the errors that concern drives and buses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _ELLIPSIS = " … "
 
 
 def shortened(text: str, longest: int = MAX_MESSAGE_LENGTH) -> str:
-    """Shorten a long text in the middle, since its beginning names the problem and its end the remedy."""
+    """Cut out the middle of a long text, since the beginning names the problem and the end names the remedy."""
     if len(text) <= longest:
         return text
     end = longest // 3
@@ -16,9 +16,9 @@ def shortened(text: str, longest: int = MAX_MESSAGE_LENGTH) -> str:
 
 
 class TrirailError(Exception):
-    """Refusal or failure in trirail. The message is one line that names the object, the problem and the remedy.
+    """Base class of all errors of trirail. The message is one line that names the object, the problem and the remedy.
 
-    The length of the message is bounded, since it may repeat the content of a file or of another message.
+    The length of the message is bounded, since the message may quote a file or another message of any length.
     """
 
     def __init__(self, message: str) -> None:
@@ -54,7 +54,7 @@ class DriveAbsentError(DriveTimeout):
 
 
 class ConfigurationRefused(DriveError):
-    """A drive did not keep a written value: a different value was read back."""
+    """A drive did not accept a written value: a different value was read back."""
 
     def __init__(
         self, drive: str, name: str, index: int, subindex: int, wanted: object, read_back: object, seconds: float

@@ -15,7 +15,7 @@ from typing import BinaryIO
 from trirail_drivers.errors import FileError
 
 LARGEST_TEXT = 16_000_000
-"""Maximum size of a text file that is read [bytes]; it holds some hundred thousand points of a trajectory."""
+"""Maximum size of a text file that is read [bytes], enough for some hundred thousand points of a trajectory."""
 
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
@@ -96,10 +96,9 @@ PREFIX = "trirail-run-"
 
 @contextmanager
 def temporary_folder(parent: str | None = None) -> Iterator[Path]:
-    """Create a folder and remove it afterwards; also remove folders that killed processes of this user have left
-    behind.
+    """Create a folder and remove it afterwards. Also remove the folders of this user's processes that were killed.
 
-    A folder is in use while a process holds its lock; the lock ends with the process. Raises OSError.
+    A folder is in use while a process has locked it; the lock ends with the process. Raises OSError.
     """
     base = Path(parent or tempfile.gettempdir())
     for left in base.glob(f"{PREFIX}*"):

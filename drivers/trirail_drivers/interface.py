@@ -18,8 +18,9 @@ Clock = Callable[[], float]
 
 
 class PowerState(IntEnum):
-    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton); the drivers of all protocols use
-    them.
+    """States of the CiA 402 power drive system (CiA 402-2, finite state automaton).
+
+    The drivers of all protocols use these states.
     """
 
     NOT_READY_TO_SWITCH_ON = 0
@@ -60,12 +61,15 @@ class MissingProtection(Struct, frozen=True):
 
 
 class Counts(NamedTuple):
-    """Numbers of late and lost positions and setpoints of one drive since the start; none is a fault by itself."""
+    """Numbers of late and lost positions and setpoints of one drive since the start.
+
+    A late or lost value is not a fault by itself.
+    """
 
     feedback_late: int = 0
     """Number of positions that arrived one cycle later than the position before."""
     feedback_lost: int = 0
-    """Number of SYNCs that the drive never answered, as far as later answers show."""
+    """Number of SYNCs that the drive never answered. A SYNC is counted once a later SYNC has been answered."""
     setpoints_late: int = 0
     """Number of setpoints written after the next SYNC was due."""
     setpoints_lost: int = 0
@@ -100,7 +104,8 @@ class Feedback(NamedTuple):
     """Measured slider positions [m]."""
     state: tuple[PowerState, PowerState, PowerState]
     fault: DriveFault | None
-    """First fault since the last reset, or the fault of a drive that did not stop after it; None if there is no fault.
+    """First fault since the last reset or, if a drive then did not stop, the fault of that drive; None if there is no
+    fault.
     """
     counts: tuple[Counts, Counts, Counts] = (Counts(), Counts(), Counts())
     warnings: tuple[str, ...] = ()
@@ -108,18 +113,20 @@ class Feedback(NamedTuple):
     age: tuple[int, int, int] = (0, 0, 0)
     """For each position, the number of SYNCs since the SYNC at which it was sampled.
 
-    0 if the drive has already answered the newest SYNC, 1 if that answer is still on its way, more if answers were
-    lost.
+    0 if the drive has already answered the newest SYNC, 1 if only that answer has not arrived yet, more if answers
+    were lost.
     """
     homing: bool = False
     """Whether a drive is being homed."""
     follows: tuple[bool, bool, bool] = (True, True, True)
-    """Whether each drive follows setpoints. A drive that is being homed moves by itself and does not."""
+    """Whether each drive follows setpoints; False while a drive is being homed, since it then moves by itself."""
     homed: tuple[bool, bool, bool] = (True, True, True)
-    """Whether each position is relative to a known place: always with absolute encoders, otherwise after homing."""
+    """Whether each position is relative to a known place: always True with an absolute encoder, otherwise True after
+    homing.
+    """
     unready: UnreadyDrives = (None, None, None)
-    """For each drive, the reason why it cannot be reset yet; None if it is configured. A drive that has sent no
-    position since the start is reported at its zero, and as not homed.
+    """For each drive, the reason why it cannot be reset yet; None if it is configured. A drive that has not sent a
+    position since the start is reported at zero counts and as not homed.
     """
     inputs: tuple[int, int, int] = (0, 0, 0)
     """Newest digital inputs of each drive, limited to its mask (trirail_drivers.config.DigitalIo)."""
@@ -133,7 +140,8 @@ class DriveGroup(Protocol):
     """
 
     bus_load: float
-    """Worst-case fraction of the bus capacity that the cyclic traffic uses, with bit stuffing; 1.0 is a full bus."""
+    """Fraction of the bus capacity that cyclic and periodic frames use with worst-case bit stuffing; 1.0 is a full bus.
+    """
 
     @property
     def missing_protections(self) -> tuple[MissingProtection, ...]:
@@ -141,13 +149,13 @@ class DriveGroup(Protocol):
 
     @property
     def path_outputs(self) -> tuple[bool, bool, bool]:
-        """Whether each drive applies its outputs together with a setpoint; otherwise its outputs cannot be switched on
+        """Whether each drive applies its digital outputs together with a setpoint; only such outputs can be switched on
         a path.
         """
 
     @property
     def traffic(self) -> int:
-        """Number of bits of all frames sent and received since the start, each with worst-case stuffing.
+        """Number of bits in all frames sent and received since the start, with worst-case bit stuffing.
 
         Frames that the kernel filters out are not counted.
         """
@@ -168,8 +176,8 @@ class DriveGroup(Protocol):
         fastest
             Velocity limit of the sliders [m/s]. If it is given, drives that cannot handle it are refused.
         awaits
-            If True, a drive that does not answer is a fault instead of an error. The following cycles configure it
-            when it appears, like a drive that restarts.
+            If True, a drive that does not answer causes a fault and not a DriveError. Once the drive appears, the
+            following cycles configure it like a drive that has restarted.
         """
 
     def sync(self) -> None:
@@ -201,8 +209,8 @@ class DriveGroup(Protocol):
         """Begin to home the drives whose positions are not absolute; the following cycles complete the homing.
 
         All drives to be homed must have power and be at standstill. A drive that was enabled alone is homed alone.
-        While a drive does not follow setpoints, its setpoints are ignored. In the cycle in which it follows again, its
-        setpoint must be the position in the previous cycle's feedback.
+        While a drive does not follow setpoints, its setpoints are ignored. In the first cycle in which the drive
+        follows setpoints again, its setpoint must be the position in the previous cycle's feedback.
         """
 
     def stop_homing(self) -> None:

@@ -1,4 +1,4 @@
-"""Align a part by two marks with one camera that is moved to each: python align_with_a_moved_camera.py [ROBOT …]."""
+"""Align a part with one camera that is moved to each of two marks: python align_with_a_moved_camera.py [ROBOT …]."""
 
 import sys
 import tempfile
@@ -11,14 +11,14 @@ from trirail.alignment.shapes import MarkShape
 from trirail.alignment.simulated_camera import DrawnMark, SimulatedCamera
 from trirail.client import calibration_file
 
-STOPS: dict[str, Pair] = {"left": (-0.05, 0.0), "right": (0.05, 0.0)}  # where the camera's own axis takes it
+STOPS: dict[str, Pair] = {"left": (-0.05, 0.0), "right": (0.05, 0.0)}  # positions of the camera, which has its own axis
 
 with Robot(*sys.argv[1:]) as robot:
     robot.enable()
     part = dict(STOPS)
 
     def capture_marks() -> Marks:
-        """Move the camera to each of its stops, and find the mark there: each stop is a view of its own."""
+        """Move the camera to each of its stops, and find the mark there. Each stop counts as a separate view."""
         seen: dict[str, Pair] = {}
         for name, stop in STOPS.items():
             view = CameraView(stop, (640.0, 480.0), ((2.5e5, 0.0), (0.0, -2.5e5)))
@@ -30,7 +30,7 @@ with Robot(*sys.argv[1:]) as robot:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "camera.json"
         calibration_file.write(file, robot.name, robot.calibrate_camera(capture_marks), targets)
-        kept = calibration_file.read(file)  # for every part from now on
+        kept = calibration_file.read(file)  # to be used for all further parts
     part = {"left": (-0.0496, 0.0), "right": (0.0504, 0.0003)}
     result = robot.align(capture_marks, kept.targets, kept.calibration, tolerance=20e-6, angle=1e-3)
     print(f"{result.why} after {len(result.corrections)}: {1e6 * result.measurements[-1].worst:.2f} µm to go")

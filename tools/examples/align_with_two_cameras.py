@@ -1,4 +1,4 @@
-"""Align a part by a disc in each of two simulated cameras: python align_with_two_cameras.py [ROBOT …]."""
+"""Align a part with two simulated cameras, each of which sees one disc: python align_with_two_cameras.py [ROBOT …]."""
 
 import sys
 
@@ -22,7 +22,7 @@ with Robot(*sys.argv[1:]) as robot:
     part = {"left": (-0.06, 0.0), "right": (0.06, 0.0)}
 
     def capture_marks() -> Marks:
-        """Take a picture with each camera, and find the disc in it."""
+        """Take a picture with each camera, and find the disc in the picture."""
         pose, seen = robot.state().pose, {}
         for name, place in part.items():
             camera = SimulatedCamera(VIEWS[name], {name: DrawnMark(DISC, place)}, 1280, 960, noise=2.0)
@@ -30,9 +30,9 @@ with Robot(*sys.argv[1:]) as robot:
                 seen[name] = (spot.u, spot.v)
         return seen
 
-    targets = capture_marks()  # the part lies right: this is where its marks belong
+    targets = capture_marks()  # this part is at its target, and so are its marks
     calibration = robot.calibrate_camera(capture_marks)
-    part = {"left": (-0.0597, 0.0001), "right": (0.0603, 0.0005)}  # the next part, 0.3 mm off and askew
+    part = {"left": (-0.0597, 0.0001), "right": (0.0603, 0.0005)}  # the next part, shifted by 0.3 mm and turned
     result = robot.align(capture_marks, targets, calibration, tolerance=20e-6, angle=1e-3)
     for measured in result.measurements:
         print(f"{1e6 * measured.worst:.2f} µm to go")

@@ -1,4 +1,4 @@
-"""Follow a target that a camera sees a hundred times a second, here a simulated one. [ROBOT [LOCATOR]]."""
+"""Follow a target that a camera, here a simulated one, sees a hundred times a second. [ROBOT [LOCATOR]]."""
 
 import math
 import sys
@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from trirail import Robot
 
 RATE, SECONDS = 100.0, 4.0
-RADIUS, TURN = 0.02, math.pi  # a circle in two seconds [m], [rad/s]
+RADIUS, TURN = 0.02, math.pi  # a full circle takes two seconds [m], [rad/s]
 
 
 def camera() -> Iterator[tuple[tuple[float, float, float], tuple[float, float, float], float]]:
-    """Yield pose and velocity of the target, and when that was, by this machine's wall clock."""
+    """Yield the pose and the velocity of the target, and the wall-clock time of the picture on this machine."""
     begins = time.time()
     for n in range(round(RATE * SECONDS)):
         time_of_picture = begins + n / RATE
@@ -24,7 +24,7 @@ def camera() -> Iterator[tuple[tuple[float, float, float], tuple[float, float, f
 with Robot(*sys.argv[1:]) as robot:
     robot.enable()
     lags = []
-    with robot.track() as track:  # when the updates cease, for whatever reason, the robot brakes on its path
+    with robot.track() as track:  # if the updates end for any reason, the robot brakes on its path
         for pose, velocity, time_of_picture in camera():
             track.update(pose, velocity, time_of_picture)
             lags.append(track.lag or 0.0)

@@ -1,6 +1,6 @@
-"""Follow timed points of a file from where they begin: python follow_a_file.py [FILE [ROBOT [LOCATOR]]].
+"""Move to the first of the timed points in a file, and follow them: python follow_a_file.py [FILE [ROBOT [LOCATOR]]].
 
-The points are a CSV with the columns t, x, y, phi and, if known, vx, vy, w and ax, ay, e; or the same as JSON.
+The file is a CSV with the columns t, x, y, phi and, if known, vx, vy, w and ax, ay, e, or the same data as JSON.
 """
 
 import sys
@@ -16,7 +16,7 @@ with Robot(*robot_and_locator) as robot:
     robot.enable()
     start = points[0]
     robot.move_to(x=start.x, y=start.y, phi=start.phi).wait(timeout=30.0)
-    goal = robot.follow(points)  # as fast as it says, or refused; stretch=True slows it where a slider could not follow
+    goal = robot.follow(points)  # refused if a slider cannot follow as fast; stretch=True slows it instead
     print(len(points), "points in", goal.duration, "s")
     result = goal.wait(timeout=points[-1].t + 30.0)
     print(result.message)

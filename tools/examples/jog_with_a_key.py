@@ -1,4 +1,4 @@
-"""Jog while a key is held: a d along x, s w along y, q e about the centre, x ends. [ROBOT [LOCATOR]]."""
+"""Jog while a key is held: a and d along x, s and w along y, q and e about the centre; x ends. [ROBOT [LOCATOR]]."""
 
 import os
 import select
@@ -10,11 +10,11 @@ from trirail import Robot
 
 V, W = 0.02, 0.2  # [m/s], [rad/s]
 KEYS = {"a": (-V, 0, 0), "d": (V, 0, 0), "s": (0, -V, 0), "w": (0, V, 0), "q": (0, 0, W), "e": (0, 0, -W)}
-HELD = 0.7  # a key that does not repeat within this time has been released [s]; terminals begin after 0.3 to 0.6 s
+HELD = 0.7  # a key that is not repeated within this time has been released [s]; terminals begin after 0.3 to 0.6 s
 
 
 def key(within: float | None = None) -> str:
-    """Return the next key, or nothing if none comes in time."""
+    """Return the next key, or "" if no key is pressed `within` this time [s]."""
     ready, _, _ = select.select([sys.stdin], [], [], within)
     return os.read(sys.stdin.fileno(), 1).decode(errors="replace") if ready else ""
 
@@ -28,7 +28,7 @@ try:
         while (pressed := key()) != "x":
             if pressed in KEYS:
                 x, y, phi = KEYS[pressed]
-                with robot.jog(x=x, y=y, phi=phi):  # renewed all the while; if this program dies, the robot brakes
+                with robot.jog(x=x, y=y, phi=phi):  # renewed automatically; if this program ends, the robot brakes
                     while key(HELD) == pressed:
                         pass
                 print("stands at", *(f"{value:.4f}" for value in robot.state().pose), flush=True)

@@ -1,4 +1,4 @@
-"""The robot's mathematics without a service: sliders for a circle of poses, the way back, and both Jacobians."""
+"""The robot's kinematics without a service: sliders for a circle of poses, poses for these sliders, and Jacobians."""
 
 import math
 
@@ -9,7 +9,7 @@ robot = Geometry.symmetric(l0=0.3)  # or three measured legs: Geometry(legs=(Leg
 
 angle = np.linspace(0.0, 2.0 * math.pi, 1000)
 pose = np.stack([0.05 * np.cos(angle), 0.05 * np.sin(angle), np.full_like(angle, 0.1)], axis=1)  # (N, 3): x, y, phi
-velocity = np.stack([-0.05 * np.sin(angle), 0.05 * np.cos(angle), np.zeros_like(angle)], axis=1)  # one radian a second
+velocity = np.stack([-0.05 * np.sin(angle), 0.05 * np.cos(angle), np.zeros_like(angle)], axis=1)  # 1 radian per second
 
 motion = inverse(robot, pose, velocity)
 print("sliders reach", motion.position.min(axis=0), "to", motion.position.max(axis=0), "m")

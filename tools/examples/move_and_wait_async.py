@@ -1,4 +1,4 @@
-"""A pose goal with asyncio, watched while it is under way: python move_and_wait_async.py [ROBOT [LOCATOR]]."""
+"""Move to a pose with asyncio, and watch the robot meanwhile: python move_and_wait_async.py [ROBOT [LOCATOR]]."""
 
 import asyncio
 import sys
@@ -7,7 +7,7 @@ from trirail import AsyncRobot, RefusedError
 
 
 async def main() -> None:
-    """Move, print the pose twice a second meanwhile, and say how it ended."""
+    """Move, print the position twice a second during the motion, and print the outcome."""
     async with AsyncRobot(*sys.argv[1:]) as robot:
         await robot.enable()
         goal = await robot.move_to(x=-0.02, y=0.01, phi=-0.1, speed=0.1)
@@ -18,10 +18,10 @@ async def main() -> None:
 
 
 async def watch(robot: AsyncRobot) -> None:
-    """Print where the robot is, until cancelled."""
+    """Print the position of the robot until this task is cancelled."""
     async for state in robot.states():
         print(f"x {state.pose[0]:.4f} m")
-        await asyncio.sleep(0.5)  # the next one is the newest again
+        await asyncio.sleep(0.5)  # the loop then continues with the newest state
 
 
 try:

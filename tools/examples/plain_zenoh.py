@@ -1,6 +1,6 @@
-"""A goal and its end with Zenoh and JSON alone, as from any language: python plain_zenoh.py [ROBOT [LOCATOR]].
+"""Send a goal with only Zenoh and JSON, as in any language, and await its end: python plain_zenoh.py [ROBOT [LOCATOR]].
 
-The messages are described by the schemas in trirail/wire/schemas.
+The schemas in trirail/wire/schemas describe the messages.
 """
 
 import json
@@ -16,7 +16,7 @@ settings.insert_json5("connect/endpoints", json.dumps([locator]))
 
 
 def ask(key: str, content: object = None) -> dict[str, object]:
-    """Query the service; the answer comes when a goal is accepted, or a command carried out."""
+    """Query the service. The answer arrives when a goal has been accepted, or a command carried out."""
     payload = None if content is None else json.dumps(content)
     for reply in session.get(f"trirail/{robot}/{key}", payload=payload, timeout=20.0):
         if reply.ok is not None:
@@ -33,6 +33,6 @@ with zenoh.open(settings) as session:
     print(ask("cmd/plain/enable"))
     goal = ask("goal/plain", {"kind": "pose", "x": 0.0, "y": 0.02, "phi": -0.1})
     print(goal)
-    while (event := events.get(timeout=30.0)).get("id") != goal["id"]:  # every goal's id ends in exactly one event
+    while (event := events.get(timeout=30.0)).get("id") != goal["id"]:  # one event reports the end of each goal
         pass
     print(event["outcome"], event["message"])

@@ -1,4 +1,4 @@
-"""Send goals ahead that blend into each other: a square with round corners. stream_of_goals.py [ROBOT [LOCATOR]]."""
+"""Send goals in advance that blend into each other: a square with round corners. [ROBOT [LOCATOR]]."""
 
 import sys
 
@@ -11,7 +11,7 @@ ROUND = 0.008
 with Robot(*sys.argv[1:]) as robot:
     robot.enable()
     robot.move_to(x=CORNERS[0][0], y=CORNERS[0][1], phi=0.0).wait(timeout=30.0)
-    # A goal with `blend` lets the next one wait for it, as many as [motion] queue allows; without, it is preempted.
+    # After a goal with `blend`, further goals wait, as many as [motion] queue allows. A goal without is preempted.
     goals = [robot.move_to(x=x, y=y, phi=0.0, blend=ROUND) for x, y in CORNERS[1:]]
     for goal in goals:
         print(goal.wait(timeout=30.0).message)

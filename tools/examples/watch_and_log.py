@@ -1,4 +1,4 @@
-"""Write the state into a CSV for some seconds: python watch_and_log.py FILE SECONDS [ROBOT [LOCATOR]]."""
+"""Write the state to a CSV file for some seconds: python watch_and_log.py FILE SECONDS [ROBOT [LOCATOR]]."""
 
 import csv
 import sys
@@ -11,9 +11,9 @@ with Robot(*robot_and_locator) as robot, open(file, "w", newline="", encoding="u
     rows = csv.writer(opened)
     rows.writerow(["t", "mode", "x", "y", "phi", "error_a", "error_b", "error_c", "goal"])
     begin = robot.state().t
-    for state in robot.states(timeout=5.0):  # fifty a second; the newest where this program is too slow
+    for state in robot.states(timeout=5.0):  # fifty per second; if this program is too slow, only the newest states
         goal = state.goal.id if state.goal else ""
-        # `pose` is measured: the forward kinematics of the measured sliders. `commanded.pose` is where it should be.
+        # `pose` is measured: the forward kinematics of the measured sliders. `commanded.pose` is the setpoint.
         rows.writerow([state.t, state.mode, *state.pose, *state.sliders.following_error, goal])
         if state.t >= begin + float(seconds):
             sys.exit(0)

@@ -1,14 +1,15 @@
-"""msgspec 0.22.0 on CPython 3.11.7, with the GIL: two threads that decode a type for the first time, and SIGSEGV.
+"""msgspec 0.22.0 on CPython 3.11.7, with the GIL: SIGSEGV if two threads decode a type for the first time.
 
     python msgspec_first_decode.py [children]
 
-prints how many children of that many (400) a signal has ended, for each way to begin. StructInfo_Convert (_core.c)
-puts a new StructInfo on the class (`class->struct_info = info`) and fills `types[]` afterwards. TypeNode_Convert runs
-Python for that (annotations, enums, unions), where the GIL may change hands: a second thread finds the StructInfo,
-takes it for complete and reads `types[i] == NULL`, in json_decode_struct_map_inner for one. On free-threaded builds a
-critical section and `initialized` prevent it. A decoder that is made before there is a second thread is a way round.
+prints with which statuses the children (400 by default) have ended, with and without the workaround. The cause:
+StructInfo_Convert (_core.c) stores a new StructInfo in the class (`class->struct_info = info`) and fills `types[]`
+afterwards. To do so, TypeNode_Convert runs Python code (annotations, enums, unions), during which the GIL may pass to a
+second thread. This thread finds the StructInfo, assumes that it is complete, and reads `types[i] == NULL`, for example
+in json_decode_struct_map_inner. On free-threaded builds, a critical section and `initialized` prevent this. The
+workaround is to create a decoder before there is a second thread.
 
-The same holds, as the code reads, for msgspec.convert, msgpack, dataclasses, TypedDicts and NamedTuples.
+According to the source code, msgspec.convert, msgpack, dataclasses, TypedDicts and NamedTuples have the same problem.
 """
 
 import os
@@ -42,12 +43,12 @@ def decode_in_two_threads(prepared: bool) -> None:
 
 
 def ended(children: int, prepared: bool) -> Counter[int]:
-    """Return how many children ended with each status, a signal's as a negative number."""
+    """Return the number of children that ended with each status. The status of a signal is a negative number."""
     statuses: Counter[int] = Counter()
     for _ in range(children):
         child = os.fork()
         if child == 0:
-            sys.setswitchinterval(1e-5)  # it happens without, too: now and then
+            sys.setswitchinterval(1e-5)  # makes the error frequent; without this, it is rare
             decode_in_two_threads(prepared)
             os._exit(0)
         statuses[os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])] += 1

@@ -1,4 +1,4 @@
-"""Additional requirements of python-can's interfaces: Python packages, or the adapter manufacturer's library."""
+"""Python packages and manufacturers' libraries that some of python-can's interfaces need."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _PACKAGES: Final = {
     "slcan": (("serial",), "serial"),
     "udp_multicast": (("msgpack",), "multicast"),
 }
-"""Modules that an interface imports, and the python-can extra that installs them."""
+"""For each interface, the modules that it imports and the python-can extra that installs them."""
 _LIBRARIES: Final = {
     "kvaser": ("canlib", "Kvaser's CANlib"),
     "pcan": ("pcanbasic", "PEAK's PCAN-Basic"),
 }
-"""Library of the adapter's manufacturer. Linux has its own drivers for the adapters of both manufacturers."""
+"""For each interface, the library of the adapter's manufacturer. Linux has its own drivers for these adapters."""
 
 
 def missing_support(interface: str) -> str:
-    """Return what this machine lacks for an interface and how to install it; "" if nothing is known to be missing."""
+    """Return which module or library an interface lacks on this machine and how to install it; "" if none is known."""
     modules, extra = _PACKAGES.get(interface, ((), ""))
     if missing := [module for module in modules if find_spec(module) is None]:
         return f"the Python module {missing[0]}; install it with: pip install 'python-can[{extra}]'"

@@ -16,9 +16,9 @@ CONTROLLER: Final = 0x004
 BUS_OFF: Final = 0x040
 RESTARTED: Final = 0x100
 PASSIVE: Final = 0x30
-"""Details of class CONTROLLER, data[1]: error-passive while receiving or sending."""
+"""Bits of data[1] in class CONTROLLER: error-passive because of receive errors or of transmit errors."""
 ACTIVE: Final = 0x40
-"""Details of class CONTROLLER, data[1]: error-active again."""
+"""Bit of data[1] in class CONTROLLER: error-active again."""
 
 _LOST_ARBITRATION, _PROTOCOL, _TRANSCEIVER = 0x002, 0x008, 0x010
 _LENGTH = 8
@@ -120,13 +120,13 @@ def decode_error_frame(kind: int, data: bytes | bytearray) -> ErrorReport:
     text = "; ".join(parts) or f"error frame {kind:X}"
     if kind & BUS_OFF:
         return ErrorReport(Severity.FAULT, text)
-    errors = kind & ~(_LOST_ARBITRATION | 0x200)  # CAN_ERR_CNT, 200h: only that the data has the error counters
+    errors = kind & ~(_LOST_ARBITRATION | 0x200)  # 200h, CAN_ERR_CNT: the data has error counters
     routine = not errors or (errors == CONTROLLER and data[1] == ACTIVE)
     return ErrorReport(Severity.ROUTINE if routine else Severity.WARNING, text)
 
 
 def queue_is_full(error: Exception) -> bool:
-    """Whether a frame was not sent because the transmit queue is full; the next cycle may succeed again."""
+    """Whether a frame was not sent because the transmit queue is full; sending may succeed in the next cycle."""
     # ENOBUFS: the interface's queue is full. EAGAIN, and python-can without a number: the socket's queue is full.
     number = error_number(error)
     return number in (errno.ENOBUFS, errno.EAGAIN) or (isinstance(error, can.CanOperationError) and number is None)

@@ -23,7 +23,7 @@ class Capture:
         self._frames = bytearray()
 
     def note(self, frame: bytes | bytearray, t: float) -> None:
-        """Add a `struct can_frame` and its time, in seconds since 1970."""
+        """Add a `struct can_frame` and its time, in seconds since 1970, unless the buffer is full."""
         if len(self._frames) < MAX_FRAMES * CAPTURED.size:
             self._frames += CAPTURED.pack(t, frame)
 

@@ -1,7 +1,7 @@
-"""Access of compiled cycles to a bus: through its socket, or through two Python functions if it has no socket.
+"""Access to a bus for compiled cycles: the socket of the bus or, if the bus has no socket, two Python functions.
 
-These functions are called like libc's recvmmsg and sendmmsg, and move the same frames in the same order, one by one.
-Since an exception cannot pass through compiled code, the functions store it, and the next `send` or `receive` raises
+Compiled code calls the functions like libc's recvmmsg and sendmmsg. They move the same frames in the same order, one by
+one. An exception cannot pass through compiled code, so the functions store it, and the next `send` or `receive` raises
 it.
 """
 
@@ -18,18 +18,18 @@ from trirail_drivers.bus.frames import Frame
 from trirail_drivers.bus.packed_frames import BusAccess, PackedFrames
 
 _CALL = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-"""Function that takes the address of consecutive `struct can_frame` and their number."""
+"""Type of a C function whose arguments are the address and the number of consecutive `struct can_frame`."""
 
 
 class LentFrames(FrameIO, Protocol):
-    """Access to the frames of a bus that can be lent to compiled code for some time."""
+    """Access to a bus that Python can lend to compiled code for some time."""
 
     @property
     def access(self) -> BusAccess:
         """Bus access for compiled code."""
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take back `number` frames from compiled code, of which it has handled the first `handled`.
+        """Take back `number` received frames from compiled code, which has handled only the first `handled` frames.
 
         `receive` returns the remaining frames, and then raises `error` (errno.h), which is 0 if receiving has not
         failed.
@@ -37,7 +37,7 @@ class LentFrames(FrameIO, Protocol):
 
 
 def lendable_frames(frames: FrameIO) -> LentFrames:
-    """Return frame access that can be lent to compiled code; it uses the socket unless every frame must be captured."""
+    """Return access that can be lent to compiled code: the socket of the bus, unless every frame must be captured."""
     return frames if isinstance(frames, SocketFrames) and not frames.captured else FrameCalls(frames)
 
 
@@ -78,7 +78,7 @@ class FrameCalls:
         self._frames.set_identifiers(identifiers)
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:  # noqa: ARG002 - frames and error are kept here
-        """Take frames back: `receive` returns those frames of the last call that follow the first `handled`."""
+        """Take frames back: `receive` returns the frames of the last receiving call except the first `handled`."""
         self._returned.extend(self._last_received[handled:number])
 
     def _receive_all(self, address: int, most: int) -> int:

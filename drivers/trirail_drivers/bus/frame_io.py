@@ -1,8 +1,9 @@
-"""Exchange of frames with a bus in the cycle, without waiting: on its socket if it has one, otherwise through
-python-can.
+"""Sending and receiving of frames in the cycle, without waiting.
+
+The frames pass through the socket of the bus if the bus has one, otherwise through python-can.
 
 python-can opens and configures every bus. If the bus is a socket of `struct can_frame` (SocketCAN, or the bus between
-processes), packed frames take a fifth of the time that python-can's messages take.
+processes), packed frames take a fifth of the time of python-can's messages.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from trirail_drivers.bus.unixbus import UnixBus
 MAX_EMPTY_READS = 64
 """Maximum number of consecutive reads without a frame.
 
-It exceeds the number of acknowledgements in a cycle, each of which slcan returns as None.
+It must exceed the number of acknowledgements in a cycle, since python-can's slcan returns None for each of them.
 """
 
 TIMESPEC: Final = Struct("@ll")
@@ -140,11 +141,11 @@ class SocketFrames:
 
     @property
     def access(self) -> BusAccess:
-        """The socket."""
+        """Bus access for compiled code: the socket."""
         return BusAccess(self._socket.fileno())
 
     def return_frames(self, arrived: PackedFrames, handled: int, number: int, error: int) -> None:
-        """Take frames back: `receive` returns those after the first `handled`, and then raises `error` (errno.h)."""
+        """Take frames back: `receive` returns all except the first `handled`, and then raises `error` (errno.h)."""
         self._returned.extend(arrived.unpacked(handled, number))
         self._error = error
 
@@ -168,18 +169,19 @@ class PythonCanFrames:
     Therefore the bus is read until its file descriptor has no more data. Without a descriptor, it is read once more for
     each sent frame that may have been acknowledged.
 
-    Frames that this end has sent are dropped: gs_usb marks them, while a multicast group returns them unmarked.
+    Some interfaces also return the frames that this end has sent: gs_usb marks them, a multicast group does not. These
+    frames are dropped.
     """
 
     def __init__(self, bus: can.BusABC, *, receives_own_frames: bool = False) -> None:
-        """If `receives_own_frames`, the bus returns sent frames in order and without a mark."""
+        """`receives_own_frames` is True if the bus returns this end's frames, in order and without a mark."""
         self._bus = bus
         self._own: deque[tuple[int, bytes]] | None = deque(maxlen=MAX_EMPTY_READS) if receives_own_frames else None
         # SocketCAN marks every frame from this machine, including those of other programs.
         self._marks_own = not isinstance(bus, SocketcanBus)
         self._poll: select.poll | None = None
         self._unanswered = 0
-        """Number of sent frames whose acknowledgement the interface may still return as None."""
+        """Number of sent frames for which the interface may still return None as the acknowledgement."""
         with contextlib.suppress(NotImplementedError, can.CanOperationError):
             descriptor = bus.fileno()
             self._poll = select.poll()
@@ -208,7 +210,7 @@ class PythonCanFrames:
     def _is_own(self, message: can.Message) -> bool:
         """Whether this end has sent the frame.
 
-        Frames that it sent earlier and that have not come back count as lost.
+        Older frames of this end that have not come back by now count as lost.
         """
         if self._own is None:
             return self._marks_own and not message.is_rx
@@ -220,7 +222,7 @@ class PythonCanFrames:
         return True
 
     def set_identifiers(self, identifiers: Collection[int]) -> None:
-        """Do nothing: filters differ between interfaces."""
+        """Do nothing, since python-can's interfaces filter frames differently."""
 
     def _may_have_more(self) -> bool:
         if self._poll is not None:

@@ -43,7 +43,7 @@ BITS: Final = tuple(frame_bits(n) for n in range(9))
 
 
 class Frame:
-    """Frame to send, with an 11-bit identifier. A frame that is sent every cycle is kept and filled with new data."""
+    """Frame to send, with an 11-bit identifier. A frame that is sent every cycle is reused and filled with new data."""
 
     __slots__ = ("bits", "packed")
 
@@ -61,7 +61,7 @@ class Frame:
         return frame
 
     def fill(self, layout: Struct, *values: int) -> None:
-        """Replace the data and keep its length. Raises struct.error if the layout cannot hold a value."""
+        """Replace the data by data of the same length. Raises struct.error if a value does not fit into the layout."""
         layout.pack_into(self.packed, DATA_AT, *values)
 
     def message(self) -> can.Message:
@@ -108,7 +108,8 @@ class FrameSender(Protocol):
 def send_in_setup(bus: FrameSender, frame: Frame) -> None:
     """Send a frame before the cycle runs. Raises BusError if the bus refuses it.
 
-    A full queue is ignored: while all drives are off, no node acknowledges frames, and the missing answer reports that.
+    A full queue is ignored: it occurs while all drives are off and no node acknowledges frames, and the missing answer
+    is reported later.
     """
     try:
         bus.send(frame.message())

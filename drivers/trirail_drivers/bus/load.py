@@ -14,7 +14,7 @@ HIGH_LOAD: Final = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Frames of three drives and the service. Numbers of bits include worst-case stuffing."""
+    """Bus traffic of three drives and the service. Numbers of bits include worst-case stuffing."""
 
     cycle_bits: int
     """Number of bits of the frames in one cycle."""
@@ -26,7 +26,7 @@ class Traffic:
     """Number of bits of a frame with digital outputs."""
 
     def with_outputs(self, drives: int) -> Traffic:
-        """Return the traffic if this number of drives has digital outputs, which may change in every cycle."""
+        """Return the traffic with the digital outputs of this number of drives, which may change in every cycle."""
         bits = drives * self.output_bits
         return replace(self, cycle_bits=self.cycle_bits + bits, most_sent=self.most_sent + drives)
 

@@ -19,11 +19,11 @@ class BusAccess(NamedTuple):
     called.
     """
     receive: int = 0
-    """Address of a function that receives up to n frames; it returns their number, or `~number` if it failed after
-    them.
+    """Address of a function that receives frames, up to a given number. It returns the number of frames received, or
+    the bitwise complement of that number if receiving then failed.
     """
     send: int = 0
-    """Address of a function that sends n frames; it returns the number of frames sent before the first failure."""
+    """Address of a function that sends frames and returns the number of frames sent before the first failure."""
 
 
 class PackedFrames:
@@ -34,7 +34,7 @@ class PackedFrames:
         """`struct can_frame`, (number, size) of uint8."""
         self._vectors = np.zeros((number, 2), np.uint64)
         self.headers = np.zeros((number, 8), np.uint64)
-        """`struct mmsghdr` of each frame; its last number is the received length [bytes]."""
+        """`struct mmsghdr` of each frame; the last of its eight numbers is the received length [bytes]."""
         # On 64-bit Linux, a header consists of msg_name, msg_namelen, msg_iov, msg_iovlen, msg_control, msg_controllen,
         # msg_flags and msg_len; each takes eight bytes including padding.
         for frame, vector, header in zip(self.frames, self._vectors, self.headers, strict=True):

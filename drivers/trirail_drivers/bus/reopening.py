@@ -1,4 +1,4 @@
-"""Reopening of a lost bus in a thread, since an adapter may take seconds to open and the cycle never waits."""
+"""Reopening of a lost bus in a thread, since an adapter may take seconds to open and the cycle must not wait."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def start_thread(work: Callable[[], None]) -> None:
     """Run `work` in a thread that delays neither the loop nor the end of the process."""
 
     def run() -> None:
-        with contextlib.suppress(OSError):  # the thread would inherit the loop's real-time priority and processor
+        with contextlib.suppress(OSError):  # else the thread runs at the real-time priority inherited from the loop
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         work()
 
@@ -70,9 +70,9 @@ class Reopening:
         self._retired = bus
 
     def attempt(self, now: float) -> can.BusABC | str | None:
-        """Return the opened bus or the reason why an attempt failed, once each; otherwise None.
+        """Return the outcome of an attempt that has ended: the opened bus, or the reason why the attempt failed.
 
-        Start an attempt when due.
+        Each outcome is returned once. If there is none, return None, and start a new attempt if one is due.
         """
         if self._under_way:
             outcome = self._outcome
@@ -89,7 +89,7 @@ class Reopening:
         return None
 
     def close(self) -> None:
-        """Close a bus that was opened but never returned; if it is still being opened, close it afterwards."""
+        """Close a bus that was opened but never returned. A bus that is still being opened is closed afterwards."""
         self._closed = True
         for bus in (self._retired, self._outcome):
             if isinstance(bus, can.BusABC):

@@ -1,4 +1,4 @@
-"""CAN bus between processes of one machine, for kernels without SocketCAN."""
+"""Emulated CAN bus between processes of one machine, for kernels without SocketCAN."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SEND_BUFFER_BYTES = 1 << 22
 class UnixBus(can.BusABC):
     """One end of a bus over an AF_UNIX SOCK_SEQPACKET socket at the path `channel`.
 
-    One end listens and any number of others connect. Whenever the listening end receives, it relays each frame to all
-    peers except the sender. A peer that does not read loses frames, like a full CAN controller. Each packet is a
-    `struct can_frame`.
+    One end listens, and any number of other ends connect. The listening end relays each frame that it receives to all
+    peers except the sender. A peer that does not read loses frames, like a CAN controller with a full buffer. Each
+    packet is a `struct can_frame`.
     """
 
     def __init__(self, channel: str, listen: bool = False, **kwargs: object) -> None:
@@ -131,12 +131,12 @@ class UnixBus(can.BusABC):
             return
         for peer in self._peers.values():
             if peer is not sender:
-                with contextlib.suppress(OSError):  # buffer full, or closed, which the next read finds
+                with contextlib.suppress(OSError):  # full, or closed, which the next read notices
                     peer.send(packet)
 
 
 def widen_send_buffer(peer: socket.socket) -> None:
-    """Enlarge the send buffer, within the system's limit, so that a peer may go unscheduled for some time."""
+    """Enlarge the send buffer, within the system's limit, so that no frame is lost if the peer reads late."""
     peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
 
 

@@ -28,24 +28,24 @@ TRIAL_CYCLES = 3
 """Number of consecutive cycles in which a reopened bus must accept every frame before it counts as working again."""
 
 Handler = Callable[[bytearray, float], None]
-"""Function that handles a frame's data at a time [s]. It raises struct.error for a wrong length."""
+"""Function that handles the data of a frame received at a time [s]. It raises struct.error for a wrong length."""
 
 
 class Listener(Protocol):
-    """Receiver of frames, which represents one drive."""
+    """Drive whose frames the bus passes to a handler."""
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
         """Latch a fault of the drive."""
 
 
 class Wire:
-    """The bus, the handlers of its frames, the first fault since the last reset, and warnings.
+    """Access of the cycle to one bus. It passes received frames to their handlers, and collects warnings.
 
-    `stop` is called when a fault is latched.
+    It latches the first fault since the last reset; `stop` is called when a fault is latched.
     """
 
     def __init__(self, bus: can.BusABC, stop: Callable[[], None], reopening: Reopening | None = None) -> None:
-        """`reopening` reopens a lost bus; without it, a lost bus stays lost."""
+        """`reopening` reopens a lost bus; without `reopening`, a lost bus stays lost."""
         self.bus = bus
         """Bus for use outside the cycle, during set-up and closing."""
         self.down = ""
@@ -65,7 +65,7 @@ class Wire:
         self._sent = False
         """Whether a frame was sent in this cycle."""
         self._dead = False
-        """Whether the lost bus cannot even send."""
+        """Whether the lost bus can no longer send either."""
         self._trial: int | None = None
         """Number of cycles in which a reopened bus has accepted every frame; None if no bus is on trial."""
         self._awaits_frame = False
@@ -96,7 +96,7 @@ class Wire:
                 self._end_trial()
             return
         if stopping and not self._dead:
-            return  # the bus may still carry the frames that stop the drives
+            return  # the bus may still transmit the frames that stop the drives
         if not isinstance(self.bus, AbsentBus):
             reopening.retire(self.bus)
             self._use(AbsentBus(self._name))
@@ -190,7 +190,7 @@ class Wire:
     def send(self, frame: Frame) -> bool:
         """Send a frame without waiting; return whether the bus accepted it.
 
-        A frame that a full queue refuses is dropped; this becomes a fault only after UNSENT_CYCLES cycles.
+        A frame is dropped if the transmit queue is full. A full queue becomes a fault only after UNSENT_CYCLES cycles.
         """
         try:
             self._frames.send(frame)
@@ -210,9 +210,9 @@ class Wire:
             self.lose(reason)
         elif self._unsent_cycles < UNSENT_CYCLES - 1:
             self.warn(f"CAN bus: {reason}")
-        elif canerrors.error_number(error) is not None:  # ENOBUFS, EAGAIN: the interface is there, reopening is no help
+        elif canerrors.error_number(error) is not None:  # ENOBUFS, EAGAIN: the interface exists; reopening is no help
             self.fail(DriveFault("", "bus", 0, f"CAN bus: {reason}"))
-        else:  # The queue is full or the adapter is gone: python-can gives no number and so does not show which.
+        else:  # The queue is full or the adapter is gone; python-can gives no error number to tell them apart.
             self._awaits_frame = True
             self.lose(reason, dead=False)
 
@@ -240,7 +240,7 @@ class Wire:
         self.traffic += BITS[min(len(data), 8)]
         if self._trial is not None:  # a received frame proves that the bus is working again
             self._end_trial()
-        entry = self._handlers.get(identifier)  # 29-bit identifiers and remote frames have flags, and so no handler
+        entry = self._handlers.get(identifier)  # none for 29-bit identifiers and remote frames, which have flags
         if entry is None:
             return
         listener, handler = entry

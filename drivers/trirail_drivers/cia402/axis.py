@@ -1,4 +1,4 @@
-"""State of one CiA 402 drive, taken from its frames: position, power state, faults."""
+"""State of one CiA 402 drive, as shown by its frames: position, power state and faults."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FOLLOW_TIME = MISSED_STATUSES * canopen_frames.STATUS_PERIOD
 REGISTER_TIME = 0.5
 """Longest time until a drive reports its error register after a reset [s]."""
 ANSWER_TIME = 0.5
-"""Longest time until a drive answers an SDO request from the cycle [s]; a set-up first waits for that answer."""
+"""Longest time until a drive answers an SDO request from the cycle [s]. A set-up waits this long before it starts."""
 STANDSTILL_DISTANCE_M = 2e-5
 """Distance [m] within which a slider must stay for STANDSTILL_TIME_S to count as at rest."""
 STANDSTILL_TIME_S = 0.1
@@ -37,13 +37,13 @@ _STATE_BITS = 0x6F
 _IN_FAULT = (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
 _WITHOUT_POWER = (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.SWITCH_ON_DISABLED)
 _ENABLING_STATES = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON)
-"""States through which controlwords lead a drive while it is enabled."""
+"""States that a drive passes through before it reaches "operation enabled"."""
 _ENABLED_OR_ENABLING = (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED)
-"""States that every drive leaves on a command to stop or to remove power."""
+"""States that every drive leaves when it is commanded to stop or to remove power."""
 
 
 class Cia402Axis(Axis):
-    """Newest feedback of one drive. The `on_` methods take the data of a frame; they may raise struct.error."""
+    """Newest feedback of one drive. Each `on_` method handles the data of one frame, and may raise struct.error."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
@@ -62,16 +62,16 @@ class Cia402Axis(Axis):
         self.mode_bits = 0
         """Mode-specific controlword bits, added to "enable operation"."""
         self.held: int | None = None
-        """Position [counts] sent to the drive instead of setpoints."""
+        """Position [counts] that is sent to the drive instead of setpoints, if any."""
         self.mode = ShownMode(drives.sdo_timeout)
         self.cyclic = True
         """Whether the drive is certain to be in the mode in which it follows setpoints."""
         self.follows = True
-        """Whether the drive follows setpoints or is about to; until it does, setpoints must hold its position."""
+        """Whether the drive follows setpoints, or will soon do so; until then, setpoints must equal its position."""
         self.has_followed = False
         """Whether the drive has reported, since it was enabled, that it follows setpoints."""
         self.sdo_answer: bytes | None = None
-        """Newest SDO answer to the request in `sdo_asked`."""
+        """Answer to the SDO request that `sdo_asked` identified; None before the answer."""
         self.error_code = 0
         """Last error code that the drive reported; 0 once it has reported the end of the error."""
         self.reset_until = -math.inf
@@ -85,7 +85,7 @@ class Cia402Axis(Axis):
         self.unanswered = 0
         """Number of unanswered SDO requests."""
         self.answered_by = -math.inf
-        """Time until which the newest of these requests may be answered [s]."""
+        """Time by which the drive must have answered the newest SDO request [s]."""
         self.poll_due = self._register_until = -math.inf
         """Time of the next statusword request, and time until which the error register may arrive [s]."""
         self.register_wanted = False
@@ -95,12 +95,12 @@ class Cia402Axis(Axis):
         self._answers_per_sync, self._answers_after = AnswersPerSync(self), AnswersAfterStop()
 
     def assign_io(self, io: DigitalIo) -> None:
-        """Set the digital outputs and inputs that the robot uses, and the exchange that the driver then expects."""
+        """Set the digital outputs and inputs that the robot uses, and the default exchange that includes them."""
         super().assign_io(io)
         self.set_up(process_data.default_exchange(self.node, io), self.units)
 
     def set_up(self, exchange: process_data.Exchange, units: Units) -> None:
-        """Set the frames and units of the exchange. The set-up has already made the outputs safe."""
+        """Set the frames and units of the exchange, after the set-up has written the safe values of the outputs."""
         self.exchange, self.units = exchange, units
         self.maps_outputs, self.outputs_kept = exchange.outputs is not None, exchange.outputs_kept
         self.outputs_sent = NOTHING_SENT
@@ -108,7 +108,7 @@ class Cia402Axis(Axis):
         self.position_at, self.velocity_at = exchange.setpoints.offset(0), exchange.setpoints.offset(1)
 
     def forget_power_state(self) -> None:
-        """Forget the last power state, and trust positions again, because a new set-up begins."""
+        """Forget the last power state, and stop looking for positions of another node, since a new set-up begins."""
         self.state = PowerState.NOT_READY_TO_SWITCH_ON
         self.unanswered = 0
         self._answers_after.forget()
@@ -135,9 +135,9 @@ class Cia402Axis(Axis):
         return max(self.status_heard, super().last_heard)
 
     def lose(self, *, stopping: bool) -> None:
-        """Handle the loss of the bus: the set-up must be checked again.
+        """Record that the bus is lost, so that the drive's set-up must be checked again.
 
-        Unless `stopping`, the drive is assumed to have no power.
+        If `stopping` is False, the drive is assumed to have no power.
         """
         self.silent = True
         if not stopping:
@@ -170,7 +170,7 @@ class Cia402Axis(Axis):
         self._operational = True  # CiA 301: PDOs are sent only in NMT operational
 
     def is_steady(self, wanted: canopen_frames.TargetState) -> bool:
-        """Whether the driver has nothing to send or decide as long as the drive's frames do not change."""
+        """Whether the drive needs no command and no decision as long as its frames do not change."""
         settled = self.state is wanted and wanted is not PowerState.QUICK_STOP_ACTIVE
         no_fault = self.event is None and not self.error_code and self.reset_until == -math.inf
         lives = self._operational and not (
@@ -188,9 +188,7 @@ class Cia402Axis(Axis):
         )
 
     def expected_rows(self, number: int) -> list[tuple[Any, ...]]:
-        """Return rows of trirail_drivers.driver.cyclic.EXPECTED for the frames of drive `number` that carry no new
-        information.
-        """
+        """Return the rows of driver.cyclic.EXPECTED that describe the frames of drive `number` if nothing changes."""
         exchange, word = self.exchange, canopen_frames.STATUSWORD.pack(self.statusword)
         decides = canopen_frames.STATUSWORD.pack(
             _STATE_BITS | (canopen_frames.FOLLOWS_SETPOINTS if exchange.tells_following else 0)
@@ -240,11 +238,11 @@ class Cia402Axis(Axis):
 
     @property
     def awaits_mode(self) -> bool:
-        """Whether the drive has power but does not show its mode yet; it gets setpoints only once it does."""
+        """Whether the drive has power but does not show its mode yet. It is sent setpoints only when it does."""
         return not self.mode.shown and self.cyclic and self.state is PowerState.OPERATION_ENABLED
 
     def _update_mode(self, mode: int) -> None:
-        """Check the mode display 6061h: 0 means no mode yet; any other unexpected mode is a fault."""
+        """Check the mode display 6061h: 0 means that there is no mode yet; any other unexpected mode is a fault."""
         self.mode.shown = mode == self.exchange.mode
         if not self.mode.shown and mode:
             self.note_fault("state", 0, f"shows mode {mode} (object 6061), with power; expected {self.exchange.mode}")
@@ -257,7 +255,7 @@ class Cia402Axis(Axis):
 
     @property
     def holds(self) -> int | None:
-        """Position [counts] sent to the drive instead of setpoints; None if setpoints are sent."""
+        """Position [counts] that is sent to the drive instead of setpoints; None if setpoints are sent."""
         return self.held if self.mode.shown or self.held is not None else self.actual
 
     def on_status(self, data: bytes | bytearray, now: float) -> None:
@@ -291,15 +289,15 @@ class Cia402Axis(Axis):
             self.powered_up = True
         if state not in _IN_FAULT:
             if self.state in _IN_FAULT:
-                self.error_code = 0  # it was the reason for the fault
+                self.error_code = 0  # the error was the reason for the fault, which has ended
             self.reset_until = -math.inf
         self.state = state
 
     def end_cycle(self) -> DriveFault | None:
-        """Check the cycle's frames for a second node with this id. A node answers each SYNC once, and only while
-        operational.
+        """Check whether this cycle's frames came from two nodes with the same id.
 
-        Return the fault that was attributed to this drive although the other node caused it; `event` then names that
+        A single node answers each SYNC once, and only while it is operational. Return a fault that was attributed to
+        this drive although the second node caused it, otherwise None; the fault in `event` then reports the second
         node.
         """
         mistaken = self._answers_after.end_cycle(came=self.came)
@@ -313,8 +311,9 @@ class Cia402Axis(Axis):
 
     @property
     def shown_state(self) -> PowerState:
-        """State of the drive, shown as "switched on" while it has power but has not yet reported that it follows
-        setpoints.
+        """State of the drive for the feedback.
+
+        A drive with power counts as "switched on" until it reports that it follows setpoints.
         """
         if not self.configured and self.state not in _ENABLED_OR_ENABLING:
             return PowerState.NOT_READY_TO_SWITCH_ON
@@ -349,9 +348,9 @@ class Cia402Axis(Axis):
             self.state = PowerState.NOT_READY_TO_SWITCH_ON
             # This replaces an earlier event, which the restart explains.
             self.event = self.make_fault("state", 0, _RESTARTED)
-            if was_there:  # otherwise later positions come from this drive: some drives start by themselves
+            if was_there:  # otherwise positions may come from this drive, since some drives start by themselves
                 self._answers_after.begin(self.event)
-        elif self._operational:  # until then, the heartbeat was sent before the drive was started
+        elif self._operational:  # otherwise the drive sent the heartbeat before it was started
             self.leave_operational()
             self.note_fault("state", 0, f"left NMT operational: is {_NMT_STATES.get(state, f'in {state:02X}')}")
             self._answers_after.begin(self.event)
@@ -369,11 +368,11 @@ class Cia402Axis(Axis):
         return self.left_operational or self.missed > 0
 
     def clear_faults(self, now: float) -> None:
-        """Forget the latched event, but not a condition that persists, and allow time for a fault reset."""
+        """Forget the latched event, but not a condition that persists, and give a fault reset time to take effect."""
         self._answers_after.forget()
         if self.configured:
             self.event = None
-        if self.state is PowerState.FAULT or self.left_operational:  # it was unable to report a fault
+        if self.state is PowerState.FAULT or self.left_operational:  # the latter cannot report a fault
             self.reset_until = now + RESET_TIME
         if self.left_operational:
             self.left_operational = False
@@ -390,8 +389,8 @@ class Cia402Axis(Axis):
             # Bit 7 stays set until the drive leaves fault: some drives sample it only every few cycles.
             return canopen_frames.FAULT_RESET
         if self.state is PowerState.QUICK_STOP_ACTIVE and self._is_at_rest(now):
-            # With 605Ah = 5 to 8, the drive stays there with power (CiA 402-2, transition 12).
-            # If this were sent earlier, the drive would coast.
+            # With 605Ah = 5 to 8, the drive stays in this state with power (CiA 402-2, transition 12).
+            # If "disable voltage" were sent before the drive is at rest, it would coast.
             return canopen_frames.DISABLE_VOLTAGE
         word = canopen_frames.controlword(self.state, wanted)
         if word != canopen_frames.ENABLE_OPERATION:
@@ -414,10 +413,9 @@ class Cia402Axis(Axis):
         return now - self.stands_since >= STANDSTILL_TIME_S and self.missed == 0
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return the fault of a drive that still has power `seconds` [s] after the command `wanted`, such as "quick
-        stop".
+        """Return a fault if the drive still has power `seconds` [s] after the command `wanted`, such as "disable".
 
-        A drive in fault, or not operational, already has another fault.
+        Return None for a drive in fault or not operational, since it already has another fault.
         """
         if self.state in _WITHOUT_POWER or self.state in _IN_FAULT:
             return None
@@ -425,7 +423,7 @@ class Cia402Axis(Axis):
         return self.make_fault("timeout", 0, text)
 
     def find_fault(self, now: float, wanted: canopen_frames.TargetState) -> DriveFault | None:
-        """Return the drive's fault at time `now` [s]; `wanted` is the state that it is commanded to."""
+        """Return the drive's fault at time `now` [s], or None; `wanted` is the commanded state."""
         if self.event is not None:
             return self.event
         if self.state in _IN_FAULT:
@@ -454,8 +452,9 @@ class Cia402Axis(Axis):
         return None
 
     def _following_fault(self, now: float, wanted: canopen_frames.TargetState) -> DriveFault | None:
-        """Check bit 12 of the statusword, which shows whether setpoints are followed or ignored (CiA 402-2, modes 7 and
-        8).
+        """Return a fault if the drive shows no mode, or ignores setpoints according to bit 12 of its statusword.
+
+        CiA 402-2 defines this bit for modes 7 and 8.
         """
         if (waited := self.mode.waited(now, awaited=self.awaits_mode)) is not None:
             return self.make_fault("state", 0, f"shows no mode (object 6061) {waited:.3g} s after it got power")

@@ -35,7 +35,7 @@ LISTEN_TIME_S: Final = 0.5
 MAX_TIMEOUTS: Final = 3
 """Number of consecutive unanswered requests after which a drive counts as lost."""
 MAX_WRITE_ROUNDS: Final = 3
-"""Maximum number of passes over differing values: writing one value may change another."""
+"""Maximum number of passes over the differing values. Several are needed because one value may change another."""
 STORE_TIMEOUT_S: Final = 20.0
 """Longest time to store parameters [s]: the drive answers only when it has finished (CiA 301, 1010h)."""
 _STORE: Final[Key] = 0x1010, 1
@@ -43,13 +43,13 @@ _SAVE: Final = b"save"
 _SDO_CHANNELS: Final = range(0x1200, 0x1300)
 """SDO parameters of CiA 301, whose identifiers depend on the node id."""
 _POWERED: Final = (*HAS_POWER, PowerState.FAULT_REACTION_ACTIVE, None)
-"""States with power; None represents a statusword that encodes no CiA 402 state."""
+"""States in which the drive may have power; None represents a statusword that encodes no CiA 402 state."""
 
 T = TypeVar("T")
 
 
 class UnrestoredParameter(NamedTuple):
-    """Parameter of a file that still differs in the drive after a restore."""
+    """Parameter whose value in the drive still differs from the file after a restore."""
 
     different: ParameterDifference
     """Values in the file and in the drive."""
@@ -134,7 +134,7 @@ def _run_conversations(
     progress: _Progress,
     conversation: Callable[[Remote, Drive], Coroutine[Any, Any, T]],
 ) -> dict[str, T | DriveError]:
-    """Run a conversation with each named drive, unless another master sends frames."""
+    """Run a conversation with each named drive. Raises DriveError if another master sends frames."""
     of = dict(zip(NAMES, drives.each, strict=True))
     with ExclusiveBus(bus, [drive.node for drive in drives.each], drives.master_node) as watched:
         remotes = [remote for remote in setup.remotes(watched, drives, clock) if remote.name in names]
@@ -177,7 +177,7 @@ async def _save(remote: Remote, drive: Drive, progress: _Progress) -> SavedParam
 
 
 async def _extend_arrays(remote: Remote) -> None:
-    """Add array elements that the EDS omits to the dictionary; the drive reports their number (CiA 301)."""
+    """Add the array elements that the EDS omits to the dictionary; subindex 0 contains their number (CiA 301)."""
     for index, item in remote.client.od.items():
         if isinstance(item, ODArray) and 1 in item.subindices and is_parameter(item.subindices[1]):
             for subindex in range(1, (await remote.peek(index) or 0) + 1):
@@ -223,13 +223,13 @@ async def _restore(
 async def _write(
     remote: Remote, intended: Mapping[Key, Parameter], progress: _Progress
 ) -> tuple[list[Key], dict[Key, str]]:
-    """Write differing parameters. Refused parameters are tried again after the others, which may have blocked them.
+    """Write the parameters that differ, and try a refused parameter again after the others, which may have blocked it.
 
-    Return the objects that were written, and the reasons why the others were not.
+    Return the objects that were written, and the reasons why the other objects were not written.
     """
     held = await _read_held(remote, intended, progress)
     due = [key for key, each in intended.items() if key not in held or held[key].data != each.data]
-    for key in due:  # in the first round, before anything is written
+    for key in due:  # all sizes are checked before anything is written
         size = len(held[key].data) if key in held else len(intended[key].data)
         if intended[key].fixed_size and size != len(intended[key].data):
             raise DriveError(
@@ -254,7 +254,7 @@ async def _write(
 
 
 async def _write_one(remote: Remote, key: Key, wanted: Parameter, held: Parameter | None) -> str:
-    """Write one object and read it back; return the reason why the drive does not hold the value, or ""."""
+    """Write one object and read it back; return the reason why the drive did not accept the value, or ""."""
     if held is None:
         return "the drive does not let it be read"
     try:
@@ -269,7 +269,7 @@ async def _write_one(remote: Remote, key: Key, wanted: Parameter, held: Paramete
 
 
 async def _read_held(remote: Remote, parameters: Mapping[Key, Parameter], progress: _Progress) -> dict[Key, Parameter]:
-    """Return the current values of those parameters that can be read from the drive."""
+    """Return the current values of the given parameters, except for parameters that cannot be read from the drive."""
     progress.doing = "reading parameters"
     held = {}
     for number, (key, each) in enumerate(parameters.items()):
@@ -322,7 +322,7 @@ async def _check_without_power(remote: Remote) -> None:
 
 
 async def _store(remote: Remote) -> str:
-    """Let the drive store its parameters; return the reason why it does not, or ""."""
+    """Make the drive store its parameters; return the reason why it refused, or ""."""
     await _check_without_power(remote)
     client = remote.client
     patience, client.timeout = client.timeout, max(client.timeout, STORE_TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""CANopen frames as bytes: identifiers, layouts, CiA 402 states, bus traffic."""
+"""CANopen frames as bytes: their identifiers and layouts, the coding of CiA 402 states, and the bus traffic."""
 
 from __future__ import annotations
 
@@ -78,17 +78,17 @@ SWITCH_ON: Final = 0x07
 ENABLE_OPERATION: Final = 0x0F
 FAULT_RESET: Final = 0x80
 HOMING_START: Final = 0x10
-"""Bit 4 in homing mode, in addition to ENABLE_OPERATION."""
+"""Controlword bit 4, which starts homing in homing mode; sent together with ENABLE_OPERATION."""
 HALT: Final = 0x100
-"""Bit 8: stop and hold the position, with power."""
+"""Controlword bit 8: the drive stops and holds its position, with power."""
 
 STATUS_PERIOD: Final = 0.1
 """Period in which a drive repeats an unchanged statusword: event timer 1800h:05 [s]."""
 
 POLL_PERIOD: Final = 0.02
-"""Period of requests for a statusword that no PDO repeats [s]."""
+"""Period of the SDO requests for a statusword that the drive does not repeat in a PDO [s]."""
 INTERPOLATE: Final = 0x10
-"""Bit 4 in interpolated position mode, in addition to ENABLE_OPERATION."""
+"""Controlword bit 4, which enables interpolated position mode; sent together with ENABLE_OPERATION."""
 FOLLOWS_SETPOINTS: Final = 1 << 12
 """Statusword bit that shows that a drive follows setpoints, in modes 8 and 7."""
 
@@ -108,7 +108,7 @@ _STATES: Final = {
     0x07: PowerState.QUICK_STOP_ACTIVE,
 }
 
-# A quick stop is not interrupted: it ends by itself in switch on disabled (605Ah = 2); otherwise, see Cia402Axis.word.
+# A quick stop is not interrupted. With 605Ah = 2 it ends by itself in switch on disabled; else see Cia402Axis.word.
 _TOWARDS_OPERATION: Final = {
     PowerState.SWITCH_ON_DISABLED: SHUTDOWN,
     PowerState.READY_TO_SWITCH_ON: SWITCH_ON,
@@ -118,7 +118,7 @@ _TOWARDS_OPERATION: Final = {
 }
 
 TargetState = Literal[PowerState.SWITCH_ON_DISABLED, PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE]
-"""States that can be commanded; the drive passes through or enters all others by itself."""
+"""States that the driver can command. The drive passes through the other states, or enters them by itself."""
 
 
 def nmt(command: int, node: int) -> Frame:
@@ -141,7 +141,7 @@ def controlword(state: PowerState, wanted: TargetState) -> int:
 
 
 def _background(heartbeat: float) -> float:
-    """Return the bits per second of repeated statuswords and of four heartbeats with this period [s]."""
+    """Return the bits per second of the repeated statuswords and of four heartbeats with the given period [s]."""
     return 3 * frame_bits(STATUSWORD.size) / STATUS_PERIOD + 4 * frame_bits(NMT_STATE.size) / heartbeat
 
 

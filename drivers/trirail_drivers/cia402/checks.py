@@ -15,7 +15,7 @@ from trirail_drivers.interface import NAMES
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield checks for settings that a drive does not have, or whose values it cannot accept or resolve."""
+    """Yield checks for settings that a drive does not have, and for values that it cannot accept or resolve."""
     nodes = tuple(f"drives.{name}.node" for name in NAMES)
     yield Rule("drives.master_node", nodes, partial(settings.check_nodes, drives))
     for name, drive in zip(NAMES, drives.each, strict=True):

@@ -98,7 +98,7 @@ _CODES = {
     0x8A00: "control",
     0xF001: "deceleration",
 }
-"""Codes that manufacturers use most; other codes are described by their class."""
+"""Error codes that manufacturers use most. The other codes are described by their class."""
 
 _CLASSES = {
     0x10: "generic error",
@@ -136,7 +136,7 @@ _CLASSES = {
     0xF0: "additional function",
     0xFF: "the maker's own",
 }
-"""Error classes by the code's upper byte, or by its first digit if the byte is not listed."""
+"""Error classes by the upper byte of the code or, if this byte is not listed, by the first digit of the code."""
 
 _UNKNOWN_CLASS = "of no class of CiA 301"
 
@@ -159,7 +159,7 @@ _REMEDIES = {
     0x8700: _LATE_REMEDY,
     0x9: "check the wiring of the drive's inputs",
 }
-"""Remedies by code, upper byte or first digit."""
+"""Remedies by the code, the upper byte of the code, or its first digit; the most specific entry applies."""
 _DEFAULT_REMEDY = "see the drive's manual"
 
 

@@ -1,6 +1,6 @@
-"""Differences between a drive's objects and the required values.
+"""Comparison of a drive's objects with the required values, and correction of the differences.
 
-Objects are read first; only differences are written.
+Every object is read first and written only if its value differs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 
 
 class Difference(NamedTuple):
-    """Value that must be changed in a drive."""
+    """Object of a drive that must be changed, with its present and its required value."""
 
     object: str
     """Index and subindex, such as 6085:00."""
@@ -27,7 +27,7 @@ class Difference(NamedTuple):
 
 
 class Differences:
-    """Writer that corrects and records the differing objects of one drive."""
+    """Record of the objects of one drive that differ from the required values, with methods that correct them."""
 
     def __init__(self, remote: Remote) -> None:
         self.remote = remote
@@ -35,14 +35,13 @@ class Differences:
         self.notes: list[str] = []
         """Notes on deviations from the usual set-up."""
         self.missing_protections: dict[str, str] = {}
-        """Missing protections by their names in PROTECTIONS, each with the reason."""
+        """Reason why each missing protection is missing, by the protection's name in PROTECTIONS."""
 
     async def ensure(self, index: int, subindex: int, value: int, also: Sequence[int] = ()) -> int | None:
-        """Write an object unless it holds `value` or one of the values in `also`; return the value that it holds, or
-        None.
+        """Write `value` to an object; if the drive refuses it, the values in `also` are accepted or written instead.
 
-        Raises SdoRefused if the drive does not accept a needed object, and ConfigurationRefused if another value is
-        read back.
+        Return the value that the object then has, or None if the object is missing or refuses every value. Raises
+        SdoRefused if a needed object refuses every value, and ConfigurationRefused if a different value is read back.
         """
         key = index, subindex
         if not await self.remote.has(*key):
@@ -67,7 +66,7 @@ class Differences:
         return None
 
     async def try_ensure(self, key: Key, value: int) -> bool:
-        """Write an object unless it already holds the value; return whether the drive accepts it."""
+        """Write an object unless it already has the value; return whether the drive accepts the value."""
         current = await self.remote.peek(*key)
         if current is None or not same(*key, current, value):
             try:
@@ -88,7 +87,7 @@ class Differences:
     async def confirm(self, key: Key, value: int) -> None:
         """Read a written value back. An object that cannot be read counts as confirmed.
 
-        Raises ConfigurationRefused if the object keeps a different value.
+        Raises ConfigurationRefused if the object still has a different value.
         """
         read, waited = await self.remote.wait_until(key, lambda current: same(*key, current, value))
         if read is not None and not same(*key, read, value):
@@ -96,7 +95,7 @@ class Differences:
             raise ConfigurationRefused(self.remote.name, name, *key, shown(*key, value), shown(*key, read), waited)
 
     def note(self, key: Key, current: int | None, wanted: int, why: str = "") -> None:
-        """Record a difference."""
+        """Record that an object must be, or was, changed from `current` to `wanted`."""
         named = find_use(key)
         self.changes.append(
             Difference(
@@ -109,7 +108,10 @@ class Differences:
         )
 
     def lack(self, key: Key, reason: str, refusal: SdoRefused | None = None) -> None:
-        """Handle a missing object or a refused value: refuse the drive, add a note, or record a missing protection."""
+        """Handle a missing object or a refused value, depending on the driver's need for the object.
+
+        Raise an error if the object is needed, record a protection as missing, and otherwise add a note.
+        """
         named = find_use(key)
         if named is None or named[1].need is Need.NEEDED:
             if refusal is not None:
@@ -130,7 +132,7 @@ class Differences:
             self.notes.append(text)
 
     def refusal(self, accepted: Sequence[str]) -> str:
-        """Return the refusal for missing protections that are not `accepted`, or ""; add notes about accepted ones."""
+        """Return the error message for missing protections that are not `accepted`, or ""; note the accepted ones."""
         refused, notes = review_protections(self.remote.name, self.missing_protections, accepted, PROTECTIONS)
         for text in notes:
             self.add_note(text)

@@ -16,12 +16,11 @@ MASK: Final[Key] = 0x60FE, 2
 
 
 async def configure_outputs(drive: Differences, io: DigitalIo) -> int:
-    """Write the safe values of the outputs, and allow exactly these bits; return the bits that must be kept.
+    """Write the safe values of the outputs, and enable exactly these outputs in the mask 60FEh:02.
 
-    The mask 60FEh:02 is optional. A drive without it would apply every bit, so its other bits are kept as they are.
-
-    Raises DriveError if the drive lacks 60FEh:01, or if bits read back differently because the manufacturer reserves
-    them.
+    The mask is optional. A drive without a mask applies every bit, so the values of its other bits are returned: they
+    must be sent unchanged. Raises DriveError if the drive lacks 60FEh:01, or if bits read back differently because the
+    manufacturer reserves them.
     """
     if not io.outputs:
         return 0
@@ -31,13 +30,13 @@ async def configure_outputs(drive: Differences, io: DigitalIo) -> int:
     current = await remote.peek(*OUTPUTS)
     has_mask = await remote.has(*MASK)
     kept = 0 if has_mask else (current or 0) & ~io.outputs
-    # The value is written first, since it takes effect as soon as the new mask is written.
+    # The safe values are written before the mask, since they take effect as soon as the new mask is written.
     await _write(drive, OUTPUTS, kept | io.safe, io.outputs, "safe values")
     if has_mask:
         await _write(drive, MASK, io.outputs, 0xFFFF_FFFF, "the named outputs, and no others")
     held, _ = await remote.wait_until(OUTPUTS, lambda value: not (value ^ io.safe) & io.outputs)
     if held is not None and (held ^ io.safe) & io.outputs:
-        # Some drives show or store only the bits that the mask allowed at the time of the write.
+        # Some drives show or store only the bits that the mask enabled when the value was written.
         await remote.write(*OUTPUTS, kept | io.safe)
         held, _ = await remote.wait_until(OUTPUTS, lambda value: not (value ^ io.safe) & io.outputs)
         _refuse_differing(drive, OUTPUTS, held, io.safe, io.outputs)
@@ -51,7 +50,10 @@ async def check_inputs(drive: Differences) -> None:
 
 
 async def _write(drive: Differences, key: Key, value: int, bits: int, why: str) -> None:
-    """Write an object unless these bits already hold the value. Raises DriveError if a mask reads back differently."""
+    """Write an object unless the given bits already have their values.
+
+    Raises DriveError if a mask reads back differently.
+    """
     remote = drive.remote
     current = await remote.peek(*key)
     if current is not None and not (current ^ value) & bits:
@@ -67,7 +69,7 @@ async def _write(drive: Differences, key: Key, value: int, bits: int, why: str) 
 
 
 def _refuse_differing(drive: Differences, key: Key, held: int | None, wanted: int, bits: int) -> None:
-    """Raise DriveError if these bits of an object, which may be unreadable, hold a different value."""
+    """Raise DriveError if the given bits of the value `held` differ; None is the value of an unreadable object."""
     differing = 0 if held is None else (held ^ wanted) & bits
     if not differing or held is None:
         return

@@ -1,4 +1,4 @@
-"""Reading of a drive's units, which are checked against the configuration: 60A8h to 60AAh, 608Fh to 6097h."""
+"""Reading of a drive's units, objects 60A8h to 60AAh and 608Fh to 6097h, and comparison with the configuration."""
 
 from __future__ import annotations
 
@@ -25,16 +25,15 @@ TOLERANCE: Final = 0.01
 """Largest relative difference between the configured counts or revolutions per metre and those of the drive."""
 
 _IN_COUNTS: Final = {0x60A9: 0x00B5_0300, 0x60AA: 0x00B5_5700}
-"""Codes of the units increments per second, and increments per second squared."""
+"""For each unit object, the code of increments per second or of increments per second squared."""
 _KEYS: Final = {0x60A9: "velocity_unit", 0x60AA: "acceleration_unit"}
 _FACTORS: Final = {0x60A9: 0x6096, 0x60AA: 0x6097}
 
 
 async def read_units(drive: Differences, config: Drive, scale: Scale) -> Units:
-    """Return the units of a drive whose positions have a `scale`.
+    """Return the units of a drive whose positions have a `scale`. A unit that nothing defines becomes NaN.
 
-    Raises DriveError if the drive contradicts its configuration, or if neither of them defines a required unit, which
-    may be that of the velocity offset or of the quick-stop ramp.
+    Raises DriveError if the drive contradicts its configuration, or if a unit in revolutions cannot be converted.
     """
     remote, counts = drive.remote, abs(scale.counts_per_metre)
     revolutions = await _revolutions(remote, config, counts)
@@ -105,7 +104,10 @@ async def _unit(
     decoded: Callable[[int], Unit | None],
     velocity: Unit | None = None,
 ) -> Unit | None:
-    """Return the drive's unit, checked against the configuration; otherwise the configured unit, or None."""
+    """Return the unit that the drive reports, after a comparison with the configured unit.
+
+    If the drive reports none, return the configured unit, or None.
+    """
     remote, key = drive.remote, _KEYS[index]
     text = config.velocity_unit if index == 0x60A9 else config.acceleration_unit
     configured = (
@@ -135,7 +137,10 @@ async def _unit(
 
 
 async def _unit_from_factor(remote: Remote, index: int, velocity: Unit | None) -> Unit | None:
-    """Return the unit given by 6096h or 6097h: counts per second, or velocity per second, * divisor / numerator."""
+    """Return the unit that the factor 6096h or 6097h defines; None if it cannot be determined.
+
+    The unit is counts per second (6096h), or the unit of velocity per second (6097h), * divisor / numerator.
+    """
     factor = await _ratio(remote, _FACTORS[index])
     if factor is None:
         return None
@@ -147,7 +152,7 @@ async def _unit_from_factor(remote: Remote, index: int, velocity: Unit | None) -
 
 
 async def _switch_to_counts(drive: Differences, index: int, reported: Unit) -> Unit:
-    """Set the drive's unit to counts, because its present unit cannot be converted to metres."""
+    """Change the drive's unit to counts, because its present unit cannot be converted to metres."""
     wanted = Unit(UnitBase.COUNTS, 1.0, "counts/s" if index == 0x60A9 else "counts/s2")
     code, remote = _IN_COUNTS[index], drive.remote
     drive.note((index, 0), await remote.peek(index), code, "its unit, since its revolutions per metre are unknown")

@@ -1,7 +1,7 @@
-"""Three CiA 402 drives on CANopen that follow positions, and their homing: trirail_drivers.interface.DriveGroup.
+"""Driver of three CiA 402 drives on CANopen, which follow positions and can be homed: interface.DriveGroup.
 
-The identifiers determine the priorities on the bus: SYNC, emergencies, statuswords, controlwords, positions,
-setpoints, heartbeats. Thus the controlword of a quick stop overtakes setpoints that are still waiting.
+The identifiers determine the priorities on the bus, highest first: SYNC, emergencies, statuswords, controlwords,
+positions, setpoints, heartbeats. Thus the controlword of a quick stop overtakes setpoints that are still waiting.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from trirail_drivers.driver.recovery import Recovery
 from trirail_drivers.interface import Clock, Feedback, PowerState, Triple
 
 REPEAT_AFTER = 3
-"""Number of SYNCs after which a controlword without effect is sent again, since the frame may have been lost."""
+"""Number of SYNCs after which a controlword that had no effect is sent again, since its frame may have been lost."""
 
 
 class Cia402(Driver[Cia402Axis]):
@@ -66,17 +66,18 @@ class Cia402(Driver[Cia402Axis]):
         self._wanted: canopen_frames.TargetState = PowerState.SWITCH_ON_DISABLED
         self._stopped_in_this_cycle = False
         self._lent_state: list[tuple[int, int, int]] = []
-        """Controlwords, statuswords and inputs for which the tables have been filled."""
+        """Controlword, statusword and inputs of each drive with which the tables were last filled."""
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:
         """Set up the drives for a cycle of `period` seconds, read every value back, and start the drives without power.
 
-        With `awaits`, drives that do not answer latch a fault and are configured when they appear; a missing bus
-        latches a fault and is opened when it appears.
+        With `awaits`, a drive that does not answer causes a fault and is configured when it appears, and a missing bus
+        causes a fault and is opened when it appears.
 
-        Raises BusError if the cycle does not fit on the bus, DriveTimeout, ConfigurationRefused, or DriveError if a
-        drive's unit of velocity does not fit `fastest`, the velocity limit of the sliders [m/s], if given. A drive in
-        fault does not raise: the feedback reports the fault and `reset` clears it.
+        Raises BusError if the cycle's frames do not fit on the bus, DriveTimeout or ConfigurationRefused if a drive
+        does not answer or does not accept a value, and DriveError if a drive's unit of velocity does not fit `fastest`,
+        the velocity limit of the sliders [m/s]. A drive in fault causes no error: the feedback reports the fault, and
+        `reset` clears it.
         """
         self._set_period(period, process_data.traffic(axis.exchange for axis in self._axes))
         scales = tuple(axis.scale for axis in self._axes)
@@ -104,7 +105,7 @@ class Cia402(Driver[Cia402Axis]):
         self._report_absent(lost)
 
     def _apply_start(self, axis: Cia402Axis, start: Start) -> None:
-        """Take over the state that a drive had at the end of its set-up."""
+        """Store the state that a drive had at the end of its set-up, and handle its frames from now on."""
         self._listen(axis)
         axis.update_position(start.counts)
         axis.inputs = start.inputs & axis.io.inputs
@@ -149,7 +150,7 @@ class Cia402(Driver[Cia402Axis]):
         self._begin_cycle(now)
         self._wire.receive(now)
         if self._heartbeat_due is None:
-            # The watchdogs of drives and service start with the first cycle, no matter how long ago the set-up was.
+            # Watchdog times count from the first cycle, however long ago the set-up was.
             self._heartbeat_due = now
             for axis in self._axes:
                 axis.status_heard = now
@@ -249,14 +250,15 @@ class Cia402(Driver[Cia402Axis]):
         self._recover()
 
     def _output_frames(self) -> tuple[Frame, ...]:
-        """Return a frame of outputs for each drive, or no frames if no drive receives its outputs in a frame."""
+        """Return a frame of digital outputs for each drive, or no frames if no drive has its outputs in a PDO."""
         if not any(axis.maps_outputs for axis in self._axes):
             return ()
         return tuple(Frame(axis.exchange.outputs or 0, bytes(canopen_frames.OUTPUTS.size)) for axis in self._axes)
 
     def _send_outputs(self) -> None:
-        """Send outputs that differ from those sent last; the drives apply them at the next SYNC or, if sent by SDO, on
-        receipt.
+        """Send the digital outputs that have changed.
+
+        Drives apply outputs from a PDO at the next SYNC, and outputs from an SDO when they receive it.
         """
         for number, axis in enumerate(self._axes):
             if not (axis.outputs_pending and axis.configured):
@@ -266,7 +268,7 @@ class Cia402(Driver[Cia402Axis]):
                 frame = self._outputs[number]
                 frame.fill(canopen_frames.OUTPUTS, word)
                 sent = self._wire.send(frame)
-            elif axis.unanswered or self._is_being_configured(axis):  # a server takes one request at a time (CiA 301)
+            elif axis.unanswered or self._is_being_configured(axis):  # a server handles one request at a time (CiA 301)
                 continue
             else:
                 sent = self._ask(axis, canopen_frames.OUTPUTS_DOWNLOAD + canopen_frames.OUTPUTS.pack(word))
@@ -274,7 +276,7 @@ class Cia402(Driver[Cia402Axis]):
                 axis.outputs_sent = wanted
 
     def _make_outputs_safe(self) -> None:
-        """Write the safe values of the outputs by SDO, which also works in pre-operational; wait for the answers."""
+        """Write the safe values of the outputs and wait for the answers. SDOs also work in NMT pre-operational."""
         self.set_outputs([axis.io.safe for axis in self._axes])
         asked = [axis for axis in self._axes if axis.has_outputs and axis.configured]
         for axis in asked:
@@ -286,7 +288,7 @@ class Cia402(Driver[Cia402Axis]):
             self._wire.wait(left, self._clock)
 
     def lend(self) -> Cyclic | None:
-        """Return the tables of a cycle, or None unless all drives are in their target states and nothing is pending."""
+        """Return the tables if all drives are in their target states and nothing is pending, otherwise None."""
         due = self._heartbeat_due
         if due is None or not (self._wire.is_healthy and self._homing.idle) or self._period == 0.0:
             return None
@@ -324,16 +326,16 @@ class Cia402(Driver[Cia402Axis]):
         return feedback
 
     def send_on(self, first: int) -> None:
-        """Send the setpoints in the tables that the bus refused, one at a time, and changed outputs."""
+        """Send the setpoints in the tables one at a time, from drive `first` on, and then the changed outputs."""
         for axis, packed in zip(self._axes[first:], self._tables.setpoints.frames[first:], strict=True):
             axis.setpoints_lost += not self._wire.send(Frame.from_packed(packed.tobytes()))
         self._send_outputs()
 
     def enable(self, alone: str | None = None) -> None:
-        """Begin to power up all drives, or only the drive `alone`; the following writes complete it, as the states
-        show.
+        """Begin to power up all drives, or only the drive `alone`.
 
-        This does nothing while a fault is latched or the drives are already enabled.
+        The following calls of `write` complete the power-up, and the states in the feedback show its progress. This
+        does nothing while a fault is latched or the drives are already enabled.
         """
         if self._wire.fault is not None or self._wanted is PowerState.OPERATION_ENABLED:
             return
@@ -379,7 +381,7 @@ class Cia402(Driver[Cia402Axis]):
     def reset(self) -> None:
         """Clear the latched fault and the faults of the drives, without powering up.
 
-        Conditions that persist latch again.
+        A condition that persists latches a fault again.
         """
         self._wire.reset()
         now = self._clock()
@@ -390,7 +392,7 @@ class Cia402(Driver[Cia402Axis]):
                 continue
             if axis.left_operational:  # the set-up is still valid: only a restarted drive needs a new one
                 self._wire.send(canopen_frames.nmt(canopen_frames.NMT_START, axis.node))
-                axis.outputs_sent = NOTHING_SENT  # the drive may have missed them, or changed them by itself
+                axis.outputs_sent = NOTHING_SENT  # the drive may have missed outputs, or changed them by itself
             axis.clear_faults(now)
             if axis.register_wanted:
                 axis.register_wanted = False
@@ -398,7 +400,7 @@ class Cia402(Driver[Cia402Axis]):
         self._command()
 
     def _cut_power(self) -> None:
-        # By PDO and SDO: an operational node receives both, a pre-operational node only the SDO (CiA 301).
+        # By PDO and by SDO: an operational node receives both, a pre-operational node only the SDO (CiA 301).
         for axis in self._axes:
             self._send_word(axis, canopen_frames.DISABLE_VOLTAGE)
             self._send_word_by_sdo(axis, canopen_frames.DISABLE_VOLTAGE)
@@ -406,7 +408,7 @@ class Cia402(Driver[Cia402Axis]):
             self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
 
     def _poll_by_sdo(self, axis: Cia402Axis, now: float) -> None:
-        """Request values that no PDO carries, one request at a time, without waiting."""
+        """Request the values that no PDO contains by SDO, one request at a time, without waiting."""
         if axis.sdo_asked is not None or self._is_being_configured(axis):
             return
         if axis.pdo_silent or ((axis.exchange.polled or axis.awaits_mode) and now >= axis.poll_due):
@@ -437,7 +439,7 @@ class Cia402(Driver[Cia402Axis]):
         return self._recovery is not None and self._recovery.is_configuring(axis)
 
     def _send_word(self, axis: Cia402Axis, word: int) -> bool:
-        """Send a controlword by PDO; if it is mapped in the setpoint's PDO, send it with the last setpoint."""
+        """Send a controlword by PDO. If the setpoint's PDO contains the controlword, send it with the last setpoint."""
         if axis.exchange.controlword is not None:
             return self._wire.send(Frame(axis.exchange.controlword, canopen_frames.CONTROLWORD.pack(word)))
         frame = axis.exchange.setpoints.frame()
@@ -445,8 +447,8 @@ class Cia402(Driver[Cia402Axis]):
         return self._wire.send(frame)
 
     def _send_word_by_sdo(self, axis: Cia402Axis, word: int) -> None:
-        """Send a controlword by SDO, which also works in pre-operational; a stopped node is first switched to
-        pre-operational.
+        """Send a controlword by SDO, which also works in NMT pre-operational. A node in NMT stopped is first switched
+        to pre-operational.
         """
         if axis.stopped:
             self._wire.send(canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, axis.node))
@@ -462,7 +464,7 @@ class Cia402(Driver[Cia402Axis]):
 
     @property
     def _next(self) -> canopen_frames.TargetState:
-        """State to command now: no drive gets power while one of them may not follow setpoints."""
+        """State to command now. No drive gets power while one of the drives might not follow setpoints."""
         return PowerState.QUICK_STOP_ACTIVE if self._homing.restoring else self._wanted
 
     def _power_off(self, wanted: canopen_frames.TargetState, reason: str) -> None:
@@ -490,8 +492,9 @@ class Cia402(Driver[Cia402Axis]):
 
 
 def _target_of(axis: Cia402Axis, wanted: canopen_frames.TargetState) -> canopen_frames.TargetState:
-    """Return the target state of a drive when the drives' target state is `wanted`; a drive that is left out gets no
-    power.
+    """Return the target state of one drive, given the target state `wanted` of all drives.
+
+    A drive that is left out gets no power.
     """
     left_off = axis.left_out and wanted is PowerState.OPERATION_ENABLED
     return PowerState.SWITCH_ON_DISABLED if left_off else wanted

@@ -1,4 +1,4 @@
-"""Dry run of a drive's set-up, which shows the resulting values and whether the drive would accept them."""
+"""Dry run of a drive's set-up, to find out which values would result and whether the drive would accept them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from trirail_drivers.cia402.sdo import Remote, shown
 
 
 class DryRun(Remote):
-    """Object dictionary of a drive to which nothing is written. Written values are read back as if the drive held them.
+    """Object dictionary of a drive to which nothing is written. Values are read back as if they had been written.
 
     With `read_only`, the power of the drive is not changed either, and the drive is asked whether an object may be
-    written. Whether it accepts a value is only known once the value is written.
+    written. Whether the drive accepts a certain value cannot be known without writing it.
     """
 
     rehearsed = True

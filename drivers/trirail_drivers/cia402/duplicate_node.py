@@ -1,7 +1,7 @@
-"""Detection of two nodes with the same node id, which CiA 301 does not prevent.
+"""Detection of two nodes with the same node id, a mistake that CiA 301 does not prevent.
 
-There are two signs: each SYNC is answered by two positions, or a node boots or reports that it is not operational while
-the other node still sends positions.
+There are two signs: two positions answer each SYNC, or one node boots or reports that it is not operational while the
+other node still sends positions.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from trirail_drivers.driver.axis_row import AxisRow
 from trirail_drivers.interface import DriveFault
 
 FAR_APART_M: Final = 0.005
-"""Distance between two positions after one SYNC from which they must come from two sliders [m]."""
+"""Distance between two positions after one SYNC above which they must belong to two sliders [m]."""
 FAR_SYNCS: Final = 3
-"""Number of consecutive SYNCs with positions this far apart that proves that there are two nodes."""
+"""Number of consecutive SYNCs, each with positions FAR_APART_M apart, that proves that there are two nodes."""
 COUNT_WINDOW_SYNCS: Final = 20
 """Number of SYNCs over which SYNCs with two positions are counted, whatever the distance of the positions."""
 MAX_DOUBLE_ANSWERS: Final = 15
-"""Maximum number of SYNCs with two positions from a single node.
+"""Maximum number of SYNCs, in this window, to which a single node gives two positions.
 
-If every other answer is a cycle late, every other SYNC has two.
+If every other answer of a node is one cycle late, two positions arrive after every other SYNC.
 """
 ANSWERS_AFTER: Final = 3
-"""Number of positions that prove another node after a node has reported that it is not operational.
+"""Number of positions that prove that there is another node, after a node has reported that it is not operational.
 
-The node's own PDOs have then ended, except one that may still have been on its way.
+That node itself sends no PDOs any more, except for one that may have been waiting for the bus.
 """
 
 
@@ -58,8 +58,8 @@ class AnswersAfterStop:
         self._fault = None
 
     def end_cycle(self, *, came: bool) -> DriveFault | None:
-        """End a cycle and count its position, if one `came`; return the fault once another node is proved, otherwise
-        None.
+        """End a cycle, in which a position arrived if `came`. Once the positions prove that there is another node,
+        return the fault that was attributed to this node, otherwise None.
         """
         fault = self._fault
         if fault is None:
@@ -72,16 +72,17 @@ class AnswersAfterStop:
 
 
 class AnswersPerSync:
-    """Detection of two positions per SYNC with one identifier.
+    """Detection of two positions with the same identifier after one SYNC.
 
-    If the bus repeats a frame or a SYNC, the same position arrives again or, in motion, a later one. Positions of two
-    sliders alternate, except in a motion that covers more than their distance in one cycle.
+    Two positions may also come from one node: if the bus repeats a frame or a SYNC, the same position arrives again or,
+    in motion, a later position. The positions of two sliders alternate, unless the sliders move further in one cycle
+    than they are apart.
     """
 
     __slots__ = ("_counted_from", "_counts_far", "_far", "_far_in_a_row", "_row", "_two", "_with_two")
 
     def __init__(self, row: AxisRow) -> None:
-        """`row` holds the newest positions."""
+        """`row` contains the newest position and step of the drive."""
         self._row = row
         self._counts_far = abs(row.counts_per_metre) * FAR_APART_M
         self._two = self._far = False
@@ -104,7 +105,7 @@ class AnswersPerSync:
         return not (self._far_in_a_row or self._with_two or self._two or self._far)
 
     def from_two_nodes(self) -> bool:
-        """End a cycle; return whether its positions, together with earlier ones, prove two nodes."""
+        """End a cycle; return whether the positions up to now prove that there are two nodes."""
         self._far_in_a_row = self._far_in_a_row + 1 if self._far else 0
         self._with_two += self._two
         two_nodes = self._far_in_a_row >= FAR_SYNCS or self._with_two > MAX_DOUBLE_ANSWERS

@@ -1,4 +1,4 @@
-"""Object dictionary of a drive from its EDS, the manufacturer's file (CiA 306)."""
+"""Reading of a drive's object dictionary from its EDS, the manufacturer's electronic data sheet (CiA 306)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trirail_drivers.errors import DriveError, FileError
 
 _OBJECT = re.compile(r"([0-9A-Fa-f]{4})((?:[Ss]ub[0-9A-Fa-f]+)|Name)?")
 _PADDED_DIGIT = re.compile(r"0+([0-7])")
-"""Digit with leading zeros, which is the same number in decimal and octal."""
+"""Digit from 0 to 7 with leading zeros, which is the same number in decimal and octal."""
 _VERBATIM = ("parametervalue", "defaultvalue")
 """Keys whose digits may be an octet string, in which zeros are significant."""
 _AFTER = "\x1a\0"
@@ -39,7 +39,7 @@ class Section(NamedTuple):
 
     @property
     def parent(self) -> str:
-        """Name of the section on which this section depends, or ""."""
+        """Name of the object's main section, if this section belongs to a subindex or to array names, otherwise ""."""
         match = _OBJECT.fullmatch(self.name)
         return match[1].upper() if match and match[2] else ""
 
@@ -49,9 +49,9 @@ class Section(NamedTuple):
 
 
 def sections_of(text: str) -> tuple[list[Section], list[str]]:
-    """Return a text's sections, and notes about skipped lines, which have no value or are duplicates.
+    """Return the sections of a text, and notes about the lines that were skipped, such as contradictory duplicates.
 
-    Comments are dropped. A key without a value counts as absent, since many tools write such keys.
+    Comments are dropped. A key with an empty value counts as absent, since many tools write empty values.
     """
     sections: dict[str, Section] = {}
     notes: list[str] = []
@@ -98,7 +98,7 @@ def sort_sections(sections: list[Section]) -> list[Section]:
     return sorted(sections, key=lambda section: section.parent != "")
 
 
-# The DriveError contains canopen's reason; standard error shows only that line.
+# canopen must not print its errors as well: the DriveError contains the reason, and only its line is shown.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 SERVO: Final = Path(__file__).with_name("servo.eds")
@@ -135,7 +135,7 @@ def open_text(file: Path) -> io.StringIO:
 
 
 def _content(file: Path) -> str:
-    """Read a manufacturer's file in any encoding, since all of them represent numbers in ASCII."""
+    """Read a manufacturer's file in any encoding: every usual encoding represents numbers as in ASCII."""
     try:
         with files.open_regular(file) as source:
             return source.read().decode("utf-8-sig", errors="replace")
@@ -166,9 +166,10 @@ def _read(file: Path, node: int) -> tuple[ObjectDictionary, list[str]]:
 
 
 def _readable(file: Path, sections: list[Section], node: int, notes: list[str]) -> list[Section]:
-    """Return the sections that canopen can read, and add notes about the others.
+    """Return the sections that canopen can read, and add notes about the other sections.
 
-    Each section is tried together with the section on which it depends.
+    Each section is tried together with the section on which it depends. Raises DriveError if an object that every drive
+    needs cannot be read.
     """
     sound: dict[str, Section] = {}
     for section in sections:

@@ -1,5 +1,6 @@
-"""Supervision of drive and service by heartbeats, or by node guarding if there is no heartbeat consumer; EMCY (CiA
-301).
+"""Set-up of the mutual supervision of drive and service, and of the drive's EMCY (CiA 301).
+
+Drive and service supervise each other by heartbeats, or by node guarding if the drive has no heartbeat consumer.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from trirail_drivers.config import Drives
 from trirail_drivers.driver.conversations import Wait
 
 _EMCY_BITS: Final = 0x8000_07FF
-"""Bits of 1014h: whether the EMCY is disabled, and its identifier."""
+"""Bits of 1014h that contain the identifier of the EMCY, and whether the EMCY is disabled."""
 MOST_WATCHED: Final = 8
 """Maximum number of entries of 1016h that are read."""
 MISSED: Final = 3
@@ -28,13 +29,15 @@ class Supervision(NamedTuple):
     """Supervision of one drive."""
 
     guarded: bool
+    """Whether node guarding is used."""
     heard: bool
+    """Whether the drive sends heartbeats or answers node guarding."""
     emergency: int
     """Identifier of the drive's EMCY."""
 
 
 async def configure_watchdogs(drive: Differences, drives: Drives, period: int, node: int) -> Supervision:
-    """Configure the supervision of drive and service, with a `period` [ms]."""
+    """Configure the mutual supervision of drive and service with a heartbeat or guarding `period` [ms]."""
     guarded = not await drive.remote.has(0x1016, 1) and await _configure_guarding(drive, period, node)
     heard = True
     if not guarded:
@@ -45,7 +48,7 @@ async def configure_watchdogs(drive: Differences, drives: Drives, period: int, n
 
 
 async def _watch_master(drive: Differences, master: int, period: int) -> None:
-    """Make the drive monitor the master's heartbeat, in an entry of 1016h that no other node uses."""
+    """Make the drive monitor the master's heartbeat, in an entry of 1016h that is free or already the master's."""
     remote, wanted = drive.remote, master << 16 | period
     entries = range(1, 1 + min(await remote.peek(0x1016) or 1, MOST_WATCHED))
     held = {entry: await remote.peek(0x1016, entry) or 0 for entry in entries}
@@ -68,9 +71,10 @@ async def _configure_guarding(drive: Differences, period: int, node: int) -> boo
         await drive.ensure(0x1017, 0, 0)  # CiA 301: a node uses either heartbeats or guarding, not both
     unset = 0 in current
     if remote.rehearsed and (heartbeats or unset):
-        await _set_guarding(drive, period, MISSED)  # without a write, its answers cannot be tested
+        await _set_guarding(drive, period, MISSED)  # in a dry run, the answers cannot be tested
         return True
-    # Tested before it is set up: its life time starts with the first guarding request after that (CiA 301, 7.2.8.2.2).
+    # Guarding is tested before it is set up, since the first request after set-up starts the life time, after which a
+    # drive without further requests reacts to the loss of its master (CiA 301, 7.2.8.2.2).
     answers = await _answers(drive, node)
     if answers or unset:
         await _set_guarding(drive, period, MISSED)
@@ -108,7 +112,7 @@ async def _answers(drive: Differences, node: int) -> bool:
 
 
 async def _emergency(drive: Differences, drives: Drives, node: int) -> int:
-    """Return the identifier of the drive's EMCY, which is the predefined one or another that it keeps."""
+    """Set the predefined identifier of the drive's EMCY; return it, or the identifier that the drive uses instead."""
     remote, usual = drive.remote, canopen_frames.EMCY + node
     current = await remote.peek(0x1014)
     if current is not None and current & _EMCY_BITS != usual and not await drive.try_ensure((0x1014, 0), usual):

@@ -1,13 +1,13 @@
 """Homing of CiA 402 drives within the cycle, in homing mode (CiA 402-2, mode 6).
 
-The drives are homed one after the other, while the others hold their positions in their setpoint mode. Each of the
-three sliders moves the platform, and before homing its pose is unknown. With a single slow slider, the platform moves
-on a path that a person can foresee and watch, a wrong direction or a missing switch affects only one slider, and the
-two drives that hold report a following error if the platform jams. If all three moved, the platform could go anywhere,
-and jam unnoticed.
+The drives are homed one after the other, while the other drives hold their positions in their setpoint mode. Each of
+the three sliders moves the platform, and before homing the pose of the platform is unknown. If only one slider moves,
+slowly, the platform follows a path that a person can foresee and watch. A wrong direction or a missing switch then
+affects only one slider, and the two drives that hold their positions report a following error if the platform jams. If
+all three sliders moved, the platform could go anywhere, and jam unnoticed.
 
-The home offset 607Ch is 0, since manufacturers use different signs for it. The position at home is the `offset` of
-[drives.X].
+The home offset 607Ch is set to 0, since manufacturers use different signs for it. The slider position at home is the
+`offset` of [drives.X].
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ HOMING = 6
 _MODE, _MODE_DISPLAY, _STATUSWORD = 0x6060, 0x6061, 0x6041
 
 FRESH_ANSWERS: Final = 4
-"""Number of answers to SYNCs after homing from which a position is certain to be relative to home.
+"""Number of answers to SYNCs to wait for after homing. The next position is certain to be relative to home.
 
-One answer may still be on its way, and one may be assigned to the wrong SYNC.
+One answer may still be waiting for the bus, and one may be assigned to the wrong SYNC.
 """
 SETPOINT_SYNCS: Final = 2
 """Number of SYNCs after which a drive has applied a written setpoint."""
@@ -42,10 +42,10 @@ _ABORTED: Final = 0x80
 _TARGET_REACHED: Final = 1 << 10
 _HOMING_ATTAINED: Final = 1 << 12
 _ERROR: Final = 1 << 13
-"""Statusword bits in homing mode; they differ in other modes."""
+"""Statusword bits in homing mode. In other modes, these bits have other meanings."""
 
 Steps = Generator[None, None, None]
-"""Steps of a sequence, one per cycle."""
+"""Sequence of steps, one of which is taken in each cycle."""
 
 
 class HomingFailedError(Exception):
@@ -53,7 +53,7 @@ class HomingFailedError(Exception):
 
 
 class HomingSequence:
-    """Homing of the drives that have a homing method; each call of `step` advances it by one step."""
+    """Homing of the drives that have a homing method. Each call of `step` advances the homing by one step."""
 
     def __init__(self, axes: tuple[Cia402Axis, ...], drives: config.Drives, send: Callable[[Frame], object]) -> None:
         self._plan = [
@@ -75,8 +75,8 @@ class HomingSequence:
         self._forget_homes()
 
     def start(self) -> None:
-        """Begin to home all powered drives with a homing method; none of them counts as homed until its homing is
-        complete.
+        """Begin to home all powered drives that have a homing method. Until its homing is complete, a drive does not
+        count as homed.
         """
         self._forget_homes()
         self.under_way, self._stopping = True, False
@@ -87,7 +87,7 @@ class HomingSequence:
         self._stopping = True
 
     def restore(self) -> None:
-        """Switch drives back to their setpoint mode that a quick stop left in homing mode."""
+        """Switch the drives that a quick stop left in homing mode back to their setpoint mode."""
         if not all(axis.cyclic for axis, _ in self._plan):
             self.restoring = True
             self._steps = self._restore_all()
@@ -105,7 +105,7 @@ class HomingSequence:
         return self._steps is None
 
     def step(self, now: float) -> DriveFault | None:
-        """Continue after the frames of a cycle have been handled; return a fault if homing fails."""
+        """Take the next step, after the frames of a cycle have been handled; return a fault if homing fails."""
         self._now = now
         axis = self._axis
         if self._steps is None:
@@ -145,7 +145,7 @@ class HomingSequence:
         axis.cyclic = False
         yield from self._change_mode(axis, HOMING)
         axis.follows = False
-        # The newest statusword may come from another mode, in which its bits have other meanings.
+        # The newest statusword may have been sent in another mode, in which its bits have other meanings.
         yield from self._sdo(axis, _READ, _STATUSWORD)
         axis.seen_clear = ~axis.statusword
         if not self._stopping:
@@ -173,7 +173,7 @@ class HomingSequence:
         yield from self._wait_until(lambda: axis.sampled >= answered, self._sdo_timeout, "there was no new position")
         standing = axis.actual
         yield
-        # The control loop has received this position and holds it from now on, as this sequence does until then.
+        # The control loop has received this position. From now on it sends this position, as this sequence did before.
         axis.held = standing
         axis.follows = True
         taken_up = axis.syncs + SETPOINT_SYNCS
@@ -215,7 +215,10 @@ class HomingSequence:
 
 
 def _attained(axis: Cia402Axis) -> bool:
-    """Whether homing is attained. Bit 12 may be left over from an earlier homing, so it must have been clear since."""
+    """Whether the drive has found home.
+
+    Bit 12 may still be set from an earlier homing, so it must have been clear since this homing began.
+    """
     if axis.statusword & _ERROR:
         raise HomingFailedError(f"the drive reports a homing error (statusword {axis.statusword:04X})")
     both = _HOMING_ATTAINED | _TARGET_REACHED

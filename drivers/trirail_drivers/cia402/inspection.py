@@ -1,4 +1,4 @@
-"""Description of the drives on the bus and the changes of their set-up, for `trirail drives`."""
+"""Description of the drives on the bus and of the values that their set-up changes, for `trirail drives`."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def inspect(
     `fastest` is the velocity limit of the sliders [m/s], which must fit the drives' units; `io` contains the digital
     outputs and inputs of each drive.
 
-    With `apply`, the differences are written to all three drives or to none, without power, and are not stored in the
-    drives; otherwise nothing is written. "refused" contains the reason if a drive does not answer or is refused. Raises
-    DriveError if `apply` fails.
+    With `apply`, the required values are written to all three drives or, if one of them is refused, to none. The drives
+    have no power then and do not store the values permanently. Without `apply`, nothing is written. "refused" contains
+    the reason if a drive does not answer or is refused. Raises DriveError if `apply` fails.
     """
     scales = tuple(scale_of(name, drive) for name, drive in zip(NAMES, drives.each, strict=True))
     if apply:
@@ -60,9 +60,10 @@ def inspect(
 
 
 def inputs(bus: can.BusABC, drives: Drives, clock: Clock) -> Callable[[str], int | None]:
-    """Return a function that reads the digital inputs 60FDh of a named drive, or returns None if they cannot be read.
+    """Return a function that reads the digital inputs 60FDh of a named drive; it returns None if reading fails.
 
-    The function waits for the answer and drops other frames. Use it only for drives without power, between two cycles.
+    The function waits for the answer and drops other frames. Use it only while the drives have no power, between two
+    cycles.
     """
     remotes = {remote.name: remote for remote in setup.remotes(bus, drives, clock)}
 

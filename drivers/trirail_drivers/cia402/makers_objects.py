@@ -16,12 +16,12 @@ _STORES: Final = "would store it in the drive, or restore what is stored"
 _ADDRESS: Final = "changes node id or bitrate: that is for its maker's tool"
 _FORBIDDEN: Final = {0x1010: _STORES, 0x1011: _STORES, 0x100B: _ADDRESS}
 _UNITS: Final = (0x60A9, 0x60AA)
-"""Additional objects that the set-up itself may write."""
+"""Objects that are not in USES but that the set-up may write."""
 _ADDRESSES: Final = {
     0x0000_00FB: (0x2000, 0x2001),  # maxon, EPOS4 Firmware Specification: Node-ID, CAN bit rate
     0x0000_026C: (0x2005, 0x2009),  # Nanotec, manuals, object dictionary: CANopen Baudrate, CANopen NodeID
 }
-"""Objects that contain the node id and bit rate, by vendor (1018h:01)."""
+"""Objects that contain the node id and the bit rate, by vendor id (1018h:01)."""
 _ADDRESS_NAMES: Final = re.compile(r"node.?id|bit.?rate|baud", re.IGNORECASE)
 
 
@@ -35,10 +35,9 @@ def check(name: str, drive: Drive, number: int) -> None:
 
 
 def owned(key: Key) -> str:
-    """Return the reason why the configuration may not write an object, because the set-up writes it or nobody may; else
-    "".
+    """Return the reason why the configuration may not write an object, or "" if it may.
 
-    Nobody may write the objects that store parameters or set the address.
+    It may not write the objects that the set-up writes, that store parameters, or that set the node id or bit rate.
     """
     used = find_use(key)
     if used is not None or is_pdo(key[0]) or key[0] in _UNITS:
@@ -47,12 +46,12 @@ def owned(key: Key) -> str:
 
 
 def address(key: Key, name: str, vendor: int | None) -> str:
-    """Return the refusal of an object that holds the node id or bit rate, by its vendor or name; otherwise ""."""
+    """Return an error message if an object contains the node id or bit rate, judging by its vendor or name, or ""."""
     return _ADDRESS if key[0] in _ADDRESSES.get(vendor or 0, ()) or _ADDRESS_NAMES.search(name) else ""
 
 
 async def write_makers_objects(drive: Differences, writes: tuple[ObjectWrite, ...]) -> None:
-    """Write differing objects and read them back. Raises DriveError if an object is missing or has a different size."""
+    """Write the objects that differ and read them back. Raises DriveError if one is missing or has another size."""
     remote = drive.remote
     for each in writes:
         key = each.object, each.sub

@@ -1,8 +1,8 @@
 """Objects of a CiA 402 drive that the driver uses: type, purpose, and the consequence if an object is missing.
 
-Manufacturers omit objects that are optional in CiA 301 and CiA 402-2. A drive without a NEEDED object is refused. A
-REPLACEABLE object has a substitute, whose use is noted. Without a PROTECTION, the drive would continue where this
-service promises that it stops, so the drive is refused unless `accept_without` names the object.
+Manufacturers omit objects that are optional in CiA 301 and CiA 402-2. A drive without a NEEDED object is refused. For a
+REPLACEABLE object the driver uses a substitute and adds a note. Without a PROTECTION, the drive would not stop in a
+situation in which this service promises a stop, so the drive is refused unless `accept_without` names the object.
 """
 
 from __future__ import annotations
@@ -78,14 +78,14 @@ USES: Final = {
     "60FE": ObjectUse(_N, "Digital outputs", "digital outputs, where configured", "refused"),
     "6502": ObjectUse(_R, "Supported drive modes", "mode 8 or 7", "mode 8 is tried, then 7"),
 }
-"""Objects by index, or by index and subindex, of CiA 301 or, from 6000h on, of CiA 402-2.
+"""Use of each object, by index or by index and subindex. The objects are those of CiA 301 and, from 6000h, CiA 402-2.
 
 605B (shutdown) and 605C (disable operation) are not used: the driver removes power with "disable voltage" and
 "quick stop", which do not depend on these objects.
 """
 
 FOLLOWING_BIT: Final = "6041"
-"""Name in `accept_without` for a drive that does not set bit 12 of its statusword."""
+"""Name in `accept_without` that allows a drive never to set bit 12 of its statusword."""
 PROTECTIONS: Final = {name: used for name, used in USES.items() if used.need is Need.PROTECTION} | {
     FOLLOWING_BIT: ObjectUse(
         _P, "Bit 12 of the statusword", "its report that it follows setpoints", "that is not checked"

@@ -1,4 +1,4 @@
-"""Set-up of one CiA 402 drive over SDO: wait for it, read its objects, write the differences, and read them back."""
+"""Set-up of one CiA 402 drive over SDO: wait for the drive, read its objects, write and read back those that differ."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ class SetUp(NamedTuple):
     differences: tuple[Difference, ...]
     """Values that were written or, in a dry run, would be written."""
     notes: tuple[str, ...]
-    """Deviations from the usual set-up, and missing protections; one line for people each."""
+    """Deviations from the usual set-up, and missing protections; each note is one line for people."""
     missing_protections: tuple[str, ...]
     """Protections that the drive lacks, by their names in `accept_without`."""
     refused: str
-    """Refusal for missing protections, or ""."""
+    """Error message if the drive lacks protections that it must have, or ""."""
     home_offset: int | None = None
     """Home offset 607Ch, the zero of the drive's positions."""
 
@@ -170,10 +170,10 @@ async def configure_drive(one: SetupTask, remote: Remote) -> SetUp:
 
 
 async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool) -> None:
-    """Wait until the node answers, for at most the duration of a boot; check that it is a CiA 402 drive.
+    """Wait until the node answers, at most for the longest boot time, and check that it is a CiA 402 drive.
 
-    With `to_pre_operational`, the node is first switched to NMT pre-operational. After a boot-up message, the request
-    is repeated.
+    The request is repeated after each time-out and each boot-up message. With `to_pre_operational`, the node is
+    switched to NMT pre-operational before each repetition.
     """
     client = remote.client
     begun = client.clock()
@@ -201,7 +201,7 @@ async def wait_for_drive(remote: Remote, node: int, *, to_pre_operational: bool)
 
 
 async def _switch_off(remote: Remote, seconds: float) -> None:
-    """Remove a drive's power, and wait until its state shows this, since a brake takes time to close."""
+    """Remove a drive's power, and wait until its state shows that, since a brake needs time to close."""
     await remote.write(0x6040, 0, canopen_frames.DISABLE_VOLTAGE)
     statusword, waited = await remote.wait_until(
         (0x6041, 0), lambda statusword: canopen_frames.power_state(statusword) not in HAS_POWER, seconds

@@ -12,7 +12,7 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 _LINEAR = 0
 """Value of 60C0h for linear interpolation."""
 _NONE = 0
-"""Value of 6061h for no mode (CiA 402-2); some drives show their mode only with power."""
+"""Value of 6061h that means no mode (CiA 402-2). Some drives show their mode only when they have power."""
 
 
 async def choose_modes(remote: Remote, *, homes: bool) -> tuple[int, ...]:
@@ -43,9 +43,9 @@ async def choose_modes(remote: Remote, *, homes: bool) -> tuple[int, ...]:
 
 
 async def configure_mode(drive: Differences, modes: tuple[int, ...]) -> tuple[int, bool]:
-    """Set the first of these modes that the drive accepts; return the mode, and whether 6061h already shows it.
+    """Set the first of the given modes that the drive accepts; return the mode, and whether 6061h already shows it.
 
-    Some drives show no mode until they have power. Raises ConfigurationRefused if the drive shows another mode.
+    Some drives show no mode until they have power. Raises ConfigurationRefused if the drive shows a different mode.
     """
     refusal: DriveError | None = None
     untold = None

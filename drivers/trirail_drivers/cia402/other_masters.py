@@ -1,6 +1,6 @@
-"""Detection of frames that only this service may send.
+"""Detection of frames that only the master of the bus may send (CiA 301).
 
-Any other sender is another master, and the robot stops (CiA 301).
+The service is the master. If it receives such a frame, there is another master on the bus, and the robot stops.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class OtherMasters:
             self._wire.listen(identifier or 0, self, self._sends(f"sends drive {axis.name} PDOs ({identifier:03X})"))
 
     def note_fault(self, cause: str, code: int, text: str) -> None:
-        """Latch a fault for a malformed frame of another master."""
+        """Latch a fault, because another master has sent a malformed frame."""
         self._wire.fail(DriveFault("", "bus", code, f"CAN bus: another master is on it: {text} ({cause})"))
 
     def _sends(self, text: str) -> Handler:
@@ -75,7 +75,7 @@ class OtherMasters:
 
 
 class ExclusiveBus(can.BusABC):
-    """Bus that raises DriveError on the first frame of another master. Closing it leaves the inner bus open."""
+    """Bus that raises DriveError if another master sends a frame. Closing it does not close the inner bus."""
 
     def __init__(self, bus: can.BusABC, nodes: Sequence[int], master_node: int) -> None:
         self.inner = bus

@@ -1,4 +1,7 @@
-"""File with the parameters of a drive: a DCF (CiA 306), or the TOML file that earlier versions saved."""
+"""Reading and writing of files with the parameters of a drive: DCF files (CiA 306).
+
+The TOML files that earlier versions of trirail saved can also be read.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ IDENTITY: Final[Mapping[str, Key]] = {
     "serial": (0x1018, 4),
 }
 _UNUSED: Final = re.compile("FileInfo|Comments|DummyUsage|DeviceComm?issioning", re.IGNORECASE)
-"""Sections that describe no object; canopen refuses some that other programs write."""
+"""Names of sections that describe no object; canopen refuses some of these sections in files from other programs."""
 _KEYWORDS: Final = {each.lower(): each for each in ("ParameterValue", "NodeID", "LSS_SerialNumber")}
 _COMPACT: Final = re.compile("([0-9a-f]{4})value", re.IGNORECASE)
 _TOML_TYPES: Final = {
@@ -43,7 +46,10 @@ _Number = Annotated[int, Meta(ge=1)]
 
 
 class Origin(Struct, frozen=True):
-    """Identity of the drive in a file. None means unknown, and so does 0, which matches every drive (CiA 302-2)."""
+    """Identity of the drive in a file; None means unknown.
+
+    0 in a file also means unknown, since it matches every drive (CiA 302-2).
+    """
 
     node: Annotated[int, Meta(ge=1, le=127)] | None = None
     device_type: _Number | None = None
@@ -60,14 +66,11 @@ class SavedParameters:
     origin: Origin
     parameters: Mapping[Key, Parameter]
     unread: Mapping[Key, str]
-    """Parameters without a value, each with the reason."""
+    """Reason for each parameter without a value."""
     objects: ObjectDictionary = field(default_factory=ObjectDictionary, compare=False, repr=False)
     """All objects of the drive, for other programs that open the file."""
     complete: bool = field(default=True, compare=False)
-    """Whether the drive lacks every object that is not listed.
-
-    This may be False for a DCF, which may list only some objects.
-    """
+    """Whether the drive certainly lacks every object that is not listed; False for a DCF, which may list only some."""
 
     def knows(self, key: Key) -> bool:
         """Whether the value of an object is known, or the drive is known to lack the object."""
@@ -85,12 +88,12 @@ class ParameterDifference(NamedTuple):
 
 
 def comparable(one: SavedParameters, other: SavedParameters) -> list[Key]:
-    """Return the objects that are known on both sides, in order."""
+    """Return the objects that are known on both sides, sorted by index."""
     return [key for key in sorted({*one.parameters, *other.parameters}) if one.knows(key) and other.knows(key)]
 
 
 def compare(one: SavedParameters, other: SavedParameters) -> list[ParameterDifference]:
-    """Return the differences, in the order of the objects."""
+    """Return the parameters that differ between both sides, sorted by index."""
     differences = []
     for key in comparable(one, other):
         mine, theirs = one.parameters.get(key), other.parameters.get(key)
@@ -101,19 +104,19 @@ def compare(one: SavedParameters, other: SavedParameters) -> list[ParameterDiffe
 
 
 def format_number(value: int | None) -> str:
-    """Return a number of an origin as text for people."""
+    """Return an identity number as text for people."""
     return "unknown" if value is None else f"{value:08X}h"
 
 
 def origin(numbers: Mapping[str, Any]) -> Origin:
-    """Return the origin given its numbers by field name, without zeros. Raises ValueError."""
+    """Return an origin with the given numbers by field name; 0 becomes None. Raises ValueError."""
     return msgspec.convert({name: number for name, number in numbers.items() if number}, Origin)
 
 
 def write(path: Path, saved: SavedParameters, bitrate: int | None = None) -> None:
     """Write a DCF atomically. Raises FileError if it cannot be written."""
     objects, numbers = saved.objects, saved.origin
-    for _, each in variables(objects):  # the drive's EDS may be a DCF itself
+    for _, each in variables(objects):  # the drive's EDS may itself be a DCF with values
         vars(each).update(value=None, value_raw=None)
     info = objects.device_information
     info.vendor_number, info.product_number, info.revision_number = numbers.vendor, numbers.product, numbers.revision
@@ -135,7 +138,7 @@ def write(path: Path, saved: SavedParameters, bitrate: int | None = None) -> Non
     head = {"FileName": path.name, "ModifiedBy": "trirail", "ModificationDate": date, "ModificationTime": time}
     commissioning = f"[DeviceComissioning]\nLSS_SerialNumber={numbers.serial or 0}\n"
     output = io.StringIO()
-    # canopen.export_od is not used: all files of a process would share its header.
+    # canopen.export_od is not used, because all files that it writes in a process share one header.
     export_dcf(objects, output, head)  # type: ignore[no-untyped-call]
     try:
         files.replace(path, output.getvalue().replace("[DeviceComissioning]\n", commissioning, 1).encode())
@@ -151,7 +154,7 @@ def read(path: Path, node: int | None = None) -> SavedParameters:
     """
     try:
         return _read_dcf(path, node) if path.suffix.lower() in (".dcf", ".eds") else _read_toml(path)
-    except (configparser.Error, ValueError, LookupError, AttributeError, TypeError) as error:  # canopen's, too
+    except (configparser.Error, ValueError, LookupError, AttributeError, TypeError) as error:  # also from canopen
         raise DriveError(f"{path} is not a parameter file of a drive: {' '.join(str(error).split())}") from error
 
 
@@ -202,7 +205,7 @@ def _sections(path: Path) -> tuple[configparser.RawConfigParser, dict[str, Any]]
     """Return the sections that describe objects, in a form that canopen reads, and the node id and serial number."""
     sections = configparser.RawConfigParser(inline_comment_prefixes=(";",))
     sections.optionxform = lambda optionstr: _KEYWORDS.get(optionstr.lower(), optionstr)  # type: ignore[method-assign]
-    # Strict, unlike an EDS: it is impossible to know which of two duplicate values to write into a drive.
+    # Unlike an EDS, a DCF with duplicates is refused: nobody can know which of two values to write into a drive.
     strict = configparser.RawConfigParser(allow_no_value=True)
     strict.read_string(path.read_text(encoding="utf-8-sig", errors="replace").rstrip("\x1a\0 \r\n\t"))
     with eds.open_text(path) as text:
@@ -232,7 +235,7 @@ def _expand(sections: configparser.RawConfigParser, index: str, values: Mapping[
 
 
 def _parse(variable: ODVariable, raw: str) -> Parameter:
-    """Return an object with its ParameterValue. Raises ValueError if the value is invalid."""
+    """Return an object with the value that its ParameterValue states. Raises ValueError if the value is invalid."""
     where = f"object {named((variable.index, variable.subindex))}: "
     value, bits, data_type = variable.value, len(variable), variable.data_type or 0
     if data_type in SIGNED_TYPES and raw.lower().startswith("0x") and value is not None and value >> bits - 1 == 1:
@@ -244,7 +247,7 @@ def _parse(variable: ODVariable, raw: str) -> Parameter:
 
 
 def _is_within_limits(variable: ODVariable, value: Value | None) -> bool:
-    """Whether the EDS allows a value. Limits that exclude every value, which some files contain, are ignored."""
+    """Whether the EDS allows a value. Some files contain limits that exclude every value; these limits are ignored."""
     low, high = variable.min, variable.max
     if low is None or high is None or low > high or not isinstance(value, int | float):
         return True

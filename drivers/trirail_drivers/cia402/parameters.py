@@ -1,4 +1,4 @@
-"""Selection of the objects that are a drive's parameters, and their values for people."""
+"""Selection of the objects that are parameters of a drive, and conversion of their values."""
 
 from __future__ import annotations
 
@@ -83,12 +83,12 @@ def is_parameter(variable: ODVariable) -> bool:
     if index in _PROFILE:
         index = 0x6000 + index % _NEXT_AXIS
         return index not in _PROCESS and (index, variable.subindex) != _OUTPUTS
-    # CiA 306: rwr is a value that a TPDO can carry, so the drive itself sets it.
+    # CiA 306: an rwr object that can be mapped is meant for TPDOs, so the drive itself sets its value.
     return not (index in _MAKERS and access == "rwr" and variable.pdo_mappable)
 
 
 def parameter(data_type: int | None, data: bytes, name: str) -> Parameter:
-    """Return bytes as a parameter of a data type, or of one that fits their length if the type in the EDS does not."""
+    """Return bytes as a parameter with the data type of the EDS or, if this does not fit, a data type that does."""
     sign = next((types for types in (SIGNED_TYPES, (BOOLEAN, *UNSIGNED_TYPES)) if data_type in types), ())
     for each in (data_type or OCTET_STRING, *sign):
         if _is_exact(each, data):
@@ -103,7 +103,7 @@ def decode(data_type: int, data: bytes) -> Value:
 
 
 def encode(data_type: int, value: Value, where: str = "") -> bytes:
-    """Encode a value for transfer by SDO. Raises ValueError if the data type cannot hold it."""
+    """Encode a value for transfer by SDO. Raises ValueError if the data type does not allow the value."""
     try:
         data = bytes(_variable(data_type).encode_raw(value))
         if data_type in FLOAT_TYPES or decode(data_type, data) == value:
@@ -127,7 +127,7 @@ def _is_exact(data_type: int, data: bytes) -> bool:
     value = decode(data_type, data)
     if isinstance(value, bytes) or (isinstance(value, float) and math.isnan(value)):  # no text keeps the bits of a NaN
         return data_type == OCTET_STRING
-    # An entry of a DCF is one line, without spaces around it, and ends before a comment.
+    # A DCF cannot represent a text with line breaks, spaces at its ends, or a semicolon, which begins a comment.
     if isinstance(value, str) and (not value.isprintable() or value != value.strip() or ";" in value):
         return False
     try:

@@ -1,4 +1,4 @@
-"""Mapping of a CiA 402 drive's PDOs, or use of suitable fixed PDOs (CiA 301, 1400h to 1BFFh)."""
+"""Mapping of a CiA 402 drive's PDOs, or selection of suitable PDOs with a fixed mapping (CiA 301, 1400h to 1BFFh)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TPDO: Final = 0x1800
 MAX_PDOS: Final = 512
 """Maximum number of PDOs in one direction (CiA 301)."""
 _MAX_GAP: Final = 4
-"""Number of consecutive missing PDOs after which a drive has no more, except those listed in its EDS."""
+"""Number of consecutive missing PDOs after which the search ends; after that, only PDOs of the EDS are considered."""
 _IDENTIFIER: Final = 0x7FF
 EVERY_SYNC: Final = 1
 ON_CHANGE: Final = 255
@@ -41,7 +41,7 @@ class PdoParameters(NamedTuple):
     """Parameters of a PDO in a drive."""
 
     at: int
-    """Index of its communication parameters."""
+    """Index of the PDO's communication parameters."""
     cob_id: int | None
     kind: int | None
     """Transmission type."""
@@ -78,7 +78,7 @@ class _TargetPdo(NamedTuple):
 
 
 class Pdos:
-    """The PDOs of one drive."""
+    """Set-up of the PDOs of one drive."""
 
     def __init__(self, drive: Differences, node: int) -> None:
         self._drive = drive
@@ -87,9 +87,10 @@ class Pdos:
         self._used: set[int] = set()
 
     async def setpoints(self, mode: int) -> tuple[SetpointPdo, int | None]:
-        """Return the SYNC-driven RPDO of the setpoints, and the identifier of the event-driven RPDO of the controlword.
+        """Set up the SYNC-driven RPDO of the setpoints and the event-driven RPDO of the controlword.
 
-        Raises DriveError if one of them cannot be mapped and no fixed PDO fits.
+        Return the former, and the identifier of the latter, or None if the setpoints' RPDO contains the controlword.
+        Raises DriveError if an RPDO cannot be mapped and no fixed RPDO fits.
         """
         position = POSITIONS[mode]
         wanted: list[tuple[int, ...]] = [(position,)]
@@ -112,7 +113,7 @@ class Pdos:
         return chosen, control
 
     async def outputs(self) -> int | None:
-        """Return the identifier of the SYNC-driven RPDO of the digital outputs, or None if there is none."""
+        """Set up the SYNC-driven RPDO of the digital outputs; return its identifier, or None if no RPDO is suitable."""
         entries, number = (DIGITAL_OUTPUTS,), canopen_frames.RPDO3 + self._node
         for index in (RPDO + 2, RPDO + 3, RPDO):
             if (
@@ -126,11 +127,11 @@ class Pdos:
         return None if pdo is None else pdo.identifier
 
     async def feedback(self, *, inputs: bool = False) -> tuple[FeedbackPdo, int | None, bool, int | None]:
-        """Return the TPDOs of the position, the statusword and the digital inputs.
+        """Set up the TPDOs of the position, of the statusword and, if `inputs` is True, of the digital inputs.
 
-        The result is the SYNC-driven TPDO of the position; the identifier of the TPDO of the statusword, or None;
-        whether the statusword must be polled; and the identifier of the TPDO of the digital `inputs`, if they are
-        wanted, which may be the same as for the statusword. Raises DriveError if no TPDO can carry them.
+        Return four values: the SYNC-driven TPDO of the position; the identifier of the TPDO of the statusword, or None;
+        whether the statusword must be polled; and the identifier of the TPDO of the digital inputs, which may be that
+        of the statusword, or None. Raises DriveError if no TPDO can contain the position or the inputs.
         """
         chosen, status, polled, beside = await self._feedback_and_status(inputs=inputs)
         if not inputs or beside:
@@ -138,7 +139,7 @@ class Pdos:
         return chosen, status, polled, await self._inputs()
 
     async def _inputs(self) -> int:
-        """Return the identifier of a TPDO that carries only the digital inputs. Raises DriveError if there is none."""
+        """Set up a TPDO with only the digital inputs; return its identifier. Raises DriveError if no TPDO fits."""
         entries, number = (DIGITAL_INPUTS,), canopen_frames.TPDO3 + self._node
         for index in (TPDO + 2, TPDO + 3, TPDO):
             if (
@@ -153,7 +154,7 @@ class Pdos:
         )
 
     async def _first_fixed(self, base: int, entries: tuple[int, ...], kind: int) -> PdoParameters | None:
-        """Return an unused PDO that has exactly this mapping, or None."""
+        """Return an unused PDO that has exactly the given mapping and transmission type, or None."""
         for index in await self._all(base):
             pdo = await self._pdo(index)
             if index not in self._used and pdo.valid and pdo.entries == entries and await self._has_kind(pdo, kind):
@@ -162,8 +163,9 @@ class Pdos:
         return None
 
     async def _feedback_and_status(self, *, inputs: bool) -> tuple[FeedbackPdo, int | None, bool, bool]:
-        """Return position and statusword as `feedback` does, and whether wanted inputs are mapped in the statusword's
-        PDO.
+        """Set up the TPDOs of position and statusword.
+
+        Return the same values as `feedback`, except that the last is whether the statusword's TPDO contains the inputs.
         """
         timed = await self._remote.has(TPDO, 5) and await self._can_be_prompt(TPDO)
         wanted = [(ACTUAL_POSITION,)] if timed else [(ACTUAL_POSITION, STATUSWORD), (ACTUAL_POSITION,)]
@@ -188,7 +190,7 @@ class Pdos:
         return chosen, status, polled, beside
 
     async def switch_off_others(self) -> None:
-        """Switch off unused PDOs: they add bus load that is not budgeted, or accept frames from other senders."""
+        """Switch off unused PDOs, since they would add bus load or let other senders command the drive."""
         for base in (RPDO, TPDO):
             for index in await self._all(base):
                 pdo = await self._pdo(index)
@@ -230,11 +232,14 @@ class Pdos:
         return kept
 
     async def _is_mappable(self, entry: int, sending: bool) -> bool:
-        """Whether the drive has an object of that length that PDOs in this direction may carry (CiA 301, 1600h)."""
+        """Whether PDOs in this direction can contain the object of a mapping entry (CiA 301, 1600h).
+
+        It is checked only if nothing may be written: otherwise the mapping itself shows the result.
+        """
         index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
         remote = self._remote
         if not remote.read_only:
-            return True  # the mapping itself will show this
+            return True
         if not await remote.has(index, subindex) or await remote.bits(index, subindex) != bits:
             return False
         if sending:
@@ -246,7 +251,7 @@ class Pdos:
         index, write, wait_until = current.at, self._remote.write, self._remote.wait_until
         fixed = False
         try:
-            # CiA 301: the identifier may change only while the PDO is invalid, so it is invalidated under its old one.
+            # CiA 301: the identifier may change only while the PDO is invalid, so the old identifier is marked invalid.
             await write(
                 index, 1, (current.cob_id if current.valid and current.cob_id is not None else cob_id) | INVALID
             )
@@ -283,10 +288,7 @@ class Pdos:
         return cob_id & _IDENTIFIER
 
     async def _set_timer(self, index: int, subindex: int, value: int) -> None:
-        """Set the event timer.
-
-        If the drive refuses it for a TPDO, the PDO is kept and its statusword is polled as well.
-        """
+        """Set the event timer. If the drive refuses the timer of a TPDO, the statusword is also polled by SDO."""
         try:
             await self._remote.write(index, subindex, value)
         except SdoRefused as refusal:
@@ -299,8 +301,9 @@ class Pdos:
         await self._drive.confirm((index, subindex), value)
 
     async def _event_timer(self, index: int, kind: int) -> tuple[int, int] | None:
-        """Return the event timer to set: in a TPDO it repeats the statusword; in an RPDO it is a deadline and must be
-        off.
+        """Return the subindex and the value of the event timer if it must be changed, otherwise None.
+
+        The event timer of a TPDO repeats the statusword. That of an RPDO is a deadline, and must be off.
         """
         if index < TPDO:
             return await self._parameter(index, 5, 0)
@@ -309,8 +312,9 @@ class Pdos:
         )
 
     async def _parameter(self, index: int, subindex: int, value: int) -> tuple[int, int] | None:
-        """Return a communication parameter that must be changed, or None if the drive lacks it or already has the
-        value.
+        """Return subindex and value of a communication parameter that must be changed.
+
+        Return None if the drive lacks the parameter, or if the parameter already has the value.
         """
         if not await self._remote.has(index, subindex) or await self._remote.peek(index, subindex) == value:
             return None
@@ -345,7 +349,7 @@ class Pdos:
     async def _find_fixed(
         self, base: int, fits: Callable[[tuple[int, ...]], bool], name: str, kind: int
     ) -> PdoParameters:
-        """Return a PDO whose fixed mapping fits. Raises DriveError if there is none."""
+        """Return an unused PDO whose fixed mapping fits. Raises DriveError if there is none."""
         seen = []
         for index in await self._all(base):
             pdo = await self._pdo(index)
@@ -375,8 +379,9 @@ class Pdos:
     # ------------------------------------------------------------------ the statusword
 
     async def _status(self, *, inputs: bool) -> tuple[int | None, bool]:
-        """Return the identifier of the statusword's TPDO, or None, and whether wanted inputs are mapped in the same
-        TPDO.
+        """Set up the TPDO of the statusword, and of the inputs if they are wanted and fit into the same TPDO.
+
+        Return the identifier of the TPDO, or None, and whether the TPDO contains the inputs.
         """
         number = canopen_frames.TPDO1 + self._node
         if inputs:
@@ -394,7 +399,7 @@ class Pdos:
         return await self._remote.peek(TPDO, 5) == round(1000 * canopen_frames.STATUS_PERIOD)
 
     async def _can_be_prompt(self, index: int) -> bool:
-        """Whether the inhibit time is 0 or can be set to 0; otherwise a statusword may be delayed."""
+        """Whether the inhibit time is 0 or can be set to 0. With another inhibit time, a statusword may be delayed."""
         if not await self._remote.has(index, 3) or await self._remote.peek(index, 3) == 0:
             return True
         cob_id = await self._remote.peek(index, 1) or 0
@@ -410,7 +415,7 @@ class Pdos:
     # ------------------------------------------------------------------ reading
 
     async def _mappable(self, entry: int) -> bool:
-        """Whether the drive has an object that, according to its EDS if there is one, may be mapped to PDOs."""
+        """Whether the drive has an object and its EDS does not exclude the object from PDOs."""
         variable = self._remote.client.od.get_variable(entry >> 16, entry >> 8 & 0xFF)
         there = await self._remote.has(entry >> 16, entry >> 8 & 0xFF)
         return there and (variable is None or bool(variable.pdo_mappable))

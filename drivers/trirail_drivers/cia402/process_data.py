@@ -1,4 +1,4 @@
-"""Exchange of setpoints and feedback with one drive: mode, PDOs, statusword, supervision."""
+"""Description of the exchange of setpoints and feedback with one drive: mode, PDOs, statusword and supervision."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DIGITAL_OUTPUTS: Final = 0x60FE_01_20
 """Entries of PDO mappings: index, subindex, number of bits (CiA 301, 1600h)."""
 
 POSITIONS: Final = {CYCLIC_SYNCHRONOUS_POSITION: TARGET_POSITION, INTERPOLATED_POSITION: INTERPOLATION_DATA}
-"""Setpoint object in each mode."""
+"""Mapping entry of the position setpoint in each mode."""
 
 _FORMATS: Final = {8: "b", 16: "h", 32: "i", 64: "q"}
 
@@ -50,7 +50,7 @@ class SetpointPdo:
         self.size = self._layout.size
 
     def frame(self) -> Frame:
-        """Return a frame that is filled in each cycle."""
+        """Return an empty frame, which `fill` then fills in each cycle."""
         return Frame(self.identifier, bytes(self.size))
 
     def fill(self, frame: Frame, counts: int, velocity: int, controlword: int) -> None:
@@ -72,7 +72,7 @@ class SetpointPdo:
 
     @property
     def has_controlword(self) -> bool:
-        """Whether the controlword is mapped in the setpoint's PDO, because it has no PDO of its own."""
+        """Whether the setpoint's PDO contains the controlword, because there is no separate PDO for the controlword."""
         return CONTROLWORD in self.entries
 
 
@@ -104,19 +104,19 @@ class FeedbackPdo:
 
 
 def fits_setpoints(entries: tuple[int, ...], mode: int) -> bool:
-    """Whether a fixed mapping contains setpoints, and only objects that this service provides."""
+    """Whether a fixed mapping contains the position setpoint, and no object whose value this service does not know."""
     known = {POSITIONS[mode], VELOCITY_OFFSET, CONTROLWORD}
     return POSITIONS[mode] in entries and set(entries) <= known
 
 
 def fits_feedback(entries: tuple[int, ...]) -> bool:
-    """Whether a fixed mapping contains the position."""
+    """Whether a fixed mapping contains the position, and only objects of a known length."""
     return ACTUAL_POSITION in entries and all(entry & 0xFF in _FORMATS for entry in entries)
 
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """Exchange of setpoints and feedback with one drive."""
+    """Frames that exchange setpoints and feedback with one drive, and the expected behaviour of the drive."""
 
     mode: int
     """Mode 6060h: cyclic synchronous position, or interpolated position."""
@@ -138,13 +138,13 @@ class Exchange:
     tells_following: bool = True
     """Whether bit 12 of the statusword must show that the drive follows setpoints."""
     mode_shown: bool = True
-    """Whether 6061h also shows the mode without power."""
+    """Whether the drive shows its mode in 6061h even without power."""
     outputs: int | None = None
-    """Identifier of the RPDO of the digital outputs, which take effect at the SYNC; None if there are no outputs, or if
-    an SDO writes them.
+    """Identifier of the RPDO of the digital outputs, which take effect at the SYNC. None if there are no outputs, or if
+    they are written by SDO.
     """
     outputs_kept: int = 0
-    """Bits of 60FEh:01 next to the outputs that are sent unchanged since set-up."""
+    """Bits of 60FEh:01 that the robot does not use; they are sent as they were at the set-up."""
     inputs: int | None = None
     """Identifier of the event-driven TPDO of the digital inputs, which may be the statusword's TPDO; None if there are
     no inputs.
@@ -179,7 +179,7 @@ class Exchange:
 
 
 def default_exchange(node: int, io: DigitalIo = NO_IO[0]) -> Exchange:
-    """Return the exchange with a drive that has every optional object of CiA 301 and CiA 402-2."""
+    """Return the exchange that is used if a drive has every optional object of CiA 301 and CiA 402-2."""
     return Exchange(
         CYCLIC_SYNCHRONOUS_POSITION,
         SetpointPdo(canopen_frames.RPDO2 + node, (TARGET_POSITION, VELOCITY_OFFSET)),

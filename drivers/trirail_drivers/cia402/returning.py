@@ -1,4 +1,4 @@
-"""Set-up of a returning CiA 402 drive in the background; see trirail_drivers.driver.recovery."""
+"""Set-up of a CiA 402 drive that has restarted or reappeared; see trirail_drivers.driver.recovery."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from trirail_drivers.errors import DriveError
 from trirail_drivers.interface import Clock
 
 SETTLED_AFTER: Final = 2 * ANSWERS_AFTER
-"""Number of SYNCs after a boot-up within which the answers of another node with the same id reveal it."""
+"""Number of SYNCs after a boot-up message. Within this time, another node with the same id shows itself by answers."""
 _NUMBERS: Final = {"vendor": "vendor", "product": "product code", "revision": "revision", "serial": "serial number"}
 """Fields of an Identity, and their names in CiA 301 (1018h)."""
 _MAY_DIFFER: Final = ("revision", "serial")
-"""Fields in which an allowed replacement may differ."""
+"""Fields of an Identity in which a permitted replacement may differ from the previous drive."""
 
 
 class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
-    """One CiA 402 drive; `setup.configure_one` sets it up."""
+    """CiA 402 drive that may have to be set up again, by `setup.configure_one`."""
 
     work, counted = "configuring", "objects"
 
@@ -38,8 +38,8 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         configured: Callable[[SetUp, Start], None],
         setups: Callable[[], Sequence[SetUp]],
     ) -> None:
-        """`configured` lets the drive take part in the cycle, and may raise DriveError; `setups` returns those of all
-        drives.
+        """`configured` lets the drive take part in the cycle, and may raise DriveError. `setups` returns the set-ups of
+        all drives.
         """
         super().__init__(axis)
         self.one = one
@@ -56,7 +56,9 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         return configure_one(self.one._replace(remote=remote), self._fastest, self._check), client
 
     def accept(self, made: SetUp, begun: Start) -> str:
-        """Let the drive take part in the cycle; it counts as not homed if its home offset has changed."""
+        """Let the drive take part in the cycle. If its home offset has changed, the drive counts as not homed, and a
+        warning is returned.
+        """
         self._configured(made, begun)
         if self.setup is None or made.home_offset == self.setup.home_offset:
             return ""
@@ -67,7 +69,7 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
         )
 
     def may_have_power(self, *, stopping: bool) -> bool:
-        """Whether the statusword shows power; while drives are stopping, a silent drive may have power too."""
+        """Whether the statusword shows power, or the drive is silent while drives are `stopping`."""
         axis = self.axis
         if axis.restarted:
             return False
@@ -76,17 +78,18 @@ class ReturningCia402(ReturningDrive[Cia402Axis, SetUp, Start]):
 
     @property
     def settled(self) -> bool:
-        """Whether another node with the same id would have revealed itself by now."""
+        """Whether enough SYNCs have passed since the boot for another node with the same id to show itself."""
         return self.axis.syncs >= self.booted_at + SETTLED_AFTER
 
     def has_answered(self, now: float) -> bool:
-        """Whether the cycle's SDO request has been answered or has timed out: a server handles one request at a time
-        (CiA 301).
+        """Whether the cycle's last SDO request has been answered or has timed out.
+
+        The set-up must wait for this, since an SDO server handles one request at a time (CiA 301).
         """
         return not self.axis.unanswered or now >= self.axis.answered_by
 
     def _check(self, looked: SetUp) -> None:
-        """Raise DriveError if the drive is not the same as before, or has a PDO identifier that another drive uses."""
+        """Raise DriveError if the drive is not the previous one, or has a PDO identifier that another drive uses."""
         name, allowed = self.axis.name, self.one.drive.allow_replacement
         if self.setup is not None:
             before, now = self.setup.identity, looked.identity

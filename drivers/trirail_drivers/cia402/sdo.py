@@ -1,4 +1,4 @@
-"""Object dictionary of a drive over SDO, with reads, writes and checks whose errors name the drive and the object."""
+"""Access to the object dictionary of a drive over SDO: reading, writing and checking of objects."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ READ_ONLY: Final = 0x0601_0002
 """SDO abort code: an attempt to write a read-only object."""
 TOO_LONG: Final = 0x0607_0012
 WRONG_LENGTH: Final = (0x0607_0010, TOO_LONG, 0x0607_0013)
-"""SDO abort codes: the value's length differs from the object's, is too large, or is too small."""
+"""SDO abort codes: the value has a different length from the object, is too long, or is too short."""
 INVALID: Final = 1 << 31
 """Bit of a PDO's COB-ID that marks the PDO as not used."""
 NO_REMOTE_REQUEST: Final = 1 << 30
-"""Bit of a TPDO's COB-ID; some drives always report it, some never do."""
+"""Bit of a TPDO's COB-ID that excludes remote requests. Some drives always report this bit, others never do."""
 _BIT_FIELDS: Final = (0x1005, 0x1014, 0x60A8, 0x60A9, 0x60AA, 0x60FD, 0x60FE, 0x6502)
 
 
@@ -45,27 +45,26 @@ class RestartedError(DriveError):
 
 
 class Remote:
-    """Object dictionary of a drive over SDO; errors name the drive and the object.
+    """Object dictionary of a drive over SDO. Errors name the drive and the object.
 
-    Values that have been read are cached until they are written, since only this service configures the drive
-    meanwhile.
+    A value that has been read is cached until the object is written, since nobody else configures the drive meanwhile.
     """
 
     rehearsed = False
-    """Whether nothing is written, as in a dry run."""
+    """Whether this is a dry run, which writes no object."""
     read_only = False
-    """Whether the drive is only asked which objects may be written."""
+    """Whether even the power of the drive is unchanged, and the drive is only asked which objects may be written."""
 
     boots = False
     """Whether the client is waiting for the drive to boot."""
 
     logs = True
-    """Whether that wait is logged; the cycle does not log."""
+    """Whether this wait is logged. It is not logged in the cycle."""
 
     def __init__(self, name: str, client: Client, skipped: str = "") -> None:
         self.name = name
         self.skipped = skipped
-        """Skipped parts of the drive's EDS, for people."""
+        """Note for people about the parts of the drive's EDS that were skipped, or ""."""
         self.client = client
         self._read: dict[Key, bytes | None] = {}
         self._missing: set[Key] = set()
@@ -73,11 +72,11 @@ class Remote:
         self._described: dict[Key, tuple[int, bool]] = {}
 
     def describe(self, key: Key, size: int, *, signed: bool) -> None:
-        """Set the size [bytes] and sign of an object that no standard defines."""
+        """Set the size [bytes] of an object that no standard defines, and whether its values are signed."""
         self._described[key] = size, signed
 
     async def peek(self, index: int, subindex: int = 0) -> int | None:
-        """Return the cached or read value of an object; None if the drive lacks the object or it cannot be read."""
+        """Return the value of an object, from the cache or the drive; None if it is missing or cannot be read."""
         key = index, subindex
         if key not in self._read and key not in self._missing:
             try:
@@ -97,12 +96,12 @@ class Remote:
         return (index, subindex) not in self._missing
 
     async def read(self, index: int, subindex: int = 0) -> int:
-        """Return the present value of an object. Raises SdoRefused if it cannot be read."""
+        """Read the present value of an object from the drive. Raises SdoRefused if it cannot be read."""
         key = index, subindex
         return self._value(key, await self.content(key))
 
     async def content(self, key: Key) -> bytes:
-        """Return the present bytes of an object. Raises SdoRefused if it cannot be read."""
+        """Read the present bytes of an object from the drive. Raises SdoRefused if it cannot be read."""
         with self._as_drive_error("read", key):
             data = self._read[key] = await self.client.upload(*key)
         return self._own(key, data)
@@ -119,7 +118,7 @@ class Remote:
             await self.client.download(*key, data)
 
     async def may_be_written(self, index: int, subindex: int = 0) -> bool:
-        """Whether the drive allows an object to be written, as far as it reports that before the write."""
+        """Whether an object may be written, as far as the drive reports this before it receives a value."""
         key = index, subindex
         if key not in self._writable:
             try:
@@ -131,7 +130,7 @@ class Remote:
         return self._writable[key]
 
     async def _try_to_write(self, attempt: str, key: Key, size: int) -> None:
-        """Begin and abort a write. Raises SdoRefused if the drive does not allow the object, or a value of this size.
+        """Begin and abort a write. Raises SdoRefused if the object must not be written, or has a different size.
 
         Other refusals, such as that of a segmented transfer, are ignored.
         """
@@ -139,13 +138,13 @@ class Remote:
             with self._as_drive_error(attempt, key):
                 await self.client.try_download(*key, size)
         except SdoRefused as refusal:
-            read = len(self._read.get(key) or b"") == size  # in that case, the length is right
+            read = len(self._read.get(key) or b"") == size  # then the size is known to be right
             if refusal.code in (READ_ONLY, *NO_SUCH_OBJECT, *(() if read else WRONG_LENGTH)):
                 raise
 
     async def bits(self, index: int, subindex: int = 0) -> int:
-        """Return the length of an object [bits], as read or, failing that, according to the drive's EDS or the
-        standards.
+        """Return the length of an object [bits], as read from the drive or, if it cannot be read, as described, or
+        according to the drive's EDS or the standards.
         """
         key = index, subindex
         await self.peek(index, subindex)
@@ -166,10 +165,10 @@ class Remote:
     async def wait_until(
         self, key: Key, predicate: Callable[[int], bool], seconds: float | None = None
     ) -> tuple[int | None, float]:
-        """Read an object until `predicate` holds, for up to `seconds`, or for the time of one answer.
+        """Read an object until `predicate` is True for its value, for at most `seconds`, or the time-out of an answer.
 
-        Return the value, or None if it cannot be read, and the time waited [s]. A drive may accept a value immediately
-        and show it later.
+        This is needed because a drive may accept a value immediately and show it later. Return the value, or None if it
+        cannot be read, and the time waited [s].
         """
 
         async def read() -> int | None:
@@ -191,8 +190,9 @@ class Remote:
         return self._described[key][1] if key in self._described else signed(key)
 
     def _own(self, key: Key, data: bytes) -> bytes:
-        """Return the bytes of an answer that belong to the object according to its EDS, since some drives pad to four
-        bytes.
+        """Return the bytes of an answer without padding, according to the object's length in the EDS.
+
+        Some drives pad each value to four bytes.
         """
         variable = self.client.od.get_variable(*key)
         if len(data) > EXPEDITED or variable is None or not variable.fixed_size:
@@ -200,8 +200,8 @@ class Remote:
         return data[: len(variable) // 8]
 
     def _size(self, key: Key) -> int:
-        """Return the size of an unreadable object [bytes], as described, or according to the drive's EDS or the
-        standards.
+        """Return the size of an object that cannot be read [bytes], as described, or according to the drive's EDS or
+        the standards.
         """
         if key in self._described:
             return self._described[key][0]
@@ -248,7 +248,7 @@ def run_setups(
     doing: str,
     conversations: Sequence[Coroutine[Any, Any, T]],
 ) -> list[T | DriveError]:
-    """Run one conversation with each drive concurrently, and log the progress every second; see `run_concurrently`."""
+    """Run one conversation with each drive, all concurrently, and log the progress every second."""
     over: set[str] = set()
 
     async def followed(remote: Remote, conversation: Coroutine[Any, Any, T]) -> T:
@@ -291,7 +291,7 @@ def shown(index: int, subindex: int, value: int) -> str:  # noqa: ARG001
 
 
 def same(index: int, subindex: int, one: int, other: int) -> bool:
-    """Whether this service treats two values as equivalent."""
+    """Whether two values of an object are equivalent for this service."""
     # Bit 30 of a PDO's COB-ID, which states whether remote requests are answered, is irrelevant here.
     ignored = NO_REMOTE_REQUEST if is_pdo(index) and not index & 0x200 and subindex == 1 else 0
     return one | ignored == other | ignored

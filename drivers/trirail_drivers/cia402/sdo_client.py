@@ -16,20 +16,20 @@ from trirail_drivers.driver.conversations import Wait
 from trirail_drivers.interface import Clock
 
 MAX_SECOND_ANSWERS: Final = 10
-"""Number of requests with a second answer that prove two nodes, within one set-up."""
+"""Number of second answers within one set-up that proves that there are two nodes with the same id."""
 EXPEDITED: Final = 4
 """Maximum size of a value in an expedited transfer [bytes]."""
 ABORT_PAUSE_S: Final = 0.002
-"""Pause after an abort, in which the drive handles it [s]."""
+"""Pause after an abort, during which the drive handles the abort [s]."""
 
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)
 """Command specifiers of the client, in the top bits of the first byte."""
 _ANSWERS: Final = {_DOWNLOAD_SEGMENT: 1, _DOWNLOAD: 3, _UPLOAD: 2, _UPLOAD_SEGMENT: 0, _ABORT: 4}
-"""Command specifiers of the server's answers."""
+"""Command specifier of the server's answer to each command specifier of the client."""
 _SEGMENTS: Final = (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT)
 """Command specifiers of frames without index and subindex."""
 _IS_EXPEDITED, _HAS_SIZE, _TOGGLE, _LAST = 0x02, 0x01, 0x10, 0x01
-"""Bits of the first byte; the last two belong to segments."""
+"""Bits of the first byte. The last two bits are those of segments."""
 _TIMED_OUT: Final = 0x0504_0000
 _NOT_ALTERNATED: Final = 0x0503_0000
 _GENERAL_ABORT: Final = 0x0800_0000
@@ -37,7 +37,7 @@ _GENERAL_ABORT: Final = 0x0800_0000
 
 
 class TwoNodesError(SdoCommunicationError):
-    """Requests receive two answers."""
+    """Requests have received two answers, so two nodes have the same id."""
 
     def __init__(self, node: int) -> None:
         super().__init__(duplicate_node.warning(node, "both answer"))
@@ -52,10 +52,10 @@ class BootedError(SdoCommunicationError):
 
 
 class Client:
-    """SDO requests to one node. The client picks the answers and boot-up messages out of all received frames.
+    """SDO client of one node. Among all received frames, it recognises the node's answers and boot-up messages.
 
-    A drive may still answer an earlier request from the previous run of the service or from an aborted attempt.
-    Therefore the answer to a request must have the expected command specifier and object.
+    A drive may still answer a request of a previous run of the service or of an aborted attempt. Therefore a frame is
+    accepted as the answer to a request only if it has the expected command specifier and object.
     """
 
     def __init__(self, bus: FrameSender, node: int, objects: ObjectDictionary, timeout: float, clock: Clock) -> None:
@@ -111,11 +111,11 @@ class Client:
             toggle ^= _TOGGLE
 
     async def try_download(self, index: int, subindex: int, size: int) -> None:
-        """Begin to write `size` bytes and abort before the first one. Raises SdoAbortedError if the drive refuses.
+        """Begin to write `size` bytes, and abort before the first byte. Raises SdoAbortedError if the drive refuses.
 
-        This is a segmented download, whose first frame contains only the size (CiA 301, SDO download initiate). A drive
-        that does not answer it accepts only expedited transfers. It is not asked again, since each request would time
-        out.
+        The first frame of a segmented download contains only the size (CiA 301, SDO download initiate). A drive that
+        does not answer this frame accepts only expedited transfers. It is not asked again, since every such request
+        would time out.
         """
         if self._knows_no_segments:
             return
@@ -153,14 +153,14 @@ class Client:
         try:
             self.bus.send(Frame(canopen_frames.SDO_REQUEST + self.node, data).message())
         except (can.CanError, OSError) as error:
-            # While all drives are off, no node acknowledges frames, so the queue fills; the request then times out.
+            # While all drives are off, no node acknowledges frames, and the queue becomes full. The request times out.
             if not canerrors.queue_is_full(error):
                 raise
 
     def _is_awaited(self, message: can.Message) -> bool:
-        """Whether a frame ends the wait: the answer, a boot-up message instead of it, or one second answer too many.
+        """Whether a frame ends the wait: the answer, a boot-up message, or the last of too many second answers.
 
-        A single second answer may be a late one; MAX_SECOND_ANSWERS of them prove two servers.
+        A single second answer may be a late answer, but MAX_SECOND_ANSWERS of them prove that there are two servers.
         """
         if message.is_error_frame or message.is_remote_frame:
             return False

@@ -1,4 +1,4 @@
-"""Values that a CiA 402 drive's objects must have before the cycle runs, and accepted alternatives."""
+"""Values that the objects of a CiA 402 drive must have before the cycle runs, and the accepted alternatives."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from trirail_drivers.errors import ConfigurationRefused, DriveError
 from trirail_drivers.interface import NAMES
 
 PREFERRED_EXPONENT: Final = -3
-"""Exponent of 60C2h for milliseconds, which every drive accepts; some accept no other."""
+"""Exponent of 60C2h for milliseconds, which every drive accepts. Some drives accept no other exponent."""
 
 
 def interpolation_periods(period: float) -> list[tuple[int, int]]:
-    """Return values and powers of ten [s] for object 60C2h that equal `period`, milliseconds first.
+    """Return the pairs of a value and an exponent of ten for object 60C2h that equal `period` [s], milliseconds first.
 
-    Raises DriveError if there are none.
+    Raises DriveError if no pair equals the period.
     """
     candidates = [
         (round(period * 10**-exponent), exponent)
@@ -60,7 +60,7 @@ def heartbeat_period_ms(drives: Drives) -> int:
 
 
 async def configure_cycle_period(drive: Differences, period: float) -> None:
-    """Configure the cycle period [s] (1006h, 60C2h), and a plain SYNC (1005h, 1007h, 1019h)."""
+    """Configure the cycle period [s] (1006h, 60C2h), and a SYNC without extras (1005h, 1007h, 1019h)."""
     for key, wanted, bits in PLAIN_SYNC:
         await _configure_sync(drive, key, wanted, bits)
     await drive.ensure(0x1006, 0, round(1e6 * period))
@@ -72,7 +72,7 @@ PLAIN_SYNC: Final = (
     ((0x1007, 0), 0, 0xFFFF_FFFF),  # setpoints and positions outside this window are dropped
     ((0x1019, 0), 0, 0xFF),  # a drive that expects a counter answers a SYNC without one with EMCY 8240h
 )
-"""SYNC objects that another master may have changed: key, required value, and the relevant bits."""
+"""SYNC objects that another master may have changed; each with its key, the required value, and the relevant bits."""
 
 
 async def _configure_sync(drive: Differences, key: Key, wanted: int, bits: int) -> None:
@@ -115,7 +115,7 @@ async def _configure_interpolation(drive: Differences, periods: list[tuple[int, 
 
 
 def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
-    """Return the remedy for a drive that keeps its own interpolation time; "" if it reports none."""
+    """Return the remedy for a drive that does not accept an interpolation time; "" if it does not report its time."""
     if not value or exponent is None:
         return ""
     period = value * 10.0**exponent
@@ -125,10 +125,10 @@ def _rate_that_it_holds(value: int | None, exponent: int | None) -> str:
 async def configure_reactions(drive: Differences, drives: Drives, units: Units) -> None:
     """Configure the drive's reactions to faults: 6007h, 605Ah, 605Eh, 6065h, 6085h."""
     name = drive.remote.name
-    # 6007h = 3: a drive without its master does a quick stop; removing power (2) or a fault (1) is also accepted.
+    # 6007h = 3: a drive without its master makes a quick stop. Removing power (2) or a fault (1) is also accepted.
     await drive.ensure(0x6007, 0, 3, also=(2, 1))
     await drive.ensure(0x605A, 0, 2)  # quick stop: follow the ramp 6085h, then remove power
-    # 605Eh = 2: on its own fault, the drive follows the quick-stop ramp; another ramp (1) or coasting (0) also stops.
+    # 605Eh = 2: after a fault, the drive follows the quick-stop ramp. Another ramp (1) or coasting (0) is accepted.
     await drive.ensure(0x605E, 0, 2, also=(1, 0))
     if await drive.remote.has(0x6085):
         ramp = units.acceleration(name, "quick_stop_deceleration", drives.quick_stop_deceleration)
@@ -148,4 +148,4 @@ async def configure_homing(drive: Differences, homing: Homing, units: Units) -> 
         await drive.ensure(0x609A, 0, units.acceleration(name, "homing.acceleration", homing.acceleration))
     else:
         drive.lack((0x609A, 0), "it has no such object")
-    await drive.ensure(0x607C, 0, 0)  # makers use different signs; the drive's `offset` in [drives] is used instead
+    await drive.ensure(0x607C, 0, 0)  # manufacturers use different signs; `offset` in [drives] is used instead

@@ -23,10 +23,10 @@ from trirail_drivers.interface import NAMES, Clock
 def configure(
     bus: can.BusABC, drives: Drives, each: Sequence[SetupTask], fastest: float | None = None, *, awaits: bool = False
 ) -> tuple[tuple[SetUp, Start] | None, ...]:
-    """Set up three drives concurrently, without power; afterwards they are NMT operational.
+    """Set up three drives concurrently, without power. Afterwards the drives are in NMT operational.
 
-    `fastest` is the velocity limit of the sliders [m/s]; if given, it must fit the drives' units. With `awaits`, the
-    result of a drive that does not answer is None.
+    `fastest` is the velocity limit of the sliders [m/s]; if it is given, it must fit the drives' units. With `awaits`,
+    the result for a drive that does not answer is None.
 
     Raises ConfigurationRefused for a value that reads back differently, DriveTimeout for a drive that does not answer,
     and DriveError for other failures.
@@ -34,7 +34,7 @@ def configure(
     clock = each[0].remote.client.clock
     for drive in drives.each:
         send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, drive.node))
-    # Every check that only needs to read is made for all drives before the first value is written.
+    # All checks for which reading is enough are made for all drives before the first value is written.
     looked = run_setups(bus, clock, [one.remote for one in each], "reading", [rehearse_setup(one) for one in each])
     absent = [awaits and isinstance(end, DriveAbsentError) for end in looked]
     _accepted([end for end, away in zip(looked, absent, strict=True) if not away])
@@ -55,10 +55,7 @@ def configure(
 
 
 async def configure_one(one: SetupTask, fastest: float | None, check: Callable[[SetUp], None]) -> tuple[SetUp, Start]:
-    """Set up one drive as `configure` does.
-
-    After the dry run, `check` is called; it raises if this is the wrong drive.
-    """
+    """Set up one drive as `configure` does. After the dry run, `check` is called, which raises for a wrong drive."""
     bus, node = one.remote.client.bus, one.drive.node
     send_in_setup(bus, canopen_frames.nmt(canopen_frames.NMT_PRE_OPERATIONAL, node))
     looked = await rehearse_setup(one)
@@ -81,8 +78,9 @@ def survey(
     fastest: float | None = None,
     io: Sequence[DigitalIo] = NO_IO,
 ) -> list[SetUp | DriveError]:
-    """Read the identities of the drives and the changes of their set-up, without writing anything or changing any
-    state.
+    """Read the identity of each drive and find the values that its set-up would change.
+
+    Nothing is written, and no state of a drive is changed.
     """
     each = _drives(bus, drives, scales, period, clock, io)
     conversations = [rehearse_setup(one, read_only=True) for one in each]
@@ -98,7 +96,7 @@ def setup_tasks(
     clock: Clock,
     io: Sequence[DigitalIo] = NO_IO,
 ) -> list[SetupTask]:
-    """Return the set-up tasks of the three drives, for a cycle of `period` seconds and the drives' digital `io`.
+    """Return the set-up tasks of the three drives, given the cycle period [s] and the drives' digital I/O.
 
     Raises DriveError for settings that no drive can accept.
     """
@@ -122,8 +120,8 @@ def _drives(
 
 
 def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
-    """Raise the errors and refusals of all drives as one error; if there are none, check that the drives can share a
-    bus.
+    """Return the set-ups if all drives are accepted and can share a bus; otherwise raise the errors of all drives as
+    one.
     """
     refused = [end if isinstance(end, DriveError) else DriveError(end.refused) if end.refused else None for end in ends]
     raise_combined([error for error in refused if error is not None])
@@ -133,7 +131,7 @@ def _accepted(ends: Sequence[SetUp | DriveError]) -> list[SetUp]:
 
 
 def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
-    """Return an error if the velocity unit is unknown or does not fit; it is irrelevant if no velocity is mapped."""
+    """Return an error if a velocity is mapped whose unit is unknown or does not fit, otherwise None."""
     if made.exchange.setpoints.has_velocity:
         try:
             made.units.check_velocity(made.name, fastest)
@@ -143,7 +141,7 @@ def _velocity_refused(made: SetUp, fastest: float | None) -> DriveError | None:
 
 
 def check_identifiers(done: Sequence[SetUp]) -> None:
-    """Raise DriveError if two drives have PDOs with the same identifier, as drives with equal, fixed defaults do."""
+    """Raise DriveError if two drives have PDOs with the same identifier, such as equal defaults that are fixed."""
     owners: dict[int, str] = {}
     for made in done:
         for identifier in sorted(made.exchange.identifiers):

@@ -1,4 +1,4 @@
-"""Check that a drive shows its setpoint mode, which some drives do only with power (6061h, CiA 402-2)."""
+"""Check that a drive shows its setpoint mode (6061h, CiA 402-2). Some drives show it only when they have power."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ class ShownMode:
 
     def __init__(self, timeout: float) -> None:
         self.shown = True
-        """Whether the drive shows the setpoint mode; until then, its own position is sent to it as setpoint."""
+        """Whether the drive shows the setpoint mode. Until it does, its own position is sent to it as the setpoint."""
         self._timeout = timeout
         self._since = math.inf
         self._asked = False
 
     def is_next(self, *, alone: bool) -> bool:
-        """Whether the mode display is requested next: always if it is requested `alone`, otherwise every other time."""
+        """Whether to request the mode display next: always if nothing else is requested, otherwise every other time."""
         self._asked = alone or not self._asked
         return self._asked
 
     def waited(self, now: float, *, awaited: bool) -> float | None:
-        """Return the time for which the drive has had power without showing the mode [s] if it is too long; otherwise
-        None.
+        """Return how long the drive has had power without showing its mode [s] if that is too long, otherwise None.
+
+        `awaited` is True while the drive has power and does not show its mode.
         """
         if not awaited:
             self._since = math.inf

@@ -1,15 +1,15 @@
 """Units of velocity and acceleration of a drive, from the drive or its configuration, and their conversion to SI.
 
-Positions are in the unit of 6064h, of which there are `counts_per_metre`. A drive reports its units of position,
-velocity and acceleration in 60A8h, 60A9h and 60AAh (CiA 402-2), each as a power of ten, a numerator and a denominator
-(CiA 303-2). Alternatively, it relates velocity to position by 6096h and 6097h, the velocity and acceleration factor:
-velocity = position units per second * numerator / divisor. Kollmorgen's AKD2G states this in its manual (6096h), and
-Beckhoff's AX8000 uses it in its defaults: 600000 / 1048576 at 2^20 counts per turn is 0.0001 rpm, and 6097h =
-360 / 600000 of that makes degrees per second squared. A drive that uses the inverse contradicts a correct
-`velocity_unit`, and is refused.
+Positions are in the unit of object 6064h; there are `counts_per_metre` of this unit in a metre. A drive reports its
+units of position, velocity and acceleration in 60A8h, 60A9h and 60AAh (CiA 402-2), each as a power of ten, a numerator
+and a denominator (CiA 303-2). Alternatively, the velocity factor 6096h and the acceleration factor 6097h relate
+velocity and acceleration to position: velocity = position units per second * numerator / divisor. The manual of
+Kollmorgen's AKD2G states this for 6096h, and the defaults of Beckhoff's AX8000 agree: 600000 / 1048576 at 2^20 counts
+per turn is 0.0001 rpm, and with this unit, 6097h = 360 / 600000 results in degrees per second squared. A drive that
+uses the inverse factor contradicts a correct `velocity_unit`, and is refused.
 
-If a drive reports neither, `velocity_unit` and `acceleration_unit` are required. No unit is assumed: a velocity offset
-in the wrong unit moves metal.
+If a drive reports neither units nor factors, `velocity_unit` and `acceleration_unit` are required. No unit is assumed,
+since a velocity offset in the wrong unit would move the machine.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from trirail_drivers.errors import DriveError
 
 
 class UnitBase(StrEnum):
-    """Base quantity of a unit."""
+    """Quantity of which a unit is a multiple or a fraction."""
 
     COUNTS = "counts"
     """Unit of 6064h."""
@@ -36,26 +36,28 @@ class UnitBase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Unit of `size` counts, revolutions or metres, per second or per second squared."""
+    """Unit of position, velocity or acceleration: `size` counts, revolutions or metres, if need be per second or per
+    second squared.
+    """
 
     base: UnitBase
     size: float
     name: str
 
     def per_metre(self, counts_per_metre: float, revolutions_per_metre: float | None) -> float | None:
-        """Return the number of units per metre of slider travel; None if the revolutions per metre are needed but
-        unknown.
+        """Return the number of units in a metre of slider travel; None if the revolutions per metre are needed for this
+        but unknown.
         """
         per_metre = {UnitBase.COUNTS: counts_per_metre, UnitBase.TURNS: revolutions_per_metre, UnitBase.METRES: 1.0}
         whole = per_metre[self.base]
         return None if whole is None else whole / self.size
 
     def is_same(self, other: Unit) -> bool:
-        """Whether the other unit is the same, whatever its name."""
+        """Whether two units are equal, even if their names differ."""
         return self.base is other.base and math.isclose(self.size, other.size, rel_tol=1e-9)
 
 
-# CiA 303-2: SI units and other common units; B4h and B5h are from CiA 402, manufacturers use ACh and C0h.
+# The codes of SI units and other common units are from CiA 303-2, B4h and B5h from CiA 402. Manufacturers use ACh, C0h.
 _NUMERATORS: Final = {
     0x01: (UnitBase.METRES, 1.0, "m"),
     0xC1: (UnitBase.METRES, 0.0254, "in"),
@@ -69,7 +71,7 @@ _NUMERATORS: Final = {
     0xAC: (UnitBase.COUNTS, 1.0, "counts"),
 }
 _RPM: Final = 0xC0
-"""Numerator that Maxon uses for accelerations, revolutions per minute: its 00C00300h is rpm/s."""
+"""Numerator for revolutions per minute, which maxon uses for accelerations: 00C00300h is rpm/s."""
 _TIMES: Final = {0x03: (1.0, "s"), 0x47: (60.0, "min"), 0x48: (3600.0, "h")}
 _SECOND_SQUARED: Final = 0x57
 
@@ -87,7 +89,7 @@ def velocity_unit(code: int) -> Unit | None:
 def acceleration_unit(code: int) -> Unit | None:
     """Return the acceleration unit encoded in 60AAh; None if it is unknown.
 
-    If the numerator is a position, a denominator of seconds means seconds squared.
+    If the numerator is a unit of position, the denominator "seconds" means seconds squared.
     """
     return _decoded(code, 2)
 
@@ -127,7 +129,7 @@ _WORDS: Final = {
 }
 _WRITTEN: Final = re.compile(r"(?:(\d+(?:\.\d+)?(?:e-?\d+)?) +)?(rpm|[a-zµ]+/(?:s|min|h))((?:/(?:s|min|h))?|2)")
 FACTORS: Final = 1e-9, 1e9
-"""Bounds of the factor before a unit, far beyond those of drives and far from the limits of floats."""
+"""Bounds of the factor before a unit. All drives' factors are far within the bounds, and the bounds within floats."""
 _SECONDS: Final = {symbol: seconds for seconds, symbol in _TIMES.values()}
 
 
@@ -217,7 +219,9 @@ def _check_known(name: str, quantity: str, per_metre: float) -> None:
 
 
 def _unsigned(name: str, key: str, value: float, per_si: float, unit: str) -> int:
-    """Convert to UNSIGNED32, excluding 0 and FFFFFFFFh, which to a drive mean no window or ramp, and no supervision."""
+    """Convert a quantity to UNSIGNED32. Raises DriveError for 0, which means no window or ramp, and for FFFFFFFFh,
+    which means no supervision.
+    """
     exact = per_si * value
     if not 0.5 < exact < UINT32_MAX - 0.5:
         raise DriveError(f"drive {name}: {key} {value:g} is {exact:g} {unit}; a drive takes 1 to {UINT32_MAX - 1}")

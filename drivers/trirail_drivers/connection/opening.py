@@ -24,7 +24,7 @@ from trirail_drivers.simulated import SimulatedBus, SimulatedDevice
 from trirail_drivers.simulated.carriages import DriveMounting
 from trirail_drivers.simulated.faults import Faults
 
-# The BusError contains python-can's reason; standard error shows only that line.
+# python-can must not print its errors as well: the BusError contains the reason, and only its line is shown.
 logging.getLogger("can").addHandler(logging.NullHandler())
 
 NETWORK_INTERFACES = Path("/sys/class/net")
@@ -46,7 +46,7 @@ def open_bus(section: config.Can, drives: config.Drives, clock: Clock = time.mon
         raise BusError(f'can.interface "{section.interface}" is unknown; known are {known}')
     options: dict[str, Any] = dict(section.options)
     try:
-        # Only our configuration applies, not python-can's own files and environment variables.
+        # ignore_config: python-can's own files and environment variables must not change the configured bus.
         bus = can.Bus(
             interface=section.interface,
             channel=section.channel,
@@ -80,11 +80,12 @@ def connect(
     awaits: bool = False,
     io: Sequence[DigitalIo] = NO_IO,
 ) -> DriveGroup:
-    """Return the three drives on their bus, not yet set up, with their digital `io`; `capture` records every frame.
+    """Open the bus and return the three drives on it, which are not set up yet.
 
-    With `awaits`, a lost bus is reopened in the background of the cycle, and a missing bus is opened when it appears.
+    `io` contains the digital outputs and inputs of each drive; `capture` records every frame. If `awaits` is True, a
+    lost bus is reopened in the background of the cycle, and a missing bus is opened when it appears.
 
-    Raises DriveError if there is no bus or, with `awaits`, only if no bus can appear.
+    Raises DriveError if there is no bus or, with `awaits`, only if no bus can appear later.
     """
     protocol = PROTOCOLS[drives.protocol]
 
@@ -124,7 +125,7 @@ def simulated_drives(section: config.Can, drives: config.Drives) -> tuple[Sequen
 
 
 def _mounted(built: Sequence[config.SimulatedSlider] | None, index: int, drive: config.Drive) -> DriveMounting:
-    """Return the true axis of a simulated drive by its node id; if there is none, return the configured axis."""
+    """Return the actual axis of a simulated drive, found by its node id, or the configured axis if none is given."""
     for slider, each in enumerate(built or ()):
         if each.node == drive.node:
             return DriveMounting(slider, each.direction * each.counts_per_metre)

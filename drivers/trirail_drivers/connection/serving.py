@@ -1,7 +1,7 @@
-"""Simulated drives served to one master in another process, on a bus between processes: trirail_drivers.bus.unixbus.
+"""Simulated drives for one master in another process, connected by a bus between processes (bus.unixbus).
 
-A single system call waits for a frame or the timer. python-can is not used, since at 1 kHz seven frames pass per
-millisecond.
+A single system call waits for a frame or the timer. python-can is not used because it is too slow for the seven frames
+per millisecond of a cycle of 1 kHz.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ def serve(
 ) -> None:
     """Serve the drives of a configuration to the first client of the socket at `path`, until the client disconnects.
 
-    The path appears once it accepts connections. `ready` is called just before that, `connected` after a connection.
+    The path appears once the socket accepts connections. `ready` is called just before the path appears, `connected`
+    when the client has connected.
     """
     devices, faults = simulated_drives(section, drives)
     states = frozenset[int]().union(*(PROTOCOLS[drives.protocol].states(each.node) for each in devices))
@@ -52,11 +53,11 @@ def serve(
 
 
 class _Master:
-    """The master's end of the bus. The drives take their time from the arriving frames, so that a stall of this process
-    does not affect them.
+    """Connection to the master. The arriving frames set the time of the drives, so that a stall of this process does
+    not affect the drives.
 
-    After a stall, the waiting frames are handled with their arrival times. Of the state frames that the drives send in
-    answer, only the newest is sent, at the end: an old position would look like a current one.
+    After a stall, the waiting frames are handled with their arrival times. Of the state frames with which the drives
+    answer, only the newest is sent, at the end: otherwise the master would take an old position for a current one.
     """
 
     def __init__(self, connection: socket.socket, states: Collection[int]) -> None:
@@ -76,7 +77,7 @@ class _Master:
         return self._now
 
     def emit(self, identifier: int, data: bytes) -> None:
-        """Send a drive's frame."""
+        """Send a drive's frame; a state frame is sent only after the waiting frames of the master."""
         frame = CAN_FRAME.pack(identifier, len(data), data)
         if identifier in self._states:
             self._held[identifier] = frame

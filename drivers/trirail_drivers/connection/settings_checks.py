@@ -20,14 +20,14 @@ MAX_CLASSICAL_BITRATE = 1_000_000
 
 
 def bus_rules(section: Can) -> Iterator[Rule]:
-    """Yield checks for a bit rate beyond classical CAN, and for options that python-can does not accept."""
+    """Yield checks for a bit rate above that of classical CAN, and for options that python-can does not accept."""
     yield Rule("can.bitrate", ("can.interface",), partial(_check_bitrate, section))
     for name in section.options:
         yield Rule(f"can.options.{name}", ("can.interface",), partial(_check_option, section, name))
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield checks for settings that a drive does not have, or whose values it cannot accept or resolve."""
+    """Yield checks for settings that a drive does not have, and for values that it cannot accept or resolve."""
     yield Rule("drives.heartbeat", ("loop.rate_hz",), partial(_check_heartbeat, drives, required))
     for name, drive in zip(NAMES, drives.each, strict=True):
         for protection in drive.accept_without:

@@ -1,4 +1,4 @@
-"""State of one drive of any protocol: the SYNC that its newest position answers, its feedback, its fault."""
+"""State of one drive of any protocol: its feedback, its fault, and the SYNC that its newest position answers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trirail_drivers.interface import Counts, DriveFault
 
 
 class Answers(AxisRow):
-    """Counts of SYNCs, and of the positions that answer them.
+    """Assignment of the received positions to the SYNCs that they answer.
 
     A drive answers a SYNC within one cycle, so a position received before the next SYNC is sent answers the current
     SYNC. A position received just after a SYNC answers the current SYNC if the previous SYNC has been answered, or if
@@ -31,7 +31,7 @@ class Answers(AxisRow):
 
     @property
     def missed(self) -> int:
-        """Number of unanswered SYNCs, without the newest one while its answer is not yet due."""
+        """Number of unanswered SYNCs. The newest SYNC is not counted while its answer is not yet due."""
         return self.syncs - self.sampled - (not self.prompt)
 
     def sync_sent(self) -> None:
@@ -40,7 +40,7 @@ class Answers(AxisRow):
         self.between = False
 
     def read_over(self) -> None:
-        """Record that this cycle's frames have been read: later positions are late answers to its SYNC."""
+        """Record that this cycle's frames have been read: a position that arrives later is a late answer."""
         self.between, self.came = True, False
 
     def answer(self) -> None:
@@ -51,7 +51,7 @@ class Answers(AxisRow):
         sampled = syncs - answers_previous
         if sampled - before > 1:
             self.lost += sampled - before - 1
-        # Late means later than the drive's last answer: a drive that always answers after the read is not late.
+        # Late means later in the cycle than the answer before: a drive that always answers after the read is not late.
         if prompt and between and sampled > before:
             self.late += 1
         self.sampled = sampled
@@ -78,13 +78,13 @@ class Axis(Answers):
         self.scale = scale
         self.position = math.nan
         self.setpoints_late = self.setpoints_lost = 0
-        """Setpoints written after the next cycle was due, and setpoints that the bus refused."""
+        """Number of setpoints written after the next cycle was due, and number of setpoints that the bus refused."""
         self.left_out = False
         """Whether the drive stays without power while others are enabled."""
         self.powered_up = False
         """Whether the drive has followed setpoints since it was enabled."""
         self.event: DriveFault | None = None
-        """Fault that was reported by a single frame, as opposed to a state that persists."""
+        """First fault since the last reset that a single frame reported, unlike a fault state that persists."""
         self.restarted = self.silent = False
         """Whether the drive has restarted, or has been silent for long, since it was configured."""
         self.boots = 0
@@ -108,7 +108,7 @@ class Axis(Answers):
 
     @property
     def outputs_pending(self) -> bool:
-        """Whether the wanted outputs have not been sent yet, or differ from those sent last."""
+        """Whether the wanted outputs differ from the outputs sent last, or no outputs have been sent yet."""
         return self.has_outputs and self.outputs != self.outputs_sent
 
     @classmethod
@@ -155,9 +155,7 @@ class Axis(Answers):
         return DriveFault(self.name, cause, code, shortened(f"drive {self.name}: {text}"))
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return the fault of a drive that still has power `seconds` [s] after the command `wanted`, such as "quick
-        stop".
-        """
+        """Return a fault if the drive still has power `seconds` [s] after the command `wanted`, such as "disable"."""
         raise NotImplementedError
 
     def silence_fault(self, now: float) -> DriveFault | None:

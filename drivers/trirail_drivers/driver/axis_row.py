@@ -36,7 +36,7 @@ class AxisRow(ctypes.Structure):
     late: int
     """Number of answers that arrived one cycle later than the answer before. A constant delay is not late."""
     lost: int
-    """Number of SYNCs that were never answered, as far as later answers show."""
+    """Number of SYNCs that were never answered. A SYNC is counted once a later SYNC has been answered."""
     between: bool
     """Whether this cycle's frames have been read and the next SYNC has not been sent."""
     prompt: bool
@@ -88,7 +88,7 @@ class AxisRow(ctypes.Structure):
     velocity_per_metre: float
     """Drive units of velocity per m/s, before the division by `velocity_step`."""
     velocity_step: float
-    """Resolution of velocities, in these units."""
+    """Resolution of velocities, in drive units."""
     velocity_bytes: int
     """Size of a velocity in the setpoint frame [bytes]."""
     still: float
@@ -104,7 +104,7 @@ class AxisRow(ctypes.Structure):
     has_outputs: bool
     """Whether the drive has digital outputs."""
     maps_outputs: bool
-    """Whether the outputs have a frame of their own; otherwise an SDO carries them, which only Python sends."""
+    """Whether the outputs are sent in a separate cyclic frame; otherwise Python sends them by SDO."""
     outputs_kept: int
     """Bits of 60FEh:01 outside the mask, sent unchanged since set-up; used for a drive without a mask 60FEh:02."""
 

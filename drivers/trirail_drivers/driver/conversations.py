@@ -1,4 +1,4 @@
-"""Concurrent conversations with several nodes in one thread; each is a coroutine that awaits frames or time."""
+"""Concurrent conversations with several nodes in one thread, as coroutines that await frames or a deadline."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ LOG: Final = logging.getLogger("trirail.drives")
 PROGRESS_PERIOD: Final = 1.0
 """Period of the progress log [s]."""
 _FIRST_PAUSE, _MAX_PAUSE = 0.001, 0.02
-"""Bounds of the pause between two readings of a value [s]. Between them, the pause equals the time already waited."""
+"""Shortest and longest pause between two readings of a value [s]. Otherwise the pause equals the time already waited.
+"""
 
 MAX_QUEUED_FRAMES: Final = 8
-"""Maximum number of frames that a background conversation queues; it awaits one at a time."""
+"""Maximum number of frames that a background conversation queues. The conversation awaits one frame at a time."""
 
 T = TypeVar("T")
 
@@ -41,7 +42,7 @@ class Wait:
 def run_concurrently(
     bus: can.BusABC, clock: Clock, conversations: Sequence[Coroutine[Any, Any, T]], progress: Callable[[], str]
 ) -> list[T | DriveError]:
-    """Run conversations concurrently; return the result of each, or its DriveError.
+    """Run conversations concurrently; return the result or the DriveError of each conversation.
 
     The text from `progress` is logged every second. A BusError affects all conversations, so it is raised.
     """
@@ -94,9 +95,9 @@ class BackgroundConversation(Generic[T]):
         self._heard.append(frame)
 
     def step(self, now: float) -> T | DriveError | None:
-        """Continue if the awaited frame has arrived or its deadline has passed; return the result once there is one.
+        """Continue if the awaited frame has arrived or its deadline has passed.
 
-        `now` is the present time [s].
+        Return the result or the error if the conversation has ended, otherwise None. `now` is the present time [s].
         """
         frame = None
         if self._wait is not None:

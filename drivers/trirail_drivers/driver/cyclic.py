@@ -1,7 +1,8 @@
 """Tables of the frames that one cycle exchanges with three drives. The compiled cycle knows only these tables.
 
-A driver lends the tables while cycles only handle expected frames and send setpoints. They always hold the state of
-each drive. `Lender.reclaim` passes the frames that the compiled cycle has not handled back to the driver.
+The tables always contain the state of each drive. A driver lends them to the compiled cycle while cycles only have to
+handle expected frames and send setpoints. `Lender.reclaim` returns the frames that the compiled cycle has not handled
+to the driver.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ EXPECTED = np.dtype(
         ("data", "u1", 8),  # required values of those bits
         ("position_at", "i1"),  # offset of a 32-bit position in the data [bytes], NO_OFFSET for none
         ("status_at", "i1"),  # offset of a statusword in the data [bytes], NO_OFFSET for none
-        ("lives", "u1"),  # whether it is a sign of life
+        ("lives", "u1"),  # whether the frame is a sign of life
     ],
     align=True,
 )
-"""Frame that may arrive in any cycle and that changes only the values read from it."""
+"""Frame that may arrive in any quiet cycle. It has no effect except to update the values that are read from it."""
 
 TIMES = np.dtype(
     [
-        ("due", "<f8"),  # time at which the driver itself has another task [s]
+        ("due", "<f8"),  # time at which the driver itself has to do something else [s]
         ("beat_due", "<f8"),  # time at which the service's next periodic frames (heartbeats, requests) are due [s]
         ("beat_period", "<f8"),  # period of these frames [s]
         ("beats", "<i8"),  # number of these frames sent together
@@ -68,7 +69,7 @@ def expected_row(
 class Cyclic:
     """Tables of three drives.
 
-    They always hold the state of the drives; the frames are filled in when the tables are lent.
+    They always contain the state of the drives; the frames are filled in when the tables are lent.
     """
 
     def __init__(self, bus: BusAccess, history: int) -> None:
@@ -79,15 +80,17 @@ class Cyclic:
         self.times: NDArray[np.void] = np.zeros(1, TIMES)
         self.expected: NDArray[np.void] = np.zeros(0, EXPECTED)
         self.begin = self.beats = self.setpoints = self.outputs = PackedFrames(0)
-        """Tables of frames: those at the start of a cycle; periodic frames, sent after those; setpoints, one for each
-        drive; digital outputs, at most one for each drive, sent after the setpoints when they change.
+        """Tables of frames to send: `begin` at the start of a cycle, then the periodic frames `beats` that are due,
+        `setpoints` with one frame for each drive, and `outputs` with at most one frame for each drive, sent after the
+        setpoints if the digital outputs have changed.
         """
         self.end = self.setpoints.headers
         """Frames at the end of a cycle: the setpoints, or none if the setpoints are sent at the start of the next
         cycle.
         """
         self.history = np.full((history, 3), np.nan)
-        """Commanded positions at SYNC n in row n % history [m]; NaN if there were none."""
+        """Positions commanded at each SYNC [m], (history, 3); SYNC n is in row n % history. NaN if none was commanded.
+        """
         self.arrived = PackedFrames(MOST_FRAMES)
 
     def expect(self, rows: Sequence[tuple[Any, ...]]) -> None:
@@ -97,13 +100,13 @@ class Cyclic:
 
 @runtime_checkable
 class Lender(Protocol):
-    """DriveGroup whose cycles can be run by compiled code, using tables."""
+    """DriveGroup that lends its tables to compiled code, which then runs the cycles."""
 
     def lend(self) -> Cyclic | None:
-        """Return the tables between two cycles, or None if the next cycle needs more than the tables.
+        """Return the tables between two cycles, or None if the tables do not suffice for the next cycle.
 
-        While they are lent, the caller may only call commands such as `disable` or `quick_stop`; it then calls
-        `reclaim` before the next cycle.
+        While the tables are lent, the caller may only call commands such as `disable` or `quick_stop`. After such a
+        command, the caller must call `reclaim` before the next cycle.
         """
 
     def reclaim(self, handled: int, arrived: int, *, synced: float | None = None, error: int = 0) -> Feedback:
@@ -122,4 +125,6 @@ class Lender(Protocol):
         """
 
     def send_on(self, first: int) -> None:
-        """Send the setpoints in the tables from drive `first` on, which the bus refused, then changed outputs."""
+        """Send the setpoints in the tables again from drive `first` on, whose setpoint the bus refused, and then the
+        changed outputs.
+        """

@@ -44,8 +44,8 @@ class Driver(ABC, Generic[AnyAxis]):
         reopening: Reopening | None = None,
         io: Sequence[DigitalIo] = NO_IO,
     ) -> None:
-        """`history` is the number of sent setpoints to keep, `reopening` reopens a lost bus, and `io` is that of each
-        drive.
+        """`history` is the number of sent setpoints to keep, `reopening` reopens a lost bus, and `io` contains the
+        digital outputs and inputs of each drive.
         """
         self.bus_load = 0.0
         self._wire = Wire(bus, self._stop, reopening)
@@ -101,7 +101,7 @@ class Driver(ABC, Generic[AnyAxis]):
             return (None, None, None), str(error)
 
     def _report_absent(self, lost: str) -> None:
-        """Latch a fault with the reason `lost` why the bus is lost, or with the drives that did not answer at the
+        """Latch a fault that states why the bus is lost or, if `lost` is empty, which drives did not answer at the
         start.
         """
         if lost:
@@ -114,7 +114,7 @@ class Driver(ABC, Generic[AnyAxis]):
     def _recover(self) -> None:
         """Continue the recovery of drives.
 
-        This includes a reopened bus on trial, since some drives only answer requests.
+        It also continues while a reopened bus is on trial, since some drives send frames only in answer to requests.
         """
         if self._recovery is None:
             return
@@ -125,7 +125,7 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @property
     def path_outputs(self) -> tuple[bool, bool, bool]:
-        """Whether each drive applies its outputs together with a setpoint; otherwise its outputs cannot be switched on
+        """Whether each drive applies its digital outputs together with a setpoint; only such outputs can be switched on
         a path.
         """
         a, b, c = self._axes
@@ -138,7 +138,7 @@ class Driver(ABC, Generic[AnyAxis]):
 
     @property
     def traffic(self) -> int:
-        """Number of bits of all frames sent and received since the start, each with worst-case stuffing."""
+        """Number of bits in all frames sent and received since the start, with worst-case bit stuffing."""
         return self._wire.traffic + int(self._tables.times[0]["traffic"])
 
     @property
@@ -206,13 +206,13 @@ class Driver(ABC, Generic[AnyAxis]):
             self._wire.warn(warning)
 
     def _begin_cycle(self, now: float) -> None:
-        """Begin a cycle on the bus, even if the bus is lost or has been reopened."""
+        """Begin a cycle on the bus, and store the access to the bus in the tables, since the bus may be a new one."""
         self._wire.begin(now, stopping=self._off_deadline != math.inf)
         self._tables.bus[:] = self._wire.access
 
     @property
     def _unready(self) -> UnreadyDrives:
-        """For each drive, the reason why it cannot be reset yet; the same reason for all while the bus is lost."""
+        """For each drive, the reason why it cannot be reset yet; while the bus is lost, all drives have this reason."""
         if self._wire.down:
             lost = Unready(self._wire.down)
             return lost, lost, lost
@@ -227,7 +227,7 @@ class Driver(ABC, Generic[AnyAxis]):
         self._off_deadline, self._stop_reason = self._clock() + self._drives.stop_timeout, reason
 
     def _check_stopped(self, now: float) -> None:
-        """Latch one fault for a drive that still has power after `stop_timeout`; only its brake can stop it."""
+        """Latch a fault for the first drive that still has power after `stop_timeout`; only its brake can stop it."""
         if now < self._off_deadline:
             return
         self._off_deadline = math.inf

@@ -22,7 +22,7 @@ from trirail_drivers.errors import DriveAbsentError, DriveError, DriveTimeout
 from trirail_drivers.interface import Clock, Unready, UnreadyDrives
 
 STEP_BITS: Final = 2000
-"""Bit times between two set-up steps, counted over all drives.
+"""Number of bit times between two set-up steps, whichever drives the steps belong to.
 
 A request and its answer then use 13.5 % of a bus that the cycle fills to 75 %. A drive that is being set up sends no
 position, which frees 11 % of that bus.
@@ -80,14 +80,14 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
         self.client: SetupClient | None = None
         """Client of the current conversation."""
         self.is_next = False
-        """Whether the conversation starts as soon as the cycle's last request is answered; the cycle must send no
-        other.
+        """Whether the conversation starts as soon as the cycle's last request has been answered. Until then, the cycle
+        must not send another request.
         """
         self.refused = ""
         """Error of the last attempt."""
         self.retry_at = -math.inf
         self.boots = self.booted_at = 0
-        """Number of observed restarts, and the number of the SYNC before the newest one."""
+        """Number of restarts observed up to now, and number of the SYNC before the newest restart."""
         axis.setup_listener = self.receive
 
     @abstractmethod
@@ -102,7 +102,7 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
 
     @abstractmethod
     def may_have_power(self, *, stopping: bool) -> bool:
-        """Whether the drive has power according to its last message or, if drives are `stopping`, may have power."""
+        """Whether the drive's last message shows power, or the drive is silent while drives are `stopping`."""
 
     @property
     def settled(self) -> bool:
@@ -123,7 +123,7 @@ class ReturningDrive(ABC, Generic[AnyAxis, Setup, StartState]):
             self.conversation.receive(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
 
     def refuse(self, error: DriveError, now: float) -> None:
-        """Record why the drive cannot take part; it is configured again later."""
+        """Record why the drive cannot take part in the cycle; another attempt to configure it follows later."""
         self.refused, self.retry_at = str(error), now + RETRY_AFTER
 
     def end(self) -> None:
@@ -191,7 +191,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
         return any(each.axis is axis and (each.is_next or each.conversation is not None) for each in self._each)
 
     def step(self, now: float, *, stopping: bool) -> None:
-        """Continue with the drives whose turn it is. `stopping` means that drives may still be on their ramp."""
+        """Advance the set-up of the drives whose turn it is. `stopping`: drives may still be on their ramps."""
         for each in self._each:
             _restart_after_boot(each)
         if self.idle:
@@ -201,7 +201,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
             for each in self._each:
                 each.end()
             return
-        # Bounded, so that steps that no drive could use do not accumulate and lead to a burst.
+        # The sum is bounded: otherwise steps that no drive could use would accumulate and cause a burst.
         self._steps_due = min(self._steps_due + self._steps_per_cycle, max(1.0, self._steps_per_cycle))
         for _ in self._each:
             if self._steps_due < 1.0:
@@ -232,7 +232,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
             return
         answered = each.client.answered if each.client is not None else 0
         each.end()
-        if isinstance(end, DriveTimeout):  # it has disappeared again, or never appeared
+        if isinstance(end, DriveTimeout):  # the drive has disappeared again, or never appeared
             each.refused, each.axis.silent = "", True
             each.axis.restarted = each.axis.restarted and not isinstance(end, DriveAbsentError)
         elif isinstance(end, DriveError):
@@ -253,7 +253,7 @@ class Recovery(Generic[AnyAxis, Setup, StartState]):
 
 
 def _restart_after_boot(each: ReturningDrive[Any, Any, Any]) -> None:
-    """Start over with a drive that has booted since, and end the conversation of a configured drive."""
+    """Restart the set-up of a drive that has booted again, and end the conversation of a configured drive."""
     if each.boots != each.axis.boots:
         each.boots, each.refused, each.retry_at = each.axis.boots, "", -math.inf
         each.booted_at = each.axis.syncs

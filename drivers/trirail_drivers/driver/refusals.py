@@ -1,4 +1,4 @@
-"""Refusals of drives: for missing protections, for a replaced drive, and the combined refusal of all three drives."""
+"""Error messages for drives that are refused: because a protection is missing, or because a drive was replaced."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def review_protections(
     protections: Mapping[str, ProtectionText],
     remedy: str = "",
 ) -> tuple[str, list[str]]:
-    """Return the refusal of a drive that lacks protections, or "", and notes on those it is allowed to lack.
+    """Return the error message for a drive that lacks required protections, or "", and notes on those it may lack.
 
     `missing_protections` maps each missing protection to the reason, `accepted` is the drive's `accept_without`, and
     `remedy` is a way to set the protections.
@@ -70,7 +70,7 @@ def review_protections(
 def replacement_refusal(
     drive: str, numbers: Mapping[str, tuple[object, object]], may_differ: Collection[str], *, allowed: bool
 ) -> str:
-    """Return the refusal of a drive that differs from the previous one; "" if it is the same or an allowed replacement.
+    """Return the error message for a drive that replaces another, or "" if it is the same or a permitted replacement.
 
     `numbers` maps each part of the drive's identity to its previous and present value. If a replacement is `allowed`,
     the parts in `may_differ` may differ.
@@ -90,7 +90,7 @@ def replacement_refusal(
 
 
 def raise_combined(errors: Sequence[DriveError]) -> None:
-    """Raise the errors of all drives as one error; an error that several drives share appears once."""
+    """Raise the errors of several drives as one DriveError; an error that several drives share appears once."""
     if len(errors) == 1:
         raise errors[0]
     alike: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""State of one ODrive, taken from its messages: position, axis state, errors and faults."""
+"""State of one ODrive, as shown by its messages: position, axis state, errors and faults."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from trirail_drivers.odrive.codes import describe_errors
 RESET_TIME = 3 * 3 * cansimple.ERROR_PERIOD
 """Time after Clear_Errors during which errors do not yet count as a fault [s]: three error requests to each drive."""
 STALE_HEARTBEATS = 1
-"""Number of heartbeats after a request that may still show the previous state."""
+"""Number of heartbeats after a request for a new axis state that may still show the previous state."""
 
 
 class OdriveAxis(Axis):
-    """Newest feedback of one drive. The `on_` methods take the data of a message; they may raise struct.error."""
+    """Newest feedback of one drive. Each `on_` method handles the data of one message, and may raise struct.error."""
 
     def __init__(self, name: str, node: int, scale: Scale, drives: Drives) -> None:
         super().__init__(name, node, scale, drives)
@@ -51,7 +51,7 @@ class OdriveAxis(Axis):
         self._result: int = ProcedureResult.SUCCESS
 
     def is_steady(self, wanted: AxisState | None) -> bool:
-        """Whether the driver has nothing to send or decide as long as the drive's frames do not change."""
+        """Whether the drive needs no command and no decision as long as its frames do not change."""
         in_state = wanted is not None and self.requested is wanted and self.state == wanted and self.state_is_current
         well = self.reported and not self.errors and self.event is None and self.reset_until == -math.inf
         follows = self.powered_up or wanted is AxisState.IDLE
@@ -59,13 +59,11 @@ class OdriveAxis(Axis):
 
     @property
     def heartbeat_state(self) -> tuple[int, int]:
-        """Axis state and procedure result in the newest heartbeat, the only fields that affect decisions."""
+        """Axis state and procedure result in the newest heartbeat. Only these two fields affect decisions."""
         return self.state, self._result
 
     def expected_rows(self, number: int) -> list[tuple[Any, ...]]:
-        """Return rows of trirail_drivers.driver.cyclic.EXPECTED for the frames of drive `number` that carry no new
-        information.
-        """
+        """Return the rows of driver.cyclic.EXPECTED that describe the frames of drive `number` if nothing changes."""
 
         def identifier(command: int) -> int:
             return cansimple.identifier(self.node, command)
@@ -79,11 +77,14 @@ class OdriveAxis(Axis):
         ]
 
     def input_pos(self, position: float, velocity: float) -> bytes:
-        """Return Set_Input_Pos for a setpoint [m], [m/s]. Raises OverflowError or struct.error if it does not fit."""
+        """Return the data of Set_Input_Pos for a position [m] and a velocity [m/s].
+
+        Raises OverflowError or struct.error if a value does not fit into the message.
+        """
         return cansimple.input_pos(self.scale.exact(position), self.scale.counts_per_metre * velocity)
 
     def with_setup_listener(self, number: int, handler: Handler) -> Handler:
-        """Return a handler that also passes messages with this number to a running set-up."""
+        """Return a handler that also passes messages with this command number to a set-up that is in progress."""
         identifier = cansimple.identifier(self.node, number)
 
         def handle(data: bytearray, now: float) -> None:
@@ -97,7 +98,7 @@ class OdriveAxis(Axis):
         """Ignore the message: only a set-up needs it, and receives it through `with_setup_listener`."""
 
     def set_up(self, turns: float, errors: int, state: int) -> None:
-        """Take over the state that the drive had at the end of its set-up."""
+        """Store the state that the drive had at the end of its set-up."""
         self.position = self.scale.metres(turns)
         self.state, self.reported, self._started = state, True, True
         self.note_request(AxisState.IDLE)
@@ -114,7 +115,7 @@ class OdriveAxis(Axis):
         self.state, self.requested = AxisState.UNDEFINED, None
 
     def on_estimates(self, data: bytes | bytearray, now: float) -> None:  # noqa: ARG002
-        """Handle Get_Encoder_Estimates, which contains the position at the arrival of the request."""
+        """Handle Get_Encoder_Estimates, which contains the position at the time when the drive received the request."""
         turns, _ = cansimple.ESTIMATES.unpack(data)
         if not self.configured:  # a drive that is booting does not know its position yet
             return
@@ -152,16 +153,16 @@ class OdriveAxis(Axis):
         self._beats = 0
 
     def clear_faults(self, now: float) -> None:
-        """Forget the latched event, but not a condition that persists, and allow time for errors to be cleared."""
+        """Forget the latched event, but not a condition that persists, and give the drive time to clear its errors."""
         if self.configured:
             self.event = None
         if self.errors:
             self.reset_until = now + RESET_TIME
 
     def power(self, follows: bool) -> PowerState:
-        """Return the power state in terms of CiA 402.
+        """Return the state of CiA 402 that corresponds to the axis state and the errors.
 
-        `follows` means that the drive should follow setpoints and is not stopping.
+        `follows` is True if the drive should follow setpoints and is not stopping.
         """
         match self.state:
             case AxisState.UNDEFINED:
@@ -181,7 +182,7 @@ class OdriveAxis(Axis):
         return self.state not in (AxisState.UNDEFINED, AxisState.IDLE)
 
     def find_fault(self, now: float, follows: bool) -> DriveFault | None:
-        """Return the drive's fault at time `now` [s]. `follows` means that the drive should follow setpoints."""
+        """Return the drive's fault at time `now` [s], or None. `follows`: the drive should follow setpoints."""
         if self.event is not None:
             return self.event
         if self.errors and now >= self.reset_until:
@@ -197,10 +198,7 @@ class OdriveAxis(Axis):
         return None
 
     def stop_overdue_fault(self, wanted: str, seconds: float) -> DriveFault | None:
-        """Return the fault of a drive that still has power `seconds` [s] after a command.
-
-        `wanted` names the command, such as "quick stop".
-        """
+        """Return a fault if the drive still has power `seconds` [s] after the command `wanted`, such as "disable"."""
         if not self.powered:
             return None
         text = f"is in {cansimple.state_name(self.state)} {seconds:g} s after {wanted}; expected idle"
@@ -215,12 +213,12 @@ class OdriveAxis(Axis):
         self.errors = errors
         if not errors:
             self.reset_until = -math.inf
-        # A drive that has started reports INITIALIZING or an undefined state only after another boot.
+        # A drive that has finished booting reports INITIALIZING or an undefined state only if it boots again.
         if self._started and cansimple.is_starting(self.state, errors):
             self._note_restart()
 
     def _note_restart(self) -> None:
-        """Record that the drive is booting: it may be a different drive, or have lost its settings and its position."""
+        """Record that the drive is booting. It may be a different drive, or may have lost its settings or position."""
         self._started, self.state = False, AxisState.UNDEFINED
         self.restarted, self.boots = True, self.boots + 1
         # This replaces an earlier event, which the restart explains.

@@ -1,4 +1,4 @@
-"""ODrive's CANSimple messages as bytes: identifiers, layouts, states, errors, bus traffic.
+"""ODrive's CANSimple messages as bytes: their identifiers, layouts, states and errors, and the bus traffic.
 
 The layouts are those of firmware 0.6, from the ODrive manual, chapter "CAN Protocol": values are little-endian, floats
 have 32 bits, and positions are in turns of the encoder that the axis uses for its load.
@@ -34,7 +34,7 @@ BEAT: Final = Struct("<IBBBx")
 ERRORS: Final = Struct("<II")
 """Get_Error: active errors, disarm reason."""
 SERIAL_AT: Final = slice(1, 7)
-"""Address: node id, serial number of 48 bits; in newer firmware, a connection id follows."""
+"""Bytes of the serial number in Address: node id, serial number of 48 bits and, in newer firmware, connection id."""
 SDO: Final = Struct("<BHB")
 """RxSdo: opcode, endpoint, reserved; TxSdo: reserved, endpoint, reserved.
 
@@ -50,8 +50,8 @@ TYPES: Final = {
     "uint32": Struct("<I"), "int32": Struct("<i"),
     "float": Struct("<f"),
 }  # fmt: skip
-"""Types of endpoints by their names in flat_endpoints.json, without the eight-byte types, which do not fit in a
-message.
+"""Types of endpoints by their names in flat_endpoints.json. Eight-byte types are omitted, since their values do not fit
+into a message.
 """
 AXIS_STATE: Final = Struct("<I4x")
 """Set_Axis_State: requested state."""
@@ -65,7 +65,7 @@ CLEAR: Final = Struct("<B")
 """Clear_Errors: whether to blink for identification."""
 
 VELOCITY_SCALE: Final = 1000
-"""Default of the drive's input_vel_scale: velocity feed-forward units per turn per second."""
+"""Default of the drive's input_vel_scale: number of units of the velocity feed-forward in 1 turn/s."""
 VELOCITY_STEP: Final = 1.0 / VELOCITY_SCALE
 """Unit of the velocity feed-forward [turns/s]."""
 MAX_FEED_FORWARD: Final = 32767 * VELOCITY_STEP
@@ -73,17 +73,17 @@ MAX_FEED_FORWARD: Final = 32767 * VELOCITY_STEP
 
 POSITION_CONTROL: Final = 3
 PASSTHROUGH: Final = 1
-"""Input mode in which the drive follows a setpoint from its arrival on, without its own filter or profile."""
+"""Input mode in which the drive follows each setpoint as soon as it arrives, without a filter or profile."""
 
 NODES: Final = range(63)
-"""Valid node ids of six bits. 3Fh is excluded: it addresses all drives together, or a drive that has no id yet."""
+"""Valid node ids, which have six bits. 3Fh is excluded, since it addresses all drives, or a drive without an id."""
 
 ERROR_PERIOD: Final = 0.01
-"""Interval at which the errors of one of the three drives are requested, in turn [s]."""
+"""Interval between two error requests [s]. The three drives are asked in turn."""
 
 
 class AxisState(IntEnum):
-    """States of an ODrive axis that this driver distinguishes; all others are procedures of the drive itself."""
+    """States of an ODrive axis that this driver distinguishes. All other states are procedures of the drive itself."""
 
     UNDEFINED = 0
     IDLE = 1
@@ -162,21 +162,22 @@ def identifier(node: int, command: int) -> int:
 
 
 def command(node: int, number: int, data: bytes) -> Frame:
-    """Return a message to one node."""
+    """Return a message with the command `number` to one node."""
     return Frame(identifier(node, number), data)
 
 
 def request(node: int, number: int) -> Frame:
-    """Return a remote frame that makes the node send the message of that number.
+    """Return a remote frame that makes the node send the message with the command `number`.
 
-    ODrives also accept an empty data frame as a request. However, that frame would collide, bit by bit, with the
-    message if the drive sends it by itself at the same moment. A remote frame gives way to it (ISO 11898-1).
+    ODrives also accept an empty data frame as a request. However, if the drive sent the message by itself at the same
+    moment, the empty frame and the message would collide, bit by bit. A remote frame gives way to the message (ISO
+    11898-1).
     """
     return Frame(identifier(node, number), remote=True)
 
 
 def input_pos(position: float, velocity: float) -> bytes:
-    """Return Set_Input_Pos for a position [turns] and velocity [turns/s].
+    """Return the data of Set_Input_Pos for a position [turns] and a velocity [turns/s].
 
     Raises OverflowError or struct.error if a value is out of range.
     """
@@ -190,7 +191,7 @@ def serial_number(address: bytes) -> int | None:
 
 
 def is_starting(state: int, errors: int) -> bool:
-    """Whether an axis state, or error bits, show that the drive is booting."""
+    """Whether an axis state or error bits show that the drive is booting."""
     return state == AxisState.UNDEFINED or bool(errors & Error.INITIALIZING)
 
 
@@ -212,7 +213,7 @@ def error_names(errors: int) -> str:
 
 
 def _background(heartbeat: float) -> float:
-    """Return the bits per second of error requests, their answers, and three heartbeats with this period [s]."""
+    """Return the bits per second of the error requests, their answers, and three heartbeats with a given period [s]."""
     return (frame_bits(0) + frame_bits(ERRORS.size)) / ERROR_PERIOD + 3 * frame_bits(BEAT.size) / heartbeat
 
 
@@ -223,6 +224,6 @@ TRAFFIC: Final = Traffic(
 )
 """Traffic of one cycle: three setpoints, three requests, three encoder estimates.
 
-In one cycle, the service sends at most those setpoints and requests, a mode and a state for each drive, and an error
-request.
+In one cycle, the service sends at most three setpoints, three requests, a mode and a state for each drive, and one
+error request.
 """

@@ -26,7 +26,7 @@ _CANOPEN_ONLY: Final = {
 
 
 def rules(drives: Drives, required: Requirements) -> Iterator[Rule]:
-    """Yield checks for settings that an ODrive does not have, or whose values it cannot accept or resolve."""
+    """Yield checks for settings that an ODrive does not have, and for values that it cannot accept or resolve."""
     for name, drive in zip(NAMES, drives.each, strict=True):
         for key in _CANOPEN_ONLY:
             yield Rule(f"drives.{name}.{key}", (), partial(_check_canopen_only, name, drive, key))
@@ -59,9 +59,9 @@ def _offset_remedy(widest: float) -> str:
 
 
 def _check_feed_forward(name: str, drive: Drive, velocity: float) -> None:
-    """Check that the velocity fits into CANSimple's 16-bit feed-forward.
+    """Check that the velocity limit fits into CANSimple's 16-bit velocity feed-forward.
 
-    Without feed-forward, an ODrive lags behind by more than its window.
+    Without feed-forward, the lag of an ODrive behind its setpoint exceeds its following error window.
     """
     turns = velocity * drive.counts_per_metre
     if turns > MAX_FEED_FORWARD:

@@ -1,4 +1,4 @@
-"""Request client of one ODrive; it sends one request at a time and awaits its answer."""
+"""Client of one ODrive, which sends one request at a time and awaits the answer."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from trirail_drivers.interface import Clock
 from trirail_drivers.odrive import cansimple
 
 ATTEMPTS: Final = 3
-"""Number of attempts of a request within `sdo_timeout`, since a frame may be lost."""
+"""Number of times that a request is sent within `sdo_timeout`, since a frame may be lost."""
 
 
 class OdriveClient:
-    """Requests to one drive. The client picks the answers out of all received frames."""
+    """Client of one drive. Among all received frames, it recognises the answers to its requests."""
 
     def __init__(self, bus: FrameSender, name: str, node: int, timeout: float, clock: Clock) -> None:
         self.name = name
@@ -50,7 +50,7 @@ class OdriveClient:
         return await self._request(cansimple.request(self._node, number), number, lambda _: True)
 
     async def read_setting(self, endpoint: int, path: str) -> bytes:
-        """Return the bytes of the setting `path`, which has this endpoint number.
+        """Read the bytes of the setting `path`, given its endpoint number.
 
         Raises the same errors as `request`.
         """
@@ -58,14 +58,14 @@ class OdriveClient:
         data = await self._request(
             cansimple.command(self._node, cansimple.RX_SDO, question),
             cansimple.TX_SDO,
-            lambda data: data[1:3] == question[1:3],  # its endpoint: a late answer to an earlier request has another
+            lambda data: data[1:3] == question[1:3],  # the endpoint; a late answer has another one
         )
         if data is None:
             raise self._timeout_error(f"RxSdo of {path}")
         return data[cansimple.SDO.size :]
 
     async def heartbeat(self, deadline: float) -> bytes | None:
-        """Return the data of a heartbeat not returned yet, or None if none arrives before `deadline` [s]."""
+        """Return the data of a new heartbeat, or None if no heartbeat arrives before `deadline` [s]."""
         if self._beat is None:
             await self._receive(cansimple.HEARTBEAT, deadline, lambda _: True)
         beat, self._beat = self._beat, None

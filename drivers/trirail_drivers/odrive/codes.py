@@ -41,7 +41,7 @@ _WORDS: Final = {
 
 
 def describe_errors(errors: int) -> str:
-    """Describe error bits [0, FFFFFFFFh]: a hexadecimal number with the names, meanings and remedies."""
+    """Describe error bits [0, FFFFFFFFh]: the hexadecimal number, and the name, meaning and remedy of each error."""
     known = [error for error in Error if errors & error]
     unknown = errors & ~sum(Error)
     names = [f"{error.name} ({_WORDS[error][0]})" for error in known]

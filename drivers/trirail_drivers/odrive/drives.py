@@ -1,12 +1,13 @@
-"""Three ODrives on CANSimple in position control: trirail_drivers.interface.DriveGroup.
+"""Driver of three ODrives on CANSimple in position control: interface.DriveGroup.
 
-CANSimple has no SYNC. `sync`, at the beginning of the cycle, takes its place: it sends the setpoints of the previous
-cycle, one after the other, and then requests the positions. A setpoint takes effect at the same moment of the cycle as
-with CiA 402, but drive B receives it one frame and drive C two frames after drive A: 0.14 and 0.27 ms at 1 Mbit/s, in
-every cycle. At 0.1 m/s, sliders that should move together are then up to 27 µm apart.
+CANSimple has no SYNC. Instead, `sync` sends the setpoints of the previous cycle, one after the other, at the beginning
+of the cycle, and then requests the positions. A setpoint thus takes effect at the same moment of the cycle as with CiA
+402. However, drive B receives its setpoint one frame later than drive A, and drive C two frames later: 0.14 and 0.27 ms
+at 1 Mbit/s, in every cycle. At 0.1 m/s, sliders that should move together are then up to 27 µm apart.
 
-Positions are requested instead of pushed by the drives (`encoder_msg_rate_ms`). The drives would push them at the pace
-of their own clocks, so that some cycles would get none or two, and their age would be unknown.
+The driver requests the positions; the drives do not send them cyclically (`encoder_msg_rate_ms`). Otherwise each drive
+would send positions at the rate of its own clock, some cycles would receive no position or two, and the age of the
+positions would be unknown.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ from trirail_drivers.odrive.setup import OdriveStart
 class Odrive(Driver[OdriveAxis]):
     """Three ODrives on one CAN bus.
 
-    An ODrive has no quick stop of its own. Both Estop and the idle state let the motor coast. Velocity control with a
-    ramp would require a mode change under power, which ODrive advises against, and a ramp that CANSimple cannot set
-    (`vel_ramp_rate`, 1 turn/s² by default). Therefore the driver ramps the setpoints down with
-    `quick_stop_deceleration`, holds until the servos have settled, and then removes power. If the host dies during the
-    ramp, the drives' watchdogs disarm the drives. An ODrive has no following error window either, so the driver
-    monitors `following_error`.
+    An ODrive has no quick stop: with both Estop and the idle state, the motor coasts. Velocity control with a ramp
+    would require a change of mode under power, which ODrive advises against, and a ramp that CANSimple cannot set
+    (`vel_ramp_rate`, 1 turn/s² by default). Therefore the driver generates the ramp: it slows the setpoints down with
+    `quick_stop_deceleration`, waits until the servos have settled, and then removes power. If the host fails during
+    the ramp, the watchdogs of the drives disarm the drives. An ODrive has no following error window either, so the
+    driver monitors `following_error`.
     """
 
     def __init__(
@@ -79,14 +80,14 @@ class Odrive(Driver[OdriveAxis]):
         self._table_writer = CycleTableWriter(self._tables, self._axes, self._error_requests, self._requests)
 
     def configure(self, period: float, fastest: float | None = None, *, awaits: bool = False) -> None:  # noqa: ARG002
-        """Find the drives, and leave them without power, ready for a cycle of `period` seconds. `fastest` is not used.
+        """Check the drives and prepare them, without power, for a cycle of `period` seconds. `fastest` is not used.
 
-        With `awaits`, drives that do not answer latch a fault and are checked when they appear; a missing bus latches
-        a fault and is opened when it appears.
+        With `awaits`, a drive that does not answer causes a fault and is checked when it appears, and a missing bus
+        causes a fault and is opened when it appears.
 
-        Raises BusError if the cycle does not fit on the bus, DriveTimeout for a missing drive, and DriveError for a
-        drive that lacks a protection which its configuration does not waive. A drive with errors does not raise: the
-        feedback reports the errors and `reset` clears them.
+        Raises BusError if the cycle's frames do not fit on the bus, DriveTimeout if a drive is missing, and DriveError
+        if a drive lacks a protection that `accept_without` does not list. A drive that reports errors causes no
+        exception: the feedback reports the errors, and `reset` clears them.
         """
         self._set_period(period, cansimple.TRAFFIC)
         self._setpoints.period = period
@@ -122,7 +123,7 @@ class Odrive(Driver[OdriveAxis]):
         now = self._synced = self._clock()
         self._begin_cycle(now)
         if self._errors_due is None:
-            # Time-outs start with the first cycle, no matter how long ago the set-up was.
+            # Time-outs count from the first cycle, however long ago the set-up was.
             self._errors_due = now
             for axis in self._axes:
                 axis.heard = now
@@ -175,7 +176,7 @@ class Odrive(Driver[OdriveAxis]):
         )
 
     def write(self, position: Triple, velocity: Triple) -> None:
-        """Store setpoints [m] and velocity feed-forward [m/s]; the next `sync` sends them to enabled drives.
+        """Store setpoints [m] and velocity feed-forward [m/s], which the next `sync` sends to enabled drives.
 
         Setpoints that are not finite or do not fit into a message latch a fault with cause "setpoint" instead.
         Setpoints are ignored during a quick stop.
@@ -192,7 +193,7 @@ class Odrive(Driver[OdriveAxis]):
                 axis.setpoints_late += 1
 
     def lend(self) -> Cyclic | None:
-        """Return the tables of a cycle, or None unless all drives are in their target states and nothing is pending."""
+        """Return the tables if all drives are in their target states and nothing is pending, otherwise None."""
         due, sender = self._errors_due, self._setpoints
         if due is None or not self._wire.is_healthy or sender.stopping:
             return None
@@ -218,12 +219,12 @@ class Odrive(Driver[OdriveAxis]):
         return feedback
 
     def send_on(self, first: int) -> None:
-        """Do nothing, since setpoints are sent by the next `sync`."""
+        """Do nothing, since the next `sync` sends the setpoints."""
 
     def enable(self, alone: str | None = None) -> None:
-        """Begin to power up all drives, or only the drive `alone`, after the setpoints of the next `sync`.
+        """Begin to power up all drives, or only the drive `alone`, after the next `sync` has sent setpoints.
 
-        This does nothing while a fault is latched. The states in the feedback follow the heartbeats of the drives.
+        This does nothing while a fault is latched. The states in the feedback are those of the drives' heartbeats.
         """
         if self._wire.fault is not None or self._enabled:
             return
@@ -270,7 +271,7 @@ class Odrive(Driver[OdriveAxis]):
     def reset(self) -> None:
         """Clear the latched fault and the errors of the drives, without powering up.
 
-        Conditions that persist latch again.
+        A condition that persists latches a fault again.
         """
         self._wire.reset()
         now = self._clock()
@@ -302,12 +303,12 @@ class Odrive(Driver[OdriveAxis]):
         self._setpoints.abandon()
 
     def _find_fault(self, now: float) -> DriveFault | None:
-        """Return the first fault of a drive, including a following error outside its window."""
+        """Return the first fault of a drive, or None. A following error outside its window is also a fault."""
         for number, axis in enumerate(self._axes):
             fault = axis.find_fault(now, self._enabled and not axis.left_out)
             if fault is not None:
                 return fault
-            # The position is compared with the setpoint of its own SYNC: the newest would add the motion since then.
+            # The position is compared with the setpoint at the same SYNC, since the newest setpoint is further ahead.
             history = self._tables.history
             due = float(history[(axis.syncs - min(axis.age, len(history) - 1)) % len(history), number])
             if math.isnan(due) or not (self._enabled and axis.powered_up):
@@ -338,7 +339,7 @@ class Odrive(Driver[OdriveAxis]):
                 axis.note_request(wanted)
 
     def _target_state(self, axis: OdriveAxis) -> AxisState | None:
-        """Return the state in which a drive should be now; None leaves the drive in its present state."""
+        """Return the state in which a drive should be now, or None if its present state should not change."""
         if self._enabled and axis.left_out:
             return AxisState.IDLE
         if not self._enabled:

@@ -1,8 +1,8 @@
 """Endpoint numbers of an ODrive's settings, by firmware, from the manufacturer's flat_endpoints.json.
 
-The numbers change with every firmware and hardware version. endpoints.json beside this module contains the numbers that
-are used here, for known firmware versions; for any other version, `endpoints` in the configuration names the drive's
-file. A wrong number reads or writes a different setting without any error, so the versions must match.
+The numbers change with every firmware and hardware version. For known firmware versions, endpoints.json in this folder
+contains the numbers that are used here. For any other version, `endpoints` in the configuration names the drive's file.
+With a wrong number, a different setting would be read or written without any error, so the versions must match.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ class Endpoint(Struct, frozen=True):
 
 
 class Table(Struct, frozen=True):
-    """The part of a flat_endpoints.json that is used here."""
+    """Content of a flat_endpoints.json, as far as it is used here."""
 
     fw_version: str
     hw_version: str
     endpoints: dict[str, Endpoint]
 
     def matches(self, version: Version) -> bool:
-        """Whether the table is for a drive of this version, compared as in the manufacturer's own examples."""
+        """Whether the table is valid for a drive of this version, compared as in the manufacturer's own examples."""
         same = self.fw_version.partition("-")[0] == _dotted(version.firmware)
         return same and self.hw_version == _dotted(version.hardware)
 
@@ -77,7 +77,7 @@ KNOWN_TABLES: Final[tuple[Table, ...]] = msgspec.json.decode(
     Path(__file__).with_name("endpoints.json").read_bytes(), type=_KnownTables
 ).tables
 """Tables of the known firmware versions."""
-_DECODER.decode(b'{"fw_version": "", "hw_version": "", "endpoints": {}}')  # loaded before any thread exists
+_DECODER.decode(b'{"fw_version": "", "hw_version": "", "endpoints": {}}')  # loads it before any thread exists
 
 
 def read(name: str, path: Path) -> Table:

@@ -18,7 +18,7 @@ from trirail_drivers.odrive.axis import OdriveAxis
 
 
 class CycleTableWriter:
-    """Writer of the tables of three drives."""
+    """Writer that fills the tables of three drives."""
 
     def __init__(
         self, tables: Cyclic, axes: Sequence[OdriveAxis], errors: Sequence[Frame], requests: Sequence[Frame]
@@ -33,12 +33,12 @@ class CycleTableWriter:
         tables.beats, tables.setpoints = packed_frames(errors), self._all.part(0, len(setpoints))
         self._data = [frame[DATA_AT:].data for frame in tables.setpoints.frames]
         self._expected: list[tuple[int, int]] = []
-        """Axis states and procedure results that the tables expect."""
+        """Axis state and procedure result of each drive for which the expected frames were last written."""
 
     def fill(self, *, follow: bool, within: float) -> None:
         """Fill the tables for the next cycle.
 
-        If `follow`, drives follow setpoints with an error of at most `within` [m].
+        `follow` is True if the drives follow setpoints; the following error may then be at most `within` [m].
         """
         self._tables.begin = self._all if follow else self._requests
         for axis, data in zip(self._axes, self._data, strict=True):

@@ -20,7 +20,7 @@ CYCLIC: Final = tuple(
 )
 POSITION_STATUS: Final = "axis0.pos_vel_mapper.status"
 RELATIVE_MODE: Final = 9
-"""Value of POSITION_STATUS if positions are counted from the place at which the drive was switched on."""
+"""Value of POSITION_STATUS if positions are relative to the place where the drive was switched on."""
 RELATIVE: Final = (
     f"{POSITION_STATUS} is {RELATIVE_MODE}, relative: its position is lost with its supply; use an absolute encoder, "
     "or home it by odrivetool before each start of the service"
@@ -30,14 +30,14 @@ SETTINGS: Final = (WATCHDOG, WATCHDOG_TIMEOUT, SCALE, HEARTBEAT, *CYCLIC, POSITI
 REQUIRED: Final = frozenset((WATCHDOG, WATCHDOG_TIMEOUT, HEARTBEAT))
 """Settings that exist in every firmware since 0.6.
 
-Early versions lack some of the others, which are then off or default.
+Early versions lack some of the other settings. A missing setting is then off or has its default value.
 """
 MIN_WATCHDOG_CYCLES: Final = 3
-"""Minimum watchdog time-out [cycles]; a shorter one disarms the drive when a single cycle is late."""
+"""Minimum watchdog time-out [cycles]. A shorter time-out would disarm the drive if a single cycle is late."""
 _FLOAT32_TOLERANCE: Final = 1e-6
 """Relative error of times, which are 32-bit floats."""
 Settings = Mapping[str, float]
-"""Settings of a drive by path, in drive units; 1 is true."""
+"""Settings of a drive by path, in drive units; 1 represents True."""
 
 
 class Protection(NamedTuple):
@@ -64,7 +64,7 @@ def describe_protection(protection: str) -> str:
 
 
 def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, str]:
-    """Return the protections that a drive lacks, each with the reason. `settings` is None for unknown firmware."""
+    """Return the reason for each protection that a drive lacks. `settings` is None if its firmware is unknown."""
     if settings is None:
         return {"endpoints": "its firmware is unknown; set endpoints to its flat_endpoints.json"}
     reasons = {}
@@ -87,9 +87,9 @@ def missing_protections(settings: Settings | None, drives: Drives) -> dict[str, 
 
 
 def is_relative(settings: Settings | None) -> bool:
-    """Whether a drive reports that it loses its position with its supply.
+    """Whether a drive reports that it loses its position when it loses its supply.
 
-    Without a report, it is assumed to keep it.
+    A drive that reports nothing is assumed to keep its position.
     """
     return settings is not None and settings.get(POSITION_STATUS) == RELATIVE_MODE
 

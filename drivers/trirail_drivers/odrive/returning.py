@@ -1,4 +1,4 @@
-"""Check of a returning ODrive in the background; see trirail_drivers.driver.recovery."""
+"""Check of an ODrive that has restarted or reappeared; see trirail_drivers.driver.recovery."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from trirail_drivers.odrive.setup import OdriveIdentity, OdriveSetup, OdriveSetu
 
 
 class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
-    """One ODrive; `setup.configure_one` sets it up."""
+    """ODrive that may have to be set up again, by `setup.configure_one`."""
 
     work, counted = "checking its settings", "answers"
 
@@ -35,19 +35,19 @@ class ReturningOdrive(ReturningDrive[OdriveAxis, OdriveSetup, OdriveStart]):
         return configure_one(one._replace(client=client), self._check), client
 
     def accept(self, made: OdriveSetup, begun: OdriveStart) -> str:
-        """Let the drive take part in the cycle; a drive with a relative position is marked as not homed."""
+        """Let the drive take part in the cycle. A drive with a relative position counts as not homed."""
         self._configured(begun)
         self.axis.homed = not made.relative
         return ""
 
     def may_have_power(self, *, stopping: bool) -> bool:
-        """Whether the drive's heartbeat shows power; while drives are stopping, a silent drive may have power too."""
+        """Whether the drive's heartbeat shows power, or the drive is silent while drives are `stopping`."""
         if self.axis.silent:
             return stopping
         return self.axis.powered
 
     def _check(self, identity: OdriveIdentity) -> None:
-        """Raise DriveError if the drive is not the same as before."""
+        """Raise DriveError if the drive is neither the previous drive nor a permitted replacement."""
         if self.setup is None:
             return
         before = self.setup.identity

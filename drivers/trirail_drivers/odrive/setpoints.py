@@ -14,15 +14,15 @@ from trirail_drivers.odrive import cansimple
 from trirail_drivers.odrive.axis import OdriveAxis
 
 SETTLE_TIME_S: Final = 0.05
-"""Time for which a drive holds its position at the end of a quick stop, before power is removed, so that its servo
-catches up.
+"""Time at the end of a quick stop during which the setpoints are constant, before power is removed [s]. The servos need
+this time to reach their setpoints.
 """
 
 
 class SetpointSender:
-    """Sender of the written setpoints.
+    """Sender of the written setpoints, and of the ramp of a quick stop.
 
-    The axes store the written setpoints, those sent last, and the positions in force.
+    Each axis stores the setpoint written last, the setpoint sent last, and the position that the bus accepted last.
     """
 
     def __init__(self, axes: Sequence[OdriveAxis], wire: Wire, deceleration: float) -> None:
@@ -33,7 +33,7 @@ class SetpointSender:
         self._wire = wire
         self._deceleration = deceleration
         self._standstill_time: float | None = None
-        """Time for which the setpoints of a quick stop have been at rest [s]; None if no quick stop is in progress."""
+        """Time since the ramp of a quick stop came to rest [s]; None if no quick stop is in progress."""
 
     @property
     def stopping(self) -> bool:
@@ -75,18 +75,18 @@ class SetpointSender:
         """
         if self._standstill_time is not None:
             self._brake()
-        # Nothing is sent once disabled: a drive that missed the command must stay where the ramp ended.
+        # Disabled drives are sent no setpoints: a drive that missed the command must stay where the ramp ended.
         if self.written and (enabled or self.stopping):
             self._send([(axis.wanted, axis.wanted_rate) for axis in self._axes], sent)
             return len(self._axes)
         return 0
 
     def stop(self) -> None:
-        """Begin the ramp now, if the drives have received setpoints."""
+        """Begin the ramp of a quick stop now, if the drives have received setpoints."""
         if not self.sent:
             return
         self._standstill_time = 0.0
-        # The position in force does not change; the velocity feed-forward decreases from now on.
+        # The position setpoint does not change yet; the velocity feed-forward decreases from now on.
         self._send([(axis.in_force, self._braked_setpoint(axis)[1]) for axis in self._axes])
         for axis in self._axes:
             axis.wanted = math.nan
@@ -96,7 +96,7 @@ class SetpointSender:
         self._standstill_time = None
 
     def _send(self, setpoints: Sequence[tuple[float, float]], sent: int = 0) -> None:
-        """Send setpoints, which take effect on arrival, except the first `sent`, which are already on the bus."""
+        """Send setpoints except the first `sent`, which are already on the bus. Each takes effect when it arrives."""
         for axis, (metres, rate) in zip(self._axes, setpoints, strict=True):
             axis.sent, axis.sent_rate = metres, rate
             if math.isnan(axis.in_force):
@@ -112,10 +112,10 @@ class SetpointSender:
                 return  # a failed send has begun a quick stop, whose setpoints are newer
 
     def _brake(self) -> None:
-        """Advance the ramp by one period. When it ends, end the quick stop, which removes power.
+        """Advance the ramp by one period. When the ramp has ended, end the quick stop, after which power is removed.
 
-        While the bus accepts no setpoint, the ramp loses velocity but keeps its position: a drive without setpoints
-        soon stops, and must not catch up with the ramp when the bus works again.
+        While the bus accepts no setpoints, the velocity of the ramp decreases but its position does not change. A drive
+        without setpoints soon stops, and must not catch up with the ramp when the bus works again.
         """
         if not self.sent or self._standstill_time is None:
             return
@@ -129,7 +129,7 @@ class SetpointSender:
             self._standstill_time = None
 
     def _braked_setpoint(self, axis: OdriveAxis) -> tuple[float, float]:
-        """Return the ramp's next setpoint, one period after the position in force, from the velocity sent last."""
+        """Return the ramp's next setpoint, one period after the position that the bus accepted last."""
         return brake(axis.in_force, axis.sent_rate, self._deceleration, self.period)
 
 
@@ -138,4 +138,4 @@ def _is_sendable(axis: OdriveAxis, metres: float, rate: float) -> bool:
         axis.input_pos(metres, rate)
     except (ValueError, OverflowError, struct.error):
         return False
-    return math.isfinite(metres)  # NaN is packed like any other float
+    return math.isfinite(metres)  # NaN causes no error when it is packed

@@ -1,4 +1,4 @@
-"""Reading of an ODrive's settings by RxSdo and TxSdo, with one request in flight."""
+"""Reading of an ODrive's settings by RxSdo and TxSdo, one request at a time."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from trirail_drivers.odrive.protections import REQUIRED, SETTINGS, Settings
 
 
 async def read(client: OdriveClient, version: Version, own: str | None) -> Settings | None:
-    """Return those settings that the drive's firmware has; None for unknown firmware.
+    """Read the settings in SETTINGS that the drive's firmware has. Return None for unknown firmware.
 
-    `own` is the file named in the configuration. Raises DriveError; DriveTimeout if the drive does not answer.
+    `own` is the file named in the configuration. Raises DriveError, or DriveTimeout if the drive does not answer.
     """
     table = flat_endpoints.endpoints_of(client.name, version, own)
     if table is None:

@@ -1,15 +1,15 @@
-"""Set-up of ODrives before or during the cycle: find them, remove their power, check their settings.
+"""Set-up of ODrives before or during the cycle: find the drives, remove their power, and check their settings.
 
-The set-up writes no settings. The following must have been set with ODrive's own tools, and saved:
+The set-up writes no settings. The following settings must have been made with ODrive's own tools, and saved:
 
 - `axis0.config.can.node_id`; `heartbeat_msg_rate_ms` as in [drives]; `encoder_msg_rate_ms = 0` and the other cyclic
-  messages off, since the driver requests what it needs, and nothing else should load the bus;
+  messages off, since the driver requests every message that it needs, and other messages would only load the bus;
 - `axis0.config.can.input_vel_scale = 1000`, the default;
 - `axis0.config.enable_watchdog = True`, with a `watchdog_timeout` of several cycles. Only the watchdog disarms a drive
-  whose host has died; every setpoint feeds it;
+  whose host has failed; every setpoint restarts the time-out;
 - gains, velocity and current limits, and a calibrated encoder that keeps its position without power.
 
-All except the last are read by RxSdo and TxSdo, and count as protections; see trirail_drivers.odrive.protections.
+All settings except the last group are read by RxSdo and TxSdo, and count as protections; see odrive.protections.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class OdriveSetup(NamedTuple):
     name: str
     identity: OdriveIdentity
     relative: bool
-    """Whether the drive loses its position with its supply."""
+    """Whether the drive loses its position when it loses its supply."""
     missing_protections: tuple[str, ...]
     """Protections that the drive lacks, by their names in `accept_without`."""
     notes: tuple[str, ...]
@@ -92,7 +92,7 @@ class OdriveStart(NamedTuple):
 
 
 def setup_tasks(bus: can.BusABC, drives: Drives, period: float, clock: Clock) -> list[OdriveSetupTask]:
-    """Return the set-up tasks of the three drives, for a cycle of `period` seconds."""
+    """Return the set-up tasks of the three drives, given the cycle period [s]."""
     return [
         OdriveSetupTask(OdriveClient(bus, name, drive.node, drives.sdo_timeout, clock), drive, drives, period)
         for name, drive in zip(NAMES, drives.each, strict=True)
@@ -102,10 +102,10 @@ def setup_tasks(bus: can.BusABC, drives: Drives, period: float, clock: Clock) ->
 def configure(
     bus: can.BusABC, each: Sequence[OdriveSetupTask], clock: Clock, *, awaits: bool = False
 ) -> tuple[tuple[OdriveSetup, OdriveStart] | None, ...]:
-    """Set up three drives concurrently. With `awaits`, the result of a drive that does not answer is None.
+    """Set up three drives concurrently. With `awaits`, the result for a drive that does not answer is None.
 
-    Raises DriveError with the errors of all drives. A single error is raised as it is, such as DriveTimeout for a
-    drive that does not answer.
+    Raises DriveError with the errors of all drives. If only one drive has an error, this error is raised unchanged,
+    such as DriveTimeout if the drive does not answer.
     """
 
     def progress() -> str:
@@ -123,8 +123,8 @@ async def configure_one(
 ) -> tuple[OdriveSetup, OdriveStart]:
     """Remove power from a drive; check that it answers, has the required settings and knows its position.
 
-    `check` raises if this is the wrong drive. Raises DriveError; DriveTimeout if the drive does not answer, and
-    DriveAbsentError if it has not answered any request. Errors that the drive itself reports do not raise.
+    `check` raises an error for a wrong drive. Raises DriveError, DriveTimeout if the drive does not answer, or
+    DriveAbsentError if it has not answered any request. Errors that the drive itself reports cause no exception.
     """
     client, name = one.client, one.client.name
     _command_idle(client)
@@ -159,7 +159,7 @@ def _command_idle(client: OdriveClient) -> None:
 
 
 async def _wait_until_idle(one: OdriveSetupTask) -> int:
-    """Wait until a heartbeat shows no power, for at most the duration of a boot; return the axis state."""
+    """Wait until a heartbeat shows that the drive is idle, at most for the longest boot time; return the axis state."""
     client = one.client
     begun, within = client.clock(), MISSED_HEARTBEATS * one.drives.heartbeat
     state: int | None = None
@@ -175,7 +175,7 @@ async def _wait_until_idle(one: OdriveSetupTask) -> int:
             within = max(within, BOOT_TIMEOUTS * client.timeout)
         elif state == AxisState.IDLE:
             return state
-        else:  # requested again with every heartbeat, since the command may be lost
+        else:  # commanded again after each heartbeat, since a command may be lost
             _command_idle(client)
 
 

@@ -1,4 +1,4 @@
-"""CiA 402 on CANopen as a protocol."""
+"""Description of the protocol CiA 402 on CANopen."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def _simulated_drive(
     drive: config.Drive,
     start: float,
 ) -> SimulatedDevice:
-    """Return a simulated drive. A drive with homing counts from 0 at power-on; its switch is at zero counts of
-    [drives].
+    """Return a simulated drive.
 
-    Without the manufacturer's EDS, it has the objects that the configuration writes, but they have no function.
+    The counter of a drive with homing starts at 0 at power-on, and its switch is where [drives] has zero counts.
+    Without the manufacturer's EDS, the drive has the objects that the configuration writes, but without any function.
     """
     counts = round(drive.direction * (start - drive.offset) * drive.counts_per_metre)
     switch = None if drive.homing is None else -counts
@@ -37,7 +37,7 @@ def _simulated_drive(
 
 
 def mechanics_of(drive: config.Drive) -> Mechanics:
-    """Return the mechanics of the configured axis, as far as the drive's dictionary does not report its units."""
+    """Return the mechanics of the configured axis, and the units that the drive's dictionary does not report."""
     counts, revolutions = drive.counts_per_metre, drive.revolutions_per_metre
 
     def fixed(key: str, text: str | None, power: int) -> float:

@@ -1,4 +1,4 @@
-"""CANSimple of ODrive as a protocol."""
+"""Description of ODrive's protocol CANSimple."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _simulated_drive(
         Servo.configured(simulated, drive, turns),
         heartbeat=drives.heartbeat,
         friction=FRICTION * drive.counts_per_metre,
-        # The same time for which a CiA 402 drive waits for its master: CANSimple has no message that sets it.
+        # A CiA 402 drive waits for its master as long as this. CANSimple has no message that sets the time.
         watchdog=MISSED_HEARTBEATS * drives.heartbeat,
     )
 

@@ -25,39 +25,43 @@ class Protocol:
     name: str
     """Name in `drives.protocol` of the configuration."""
     driver: Callable[..., DriveGroup]
-    """Return the driver of three drives. Arguments: the bus, its bit rate, section [drives], the clock, a Reopening if
-    a lost bus can be reopened, and the digital outputs and inputs of each drive.
+    """Function that returns the driver of three drives. Arguments: the bus, its bit rate, section [drives], the clock,
+    a Reopening if a lost bus can be reopened, and the digital outputs and inputs of each drive.
     """
     rules: Callable[[config.Drives, Requirements], Iterator[Rule]]
-    """Yield checks for settings that the drives cannot carry out."""
+    """Function that yields checks for settings that the drives cannot carry out."""
     files: Callable[[config.Drives], Iterator[Rule]]
-    """Yield checks that read the files named in the settings."""
+    """Function that yields checks that read the files named in the settings."""
     traffic: Traffic
     """Bus traffic of the drives and the service."""
     simulated_drive: Callable[[config.Simulated, config.Drives, config.Drive, float], SimulatedDevice]
-    """Return one simulated drive whose slider is at rest at a position [m]."""
+    """Function that returns one simulated drive, whose slider is at rest at a position [m]."""
     inspect: Callable[..., list[dict[str, Any]]] | None
-    """Return a description of each drive and the changes of its set-up; None if drives cannot be inspected.
+    """Function that returns a description of each drive, with the values that its set-up changes; None if the drives
+    cannot be inspected.
 
     Arguments: the bus, section [drives], the period [s], the clock, the velocity limit of the sliders [m/s], whether to
     `apply` the changes, and the digital outputs and inputs `io` of each drive.
     """
     save: Callable[..., dict[str, SavedParameters | DriveError]] | None
-    """Read the parameters of drives; None if the drives have no object dictionary.
+    """Function that reads the parameters of drives; None if the drives have no object dictionary.
 
     Arguments: the bus, section [drives], the clock and the names of the drives.
     """
     restore: Callable[..., RestoreResult] | None
-    """Restore the parameters of a drive, given the same arguments, its name and its saved parameters."""
+    """Function that restores the parameters of a drive; None if the drives have no object dictionary.
+
+    Arguments: the bus, section [drives], the clock, the name of the drive and its saved parameters.
+    """
     protections: Mapping[str, str]
     """Names that `accept_without` may contain, each with its description for people."""
     inputs: Callable[[can.BusABC, config.Drives, Clock], Callable[[str], int | None]] | None
-    """Return a function that reads a drive's digital inputs, as bits of object 60FDh, given the drive's name; None if
-    the drives do not report inputs.
+    """Function that returns a reader of digital inputs; None if the drives do not report inputs. The reader takes the
+    name of a drive and returns its inputs, as bits of object 60FDh.
     """
     without_io: str
     """Reason why the drives have no digital outputs and inputs in the cycle; "" if they have them."""
     states: Callable[[int], set[int]]
-    """Return the identifiers of the state frames of a node."""
+    """Function that returns the CAN identifiers of the state frames of a node."""
     fault_frames: Mapping[str, Frames]
-    """Frames that faults on demand may name."""
+    """Frames that a fault on demand may affect, by the names used in the faults."""

@@ -1,4 +1,4 @@
-"""CAN bus inside the process, with simulated drives and without threads."""
+"""Simulated CAN bus within this process, with simulated drives and without threads."""
 
 from __future__ import annotations
 
@@ -39,16 +39,13 @@ class SimulatedBus(can.BusABC):
         self._exchange = SimulatedExchange(self.drives, clock, faults, self._emit)
 
     def press(self, index: int, switches: int) -> None:
-        """Press these switches of a slider and release its others.
-
-        Switches are bits of the drive's digital inputs (60FDh).
-        """
+        """Press the given switches of a slider, bits of the digital inputs 60FDh, and release the others."""
         self.drives[index].press(switches)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002 - never waits
-        """Deliver a frame to every drive; their answers can be received immediately.
+        """Deliver a frame to every drive. The answers of the drives can be received immediately.
 
-        Raises can.CanOperationError while the controller is bus-off, like a socket whose queue is full.
+        Raises can.CanOperationError while the controller is bus-off; the error is that of a socket with a full queue.
         """
         if not self._exchange.receive(can_id(msg), bytes(msg.data), self._clock()):
             raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)

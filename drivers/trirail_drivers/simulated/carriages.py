@@ -1,4 +1,4 @@
-"""True positions of the simulated sliders, as a scale along each rail would show them, independent of the encoders."""
+"""Actual positions of the simulated sliders, as a scale along each rail would show them; the encoders may differ."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class DriveMounting(NamedTuple):
 
 
 class Carriages:
-    """The three sliders and their drives: each drive moves one slider, unless wiring or mechanics are wrong."""
+    """Coupling of the three drives to the three sliders. Without a fault, each drive moves its own slider."""
 
     def __init__(self, servos: Sequence[Servo], counts_per_metre: Sequence[float]) -> None:
         """`counts_per_metre` is negative if the counts decrease as the slider position increases."""
@@ -29,12 +29,12 @@ class Carriages:
         self._places = [0.0] * len(self._servos)
 
     def couple(self, index: int, slider: int, ratio: float) -> None:
-        """Couple a drive to a slider that moves `ratio` times the counted distance; a negative ratio reverses it."""
+        """Couple a drive to a slider, which moves `ratio` times as far as counted; a negative ratio reverses it."""
         self.read()
         self._moves[index] = slider, ratio
 
     def read(self) -> tuple[float, ...]:
-        """Return the slider positions since power-on, as shown by scales that were zeroed at power-on [m]."""
+        """Return the slider positions relative to those at power-on [m]."""
         for index, (servo, scale, (slider, ratio)) in enumerate(
             zip(self._servos, self._scales, self._moves, strict=True)
         ):
@@ -43,7 +43,7 @@ class Carriages:
         return tuple(self._places)
 
     def push(self, slider: int, by: float) -> None:
-        """Push a slider by hand [m]; the motors coupled to it turn, and their encoders count."""
+        """Push a slider by hand by a distance [m]. The motors coupled to the slider turn, and their encoders count."""
         for servo, scale, (moved, ratio) in zip(self._servos, self._scales, self._moves, strict=True):
             if moved == slider:
                 servo.push(by * scale / ratio)

@@ -1,4 +1,4 @@
-"""A CANopen device (CiA 301): NMT, heartbeat, SYNC, PDO, SDO and EMCY, without a thread of its own."""
+"""Simulated CANopen device (CiA 301) with NMT, heartbeat, SYNC, PDO, SDO and EMCY, without a thread."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ class Nmt(IntEnum):
 
 
 _ON_ERROR: Final = {0: Nmt.PRE_OPERATIONAL, 2: Nmt.STOPPED}
-"""State that an OPERATIONAL device enters on a communication error, by 1029h:01; 1 keeps it OPERATIONAL."""
+"""State that an OPERATIONAL device enters on a communication error, by the value of 1029h:01. With 1, it does not
+change.
+"""
 
 
 def _discard(can_id: int, data: bytes) -> None:
@@ -47,19 +49,19 @@ def _discard(can_id: int, data: bytes) -> None:
 
 
 class Device:
-    """Node on a CAN bus. Its owner passes frames and the time to it with `receive` and `poll`."""
+    """Simulated node on a CAN bus. Its owner passes frames and the time to it by calling `receive` and `poll`."""
 
     def __init__(self, node: int, eds: Path) -> None:
         self.node = node
         self.objects = Dictionary(eds, node)
         self.nmt = Nmt.INITIALISING
         self.fault = 0
-        """Code of the error that the device profile latches until a fault reset; 0 for none."""
+        """Code of the error that the device profile has latched until a fault reset; 0 if there is none."""
         self.silent = False
         """Whether the wire is cut: the device receives and sends nothing, but keeps running."""
         self._now = 0.0
         self._up_to_date = False
-        """Whether everything due at this time has been done and nothing has changed since."""
+        """Whether all work due at the present time has been done, and nothing has changed since then."""
         self._transmit: Callable[[int, bytes], None] = _discard
         self._handlers: dict[int, Callable[[bytes], None]] = {}
         self._emergency_id = self.objects.internal(0x1014, 0, 0x80 + node)
@@ -103,7 +105,7 @@ class Device:
         """Receive a data frame at time `now` [s]."""
         if can_id not in self._handlers or self.silent:
             return
-        self.poll(now)  # work due before the frame may also change whether the device accepts it
+        self.poll(now)  # work that was due before may decide whether the device accepts the frame
         handler = self._handlers.get(can_id)
         if handler is not None:
             handler(data)
@@ -140,7 +142,7 @@ class Device:
         if self._event_tpdos:
             self._send_events()
 
-    # Hooks for a device profile.
+    # Methods that a device profile overrides.
 
     def before_sync(self) -> None:
         """Update the values that TPDOs are about to sample, because a SYNC has arrived."""
@@ -153,16 +155,13 @@ class Device:
         return math.inf
 
     def sync_lost(self, at: float) -> None:
-        """Handle the absence of SYNC for `sync_timeout` seconds, detected at time `at`."""
+        """Handle the loss of SYNC, which was due `at` this time [s], `sync_timeout` seconds after the last SYNC."""
 
     def connection_lost(self, code: int) -> None:
-        """Handle the loss of the master's heartbeat, or the device being about to leave OPERATIONAL.
-
-        `code` is the EMCY error code.
-        """
+        """Handle the loss of the master, or the end of the NMT state OPERATIONAL. `code` is the EMCY error code."""
 
     def restarted(self) -> None:
-        """Start over with the power-on values of the objects."""
+        """Restart the device profile, after the objects have received their power-on values."""
 
     # NMT and heartbeat.
 

@@ -1,4 +1,4 @@
-"""Interface between a simulated drive of any protocol and its bus and faults."""
+"""Interface of a simulated drive of any protocol, for the simulated bus and for injected faults."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SimulatedDevice(Protocol):
 
     @property
     def power(self) -> PowerState:
-        """Power state of the drive in terms of CiA 402."""
+        """State of CiA 402 that corresponds to the drive's state."""
 
     @property
     def emergencies(self) -> Emergencies | None:
@@ -48,7 +48,7 @@ class SimulatedDevice(Protocol):
         """Do the work due at time `now` [s]."""
 
     def press(self, switches: int) -> None:
-        """Press these switches of the slider; they are bits of the digital inputs (CiA 402)."""
+        """Press the given switches of the slider, bits of the digital inputs (CiA 402), and release the others."""
 
     def fail(self, code: int) -> None:
         """Enter the fault state with an error code of the drive's protocol."""

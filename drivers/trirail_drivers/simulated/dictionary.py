@@ -1,4 +1,4 @@
-"""Object dictionary of a device, as its EDS describes it: values, access rules and write callbacks."""
+"""Object dictionary of a simulated device, as its EDS describes it: values, access rules and write callbacks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from trirail_drivers.cia402.eds import read
 
 
 def compact_arrays(file: Path) -> dict[int, int]:
-    """Return the number of sub-objects of each array whose elements the EDS does not list (CiA 306, CompactSubObj)."""
+    """Return the number of elements of each array that the EDS describes in compact form (CiA 306, CompactSubObj)."""
     sections = configparser.RawConfigParser(inline_comment_prefixes=(";",), strict=False)
     with eds.open_text(file) as text:
         sections.read_file(text)
@@ -50,7 +50,8 @@ _OCTETS = {0x08: 4, 0x11: 8, 0x0C: 6, 0x0D: 6}
 """Sizes of CiA 301 data types [bytes]: BOOLEAN and UNSIGNED8 to 64; INTEGER8 to 64; REAL32, REAL64, TIME_OF_DAY and
 TIME_DIFFERENCE.
 
-No code here computes with the last four. Any other type is text or a domain, of any length.
+The last four are stored as bytes, since no code here computes with them. Any other type is a text or a domain, of any
+length.
 """
 _BOOLEAN = 0x01
 _FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h", (4, False): "I", (4, True): "i",
@@ -58,9 +59,9 @@ _FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h", (4
 
 
 class ObjectEntry:
-    """Object or sub-object: an integer or, for other data types, bytes.
+    """Object or sub-object with its content: an integer or, for other data types, bytes.
 
-    `value` is the integer; the device's own code sets it directly.
+    `value` is the integer. The code of the device sets it directly.
     """
 
     __slots__ = (
@@ -90,7 +91,7 @@ class ObjectEntry:
         self.integer = kind in _UNSIGNED or kind in _SIGNED
         self._signed = kind in _SIGNED
         self.size: int | None = (_UNSIGNED | _SIGNED | _OCTETS).get(kind)
-        """Size [bytes]; None if the length is not fixed."""
+        """Size of the value [bytes]; None if values of any length are possible."""
         eds_value = variable.value if variable.value is not None else variable.default
         self.unset = eds_value is None
         """Whether the EDS has no power-on value."""
@@ -115,11 +116,11 @@ class ObjectEntry:
 
     @property
     def plain(self) -> bool:
-        """Whether a struct packs `value` itself; otherwise it packs the result of `encode`."""
+        """Whether `struct` can pack `value` with `format`; otherwise the result of `encode` must be packed."""
         return not self.format.endswith("s")
 
     def encode(self) -> bytes:
-        """Return the value as transmitted, little-endian."""
+        """Return the value as it is transmitted, in little-endian order."""
         return (
             self._wrapped(self.value).to_bytes(self.size or 0, "little", signed=self._signed)
             if self.integer
@@ -127,7 +128,7 @@ class ObjectEntry:
         )
 
     def load(self, data: bytes) -> None:
-        """Write bytes from the bus. Raises SdoAbortedError, and keeps the old value, if they are refused."""
+        """Write bytes from the bus. If they are refused, raise SdoAbortedError and keep the old value."""
         if self._limits is None:
             raise SdoAbortedError(READ_ONLY)
         longest = self.size or MAX_DOMAIN_SIZE
@@ -141,7 +142,7 @@ class ObjectEntry:
             self.content = data
 
     def write(self, value: int) -> None:
-        """Write an integer from an SDO or PDO. Raises SdoAbortedError, and keeps the old value, if it is refused."""
+        """Write an integer from an SDO or PDO. If it is refused, raise SdoAbortedError and keep the old value."""
         if self._limits is None:
             raise SdoAbortedError(READ_ONLY)
         low, high = self._limits
@@ -158,12 +159,12 @@ class ObjectEntry:
                 raise
 
     def store(self, number: float) -> None:
-        """Store the nearest integer of the data type; for the device's own code."""
+        """Set the value to the integer nearest to `number` in the range of the data type; for the device's own code."""
         bits = 8 * (self.size or 0) - self._signed
         self.value = max(-(1 << bits) if self._signed else 0, min(round(number), (1 << bits) - 1))
 
     def _wrapped(self, eds_value: int) -> int:
-        """Return a value from the EDS, which may represent a negative number by its two's complement."""
+        """Convert a value from the EDS, which may represent a negative number by its two's complement."""
         bits = 8 * (self.size or 0)
         value = eds_value % (1 << bits)
         return value - (1 << bits) if self._signed and value >> (bits - 1) else value
@@ -174,7 +175,7 @@ class ObjectEntry:
 
 
 def _octets(variable: ODVariable, eds_value: object, size: int | None) -> bytes:
-    """Return the EDS value of a non-integer object, as transmitted."""
+    """Return the EDS value of an object that is not an integer, as it is transmitted."""
     if isinstance(eds_value, int) and size is not None:  # EDS files write times as integers
         return (eds_value % (1 << 8 * size)).to_bytes(size, "little")
     if isinstance(eds_value, str | float):
@@ -240,7 +241,7 @@ class Dictionary:
         return entry
 
     def on_write(self, index: int, action: Callable[[ObjectEntry, int], None]) -> None:
-        """Call `action(entry, old value)` after each write to `index`; it may refuse by raising SdoAbortedError."""
+        """Call `action(entry, old value)` after each write to `index`. It can refuse the write by SdoAbortedError."""
         for entry in self._entries.values():
             if entry.index == index:
                 entry.on_write = action

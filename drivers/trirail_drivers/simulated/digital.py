@@ -39,10 +39,10 @@ class AxisSample(NamedTuple):
 
 
 class DigitalPins:
-    """Outputs and inputs of a drive.
+    """Digital outputs and inputs of a drive.
 
-    An output has the value of its bit in 60FEh:01 if the mask 60FEh:02 allows it, otherwise 0; a drive without the mask
-    allows every bit. Values arrive by SDO, or by an RPDO that takes effect at the SYNC.
+    An output has the value of its bit in 60FEh:01 if this bit is set in the mask 60FEh:02, otherwise 0. A drive without
+    a mask applies every bit. Values arrive by SDO, or by an RPDO that takes effect at the SYNC.
     """
 
     def __init__(self, objects: Dictionary, sample: Callable[[], AxisSample]) -> None:
@@ -61,7 +61,7 @@ class DigitalPins:
         objects.on_write(0x60FE, self._written)
 
     def restarted(self) -> None:
-        """Switch the outputs as after power-on. The inputs keep the levels of their wiring."""
+        """Set the outputs to their values after power-on. The inputs still show which switches are pressed."""
         self._update()
         self._inputs.value = self._pressed
 
@@ -79,7 +79,7 @@ class DigitalPins:
         self._inputs.value = value
 
     def apply_faults(self, *, stuck: int, bouncing: int, reserved: int) -> None:
-        """Set the active faults as bits: stuck outputs, bouncing inputs, outputs reserved by the manufacturer."""
+        """Set the bits that have faults: stuck outputs, bouncing inputs, and outputs that the manufacturer reserves."""
         self._stuck, self._bouncing, self._reserved = stuck, bouncing, reserved
         self._update()
 

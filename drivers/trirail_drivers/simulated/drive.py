@@ -42,12 +42,12 @@ _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
 
 
 class SimulatedDrive(Device):
-    """CANopen servo drive with its axis.
+    """Simulated CANopen servo drive with its axis.
 
-    The axis moves by one interpolation period (60C2h) per SYNC. Each SYNC first completes the motion since the previous
-    SYNC, then lets the TPDOs sample it, and then applies the latched setpoints. Without SYNC, the axis moves with time;
-    until the loss of SYNC is detected, it keeps its velocity. Without power, its brake holds it, but a push by hand
-    still moves it.
+    With each SYNC, the axis moves by one interpolation period (60C2h). The SYNC first completes the motion since the
+    previous SYNC, then the TPDOs sample the position, and then the latched setpoints are applied. Without SYNC, the
+    axis moves with time. Until the loss of SYNC is detected, the axis keeps its velocity. Without power, the brake
+    holds the axis, but a push by hand still moves it.
     """
 
     def __init__(
@@ -85,12 +85,12 @@ class SimulatedDrive(Device):
         return self.state
 
     def press(self, switches: int) -> None:
-        """Press these switches of the slider; bits of the digital inputs 60FDh, if the drive has that object."""
+        """Press the given switches of the slider, bits of the digital inputs 60FDh, and release the others."""
         self.pins.press(switches, self._now)
         self._up_to_date = False
 
     def fail(self, code: int) -> None:
-        """Enter the fault state with `code` in EMCY and 603Fh: transitions 13 and, at standstill, 14."""
+        """Enter the fault state (transition 13 and, at standstill, 14), and report `code` in EMCY and 603Fh."""
         if self.state in _FAULTY:
             return
         self._up_to_date = False
@@ -98,10 +98,10 @@ class SimulatedDrive(Device):
         self.errors.report(code)
         self._change(PowerState.FAULT_REACTION_ACTIVE)
 
-    # Hooks of Device: the additions of CiA 402 to CiA 301.
+    # Methods of Device that CiA 402 extends.
 
     def restarted(self) -> None:
-        """Perform transitions 0 and 1."""
+        """Restart the drive profile: perform transitions 0 and 1."""
         self.fault = 0
         self._synchronised = self._setpoint_given = False
         self._moved_at = self._now
@@ -113,10 +113,7 @@ class SimulatedDrive(Device):
         self._change(PowerState.SWITCH_ON_DISABLED)
 
     def before_sync(self) -> None:
-        """Move from one setpoint to the next.
-
-        This is skipped at the first SYNC, before which the axis moved with time.
-        """
+        """Move the axis from one setpoint to the next, except at the first SYNC, before which it moved with time."""
         self.syncs += 1
         if self._synchronised:
             self._heard_period = self._now - self._moved_at
@@ -125,15 +122,17 @@ class SimulatedDrive(Device):
         self._moved_at = self._now
 
     def time_passed(self, now: float) -> None:
-        """Move with time, ignoring the velocity offset, unless SYNC sets the pace; let inputs bounce."""
+        """Move the axis with time, without velocity offset, unless SYNCs determine the motion; let inputs bounce."""
         self.pins.poll(now)
         if not self._synchronised and now > self._moved_at:
             self._move(now - self._moved_at, 0.0)
             self._moved_at = now
 
     def sync_timeout(self) -> float:
-        """Return `missed_syncs` SYNC periods (1006h) if set, otherwise interpolation periods; inf before the second
-        SYNC.
+        """Return the time without SYNC after which SYNC counts as lost [s].
+
+        This is `missed_syncs` SYNC periods (1006h) or, if 1006h is not set, interpolation periods. If neither period is
+        known, as before the second SYNC, the time is infinite.
         """
         return self._missed_syncs * (self._sync_period.value * 1e-6 or self._step) or math.inf
 
@@ -143,7 +142,7 @@ class SimulatedDrive(Device):
         return self._profile.interpolation_period or self._sync_period.value * 1e-6 or self._heard_period
 
     def sync_lost(self, at: float) -> None:
-        """Continue with time; enter the fault state if the drive is enabled and configured to expect SYNC (1006h)."""
+        """Let the axis move with time; enter the fault state if the drive is enabled and expects SYNC (1006h)."""
         self._synchronised = False
         self.servo.coast(at - self._moved_at)
         self._moved_at = at
@@ -152,7 +151,7 @@ class SimulatedDrive(Device):
             self.fail(SYNC_LOST)
 
     def connection_lost(self, code: int) -> None:
-        """React as specified by the abort connection option code (CiA 402-2, 6007h)."""
+        """React to the loss of the master as the abort connection option code specifies (CiA 402-2, 6007h)."""
         if self.state is not PowerState.OPERATION_ENABLED:
             return
         match self._profile.abort_option.value:
@@ -218,7 +217,7 @@ class SimulatedDrive(Device):
         return self.state is PowerState.OPERATION_ENABLED and self._profile.mode.value == HOMING
 
     def _home(self, word: int, old: int) -> None:
-        """Start homing on a rising controlword bit 4 and interrupt it on a falling one (CiA 402-2, homing mode)."""
+        """Start homing when controlword bit 4 becomes 1, and interrupt it when the bit becomes 0 (CiA 402-2)."""
         if word & ~old & _HOMING_START:
             self.homing.start(*self._profile.homing)
         elif old & ~word & _HOMING_START:
@@ -233,7 +232,7 @@ class SimulatedDrive(Device):
             self._change(PowerState.SWITCH_ON_DISABLED)
 
     def _watch_following_error(self, step: float) -> None:
-        """Raise a fault if the following error exceeds its window for too long (CiA 402-2, 6065h and 6066h)."""
+        """Enter the fault state if the following error exceeds its window for too long (CiA 402-2, 6065h, 6066h)."""
         window, time = self._profile.window
         if abs(self.servo.following_error) <= window:
             self._beyond_window = None

@@ -1,4 +1,4 @@
-"""Active errors: error register, error history and emergency messages (CiA 301, EMCY; 1001h, 1003h)."""
+"""Active errors of a device: error register, error history and emergency messages (CiA 301, EMCY; 1001h, 1003h)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Emergencies:
         return bool(self._active)
 
     def report(self, code: int, detail: int = 0) -> None:
-        """Report a new error once while it persists; EMCY and history also contain `detail`."""
+        """Report an error, unless it is already active. `detail` is added to the EMCY and to the history."""
         if (code, detail) in self._active:
             return
         self._active.add((code, detail))
@@ -44,7 +44,7 @@ class Emergencies:
         self._emit(code, detail)
 
     def _remember(self, error: int) -> None:
-        """Insert the error at the front of the history, unless the device has no 1003h."""
+        """Insert the error at the front of the history 1003h, if the device has this object."""
         if not self._history:
             return
         self._count.value = min(self._count.value + 1, len(self._history))
@@ -53,7 +53,7 @@ class Emergencies:
         self._history[0].value = error
 
     def clear(self, code: int, detail: int = 0) -> None:
-        """Clear an error; once no error is left, "error reset" (code 0) is sent."""
+        """Clear an error. When no active error is left, send "error reset" (code 0)."""
         if (code, detail) not in self._active:
             return
         self._active.remove((code, detail))
@@ -62,13 +62,13 @@ class Emergencies:
             self._emit(0, 0)
 
     def forget(self, but: int) -> None:
-        """After a reset, drop all errors except those with code `but`, without sending an EMCY."""
+        """Drop all errors after a reset, except those with the code `but`, without sending an EMCY."""
         self._active = {key for key in self._active if key[0] == but}
         self._update_register()
         self._held_back = None
 
     def suppress(self, muted: bool) -> None:
-        """Suppress EMCY in STOPPED, and send the newest one when leaving that state (CiA 301)."""
+        """Suppress EMCYs if `muted` (NMT state STOPPED); otherwise send the newest suppressed EMCY (CiA 301)."""
         self._muted = muted
         if not muted and self._held_back is not None:
             emergency, self._held_back = self._held_back, None
@@ -92,6 +92,6 @@ class Emergencies:
 
 
 def _register_bits(code: int) -> int:
-    if code >> 8 == 0x86:  # positioning controller: a profile error of CiA 402, not communication
+    if code >> 8 == 0x86:  # positioning controller: an error of the CiA 402 profile, not of communication
         return _GENERIC | _PROFILE
     return _GENERIC | _REGISTER_BITS.get(code >> 12, 0)

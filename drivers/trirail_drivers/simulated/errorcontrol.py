@@ -1,4 +1,4 @@
-"""Error control (CiA 301): produced and consumed heartbeats or, without them, node guarding and life guarding."""
+"""Error control of a simulated device (CiA 301): heartbeats or, instead of them, node guarding and life guarding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ _TOGGLE: Final = 0x80
 
 
 class ErrorControl:
-    """Mutual supervision of this node (by 1017h or node guarding) and the master (by 1016h or life guarding)."""
+    """Supervision of this node by the master (1017h, or node guarding) and of the master by this node (1016h, or life
+    guarding).
+    """
 
     def __init__(self, objects: Dictionary, lost: Callable[[], None], changed: Callable[[], None]) -> None:
         """`lost` is called when the master is lost, `changed` when the watched node changes."""
@@ -27,7 +29,7 @@ class ErrorControl:
         objects.on_write(0x1017, self._producer_written)
 
     def restart(self, now: float) -> None:
-        """Stop sending and watching after a reset, until each is started again."""
+        """Stop all heartbeats and time-outs after a reset, until they are started again."""
         self._now = now
         self._heartbeat_due = self._consumer_due = self._guarding_due = math.inf
         self._toggle = 0
@@ -46,8 +48,9 @@ class ErrorControl:
         self._consumer_due = now + (self._consumer.value & 0xFFFF) * 1e-3
 
     def guarded(self, state: int, now: float) -> bytes | None:
-        """Return the answer to the master's guarding request, or None if heartbeats replace guarding (CiA 301: never
-        both).
+        """Return the answer to the master's guarding request, or None if this node sends heartbeats.
+
+        CiA 301 does not allow both.
         """
         if self._producer.value:
             return None
@@ -58,7 +61,7 @@ class ErrorControl:
         return answer
 
     def poll(self, now: float) -> bool:
-        """Report the loss of the master if it is due at time `now` [s]; return whether a heartbeat is due."""
+        """Report the loss of the master if its time-out has elapsed by `now` [s]; return whether a heartbeat is due."""
         self._now = now
         if now >= self._consumer_due or now >= self._guarding_due:
             self._consumer_due = self._guarding_due = math.inf
@@ -67,7 +70,7 @@ class ErrorControl:
             return False
         period = self._producer.value * 1e-3
         self._heartbeat_due += period
-        if self._heartbeat_due <= now:  # the next one is overdue as well: skip it
+        if self._heartbeat_due <= now:  # the next heartbeat is overdue as well, so it is skipped
             self._heartbeat_due = now + period
         return True
 

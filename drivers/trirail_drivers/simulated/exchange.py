@@ -1,4 +1,4 @@
-"""Exchange of frames between a master and simulated drives, and among the drives, as modified by faults."""
+"""Exchange of frames between a master and simulated drives, and among the drives, with the effects of faults."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ _FLAGS: Final = EXTENDED | REMOTE | ERROR
 
 
 class SimulatedExchange:
-    """Drives without a bus. The owner passes in the master's frames and the time, and receives the drives' frames.
+    """Simulated drives without a bus.
 
-    Identifiers include the flags of `struct can_frame`.
+    The owner passes the master's frames and the time to this object, and receives the frames of the drives. Identifiers
+    include the flags of `struct can_frame`.
     """
 
     def __init__(
@@ -37,8 +38,9 @@ class SimulatedExchange:
             drive.connect(partial(self._from_drive, index, others), now)
 
     def receive(self, identifier: int, data: bytes, now: float) -> bool:
-        """Deliver a frame from the master to every drive at time `now` [s]; return False while the controller is
-        bus-off.
+        """Deliver a frame from the master to every drive at time `now` [s].
+
+        Return False, without delivery, if the controller is bus-off, otherwise True.
         """
         if not self._faults.idle:
             self._faults.poll(now)
@@ -58,7 +60,7 @@ class SimulatedExchange:
             drive.poll(now)
 
     def _request(self, can_id: int, now: float) -> None:
-        """Deliver a remote frame to every drive, as modified by faults."""
+        """Deliver a remote frame to every drive, with the effects of faults."""
         for index in self._everyone:
             if self._faults.idle:
                 self._drives[index].receive_remote(can_id, now)
@@ -66,7 +68,7 @@ class SimulatedExchange:
                 self._faults.carry(index, True, can_id, b"", partial(self._deliver_request, index, can_id))
 
     def _to_drives(self, indices: Sequence[int], can_id: int, data: bytes) -> None:
-        """Deliver a frame to some drives, as modified by faults."""
+        """Deliver a frame to some drives, with the effects of faults."""
         if self._faults.idle:
             now = self._clock()
             for index in indices:
@@ -82,7 +84,7 @@ class SimulatedExchange:
         self._drives[index].receive(can_id, data, self._clock())
 
     def _from_drive(self, index: int, others: Sequence[int], can_id: int, data: bytes) -> None:
-        """Deliver a drive's frame to the master and the other drives, as modified by faults."""
+        """Deliver a drive's frame to the master and the other drives, with the effects of faults."""
         if self._faults.idle:
             self._deliver_from_drive(others, can_id, data)
         else:

@@ -1,9 +1,9 @@
-"""Units of a drive's objects, as defined by its own dictionary (CiA 402-2, factor group), in counts and seconds.
+"""Units of a drive's objects, as its own dictionary defines them (CiA 402-2, factor group), in counts and seconds.
 
-A count is the drive's unit of position at power-on. The objects define the other units. 60A8h, 60A9h and 60AAh define
-them by CiA 303-2 (power of ten, numerator, denominator). Without these, 6096h divides position units per second, and
-6097h divides velocity units per second. Positions scale with 608Fh, 6091h and 6092h. The manufacturer fixes any unit
-that no object defines.
+A count is the drive's unit of position at power-on. The objects 60A8h, 60A9h and 60AAh define the units as in CiA 303-2
+(power of ten, numerator, denominator). If they do not, the unit of velocity is one position unit per second divided by
+6096h, and the unit of acceleration is one velocity unit per second divided by 6097h. The unit of position depends on
+608Fh, 6091h and 6092h. The manufacturer defines any unit that no object defines.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ _METRES: Final = {0x01: 1.0, 0xC1: 0.0254, 0xC2: 0.3048}
 _PER_REVOLUTION: Final = {0x10: math.tau, 0x40: 400.0, 0x41: 360.0, 0x42: 21_600.0, 0x43: 1_296_000.0, 0xB4: 1.0}
 _COUNTS: Final = (0xB5, 0xAC)
 _RPM: Final = 0xC0
-"""Numerator that the EPOS4 uses for accelerations: its 00C00300h is rpm/s."""
+"""Numerator for revolutions per minute, which the EPOS4 uses for accelerations: 00C00300h is rpm/s."""
 _SECONDS: Final = {0x03: 1.0, 0x47: 60.0, 0x48: 3600.0}
 _SECOND_SQUARED: Final = 0x57
 
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """Properties that no object reports: the drive's axis, and units fixed by the manufacturer."""
+    """Properties of a drive that no object reports: its axis, and the units that the manufacturer has defined."""
 
     counts_per_metre: float = math.nan
     counts_per_revolution: float = math.nan
@@ -35,7 +35,7 @@ class Mechanics:
     acceleration: float = 1.0
     """Fixed unit of acceleration [counts/s²]."""
     untold: tuple[int, ...] = ()
-    """Objects of 60A9h and 60AAh that are 0, whatever the EDS contains: their units are those fixed here."""
+    """Those of the objects 60A9h and 60AAh that are 0, whatever the EDS contains, so that the units above apply."""
 
 
 class FactorGroup:
@@ -91,7 +91,7 @@ class FactorGroup:
         return numerator / divisor if numerator > 0 and divisor > 0 else None
 
     def _unit(self, code: int, power: int) -> float | None:
-        """Return the size of a unit by CiA 303-2 [counts, per second to a power]; None if the code is unknown."""
+        """Return the size of a unit coded as in CiA 303-2 [counts/s^power]; None if the code is unknown."""
         size = self._decoded(code, power)
         return size if size is not None and math.isfinite(size) else None
 
@@ -115,4 +115,5 @@ class FactorGroup:
 
 
 _RATIOS: Final = (0x608F, 0x6091, 0x6092, 0x6096, 0x6097)
-"""Encoder resolution, gear ratio, feed constant, velocity and acceleration factor: each sub-index 1 divided by 2."""
+"""Encoder resolution, gear ratio, feed constant, velocity and acceleration factor: sub-index 1 divided by sub-index 2.
+"""

@@ -2,7 +2,7 @@
 
     [at SECONDS] [when DRIVE CONDITION] [with CHANCE] [A|B|C|all] FAULT [VALUE] [FRAMES …] [for SECONDS | for N frames]
 
-`HELP` explains the words. A line outside the language is refused with one line that gives the correct form.
+`HELP` explains the words. A line with wrong syntax is refused, and the error message shows the correct form.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Commands: list · clear (ends all faults) · help"""
 
 
 class FaultSyntaxError(DriveError):
-    """A line outside the language of faults; the message gives the correct form."""
+    """A line does not describe a fault; the message shows the correct form."""
 
 
 class Frames(NamedTuple):
@@ -61,7 +61,7 @@ class Frames(NamedTuple):
     to_drive: bool | None
     """Direction; None for both."""
     identifier: int | None
-    """Identifier for node 0; None for all identifiers."""
+    """Identifier of the frame for node id 0; None for all identifiers."""
     per_node: int = 0
     """Increment of the identifier per node id; 0 if all nodes have the same identifier."""
 
@@ -87,12 +87,12 @@ class Fault:
     line: str
     name: str
     drives: tuple[int, ...] = ()
-    """Indices of the affected drives; empty for the bus."""
+    """Indices of the affected drives; empty for a fault of the bus."""
     value: float = 0.0
     """VALUE of the fault; codes and identifiers are whole numbers."""
     frames: tuple[Frames, ...] = ()
     delay: float = 0.0
-    """Time from the line to the fault [s]."""
+    """Shortest time between the reading of the line and the beginning of the fault [s]."""
     condition: Condition | None = None
     chance: float = 1.0
     duration: float = math.inf
@@ -102,13 +102,13 @@ class Fault:
 
 
 EITHER: Final = {"to": Frames(True, None), "from": Frames(False, None)}
-"""Names of frames common to drives of every protocol."""
+"""Names of frames that exist in every protocol."""
 CONDITIONS: Final = ("enabled", "moving", "stopping", "fault")
 _DRIVES: Final = {name: (index,) for index, name in enumerate(NAMES)} | {"all": tuple(range(len(NAMES)))}
 
 
 def _number(fits: Callable[[float], bool] = math.isfinite) -> Callable[[str], float]:
-    """Return a parser of finite numbers for which `fits` is true; it raises ValueError for others."""
+    """Return a parser of finite numbers for which `fits` is True; it raises ValueError for other words."""
 
     def read(word: str) -> float:
         value = float(word)
@@ -179,7 +179,7 @@ _OF_DRIVES: Final = {
 OF_PINS: Final = ("output-stuck", "input-bounces", "reserves")
 """Faults of digital outputs and inputs."""
 OF_SLIDERS: Final = ("node", "counts")
-"""Faults whose DRIVE is a slider, and which override its configuration."""
+"""Faults whose DRIVE names a slider. These faults override the configuration of the slider."""
 _OF_BUS: Final = {
     "bus-off": _Kind(),
     "error-passive": _Kind(),
@@ -189,7 +189,7 @@ _KINDS: Final = _OF_FRAMES | _OF_DRIVES | _OF_BUS
 
 
 class _FaultLineReader:
-    """Words of a line, consumed one by one."""
+    """Words of a line, which are read one by one."""
 
     def __init__(self, line: str) -> None:
         self.left = line.split()
@@ -211,7 +211,7 @@ class _FaultLineReader:
 
 
 def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
-    """Parse one line for drives with these names of frames. Raises FaultSyntaxError, which gives the correct form."""
+    """Parse one line, given the names of the frames. Raises FaultSyntaxError, which shows the correct form."""
     words = _FaultLineReader(line)
     delay, chance, condition = 0.0, 1.0, None
     while words.next_is("at", "when", "with"):

@@ -26,7 +26,7 @@ MOVING: Final = 1e-3
 BABBLED: Final = 7000.0
 """Frame rate of a node that saturates a bus of 1 Mbit/s [1/s]."""
 MOST_BABBLED: Final = 100
-"""Maximum number of babbled frames per poll, for a receiver that has not polled for a long time."""
+"""Maximum number of babbled frames in one poll. It matters if the receiver has not polled for a long time."""
 
 _STOPPING = (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 _FAULTY = (PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT)
@@ -36,7 +36,7 @@ Deliver = Callable[[bytes], None]
 
 
 def _to_nobody(*_said: object) -> None:
-    """Discard an announcement of a fault, or a frame, that has no receiver."""
+    """Discard an announcement of a fault, or a frame, because there is no receiver."""
 
 
 class _ActiveFault:
@@ -59,7 +59,7 @@ class _ActiveFault:
 
 
 class Faults:
-    """Faults of one bus. Random numbers are seeded, so the same calls produce the same faults."""
+    """Faults of one bus and its drives. Random numbers are seeded, so that the same calls produce the same faults."""
 
     def __init__(
         self,
@@ -72,9 +72,9 @@ class Faults:
     ) -> None:
         """`counts_per_metre` is negative if the counts decrease as the slider position increases.
 
-        `frames` contains the frames that have names. `announce` is called when a fault begins or ends. `mounted`
-        contains the slider and counts of each drive, if they differ from its own slider and `counts_per_metre`; a line
-        names a drive by that slider.
+        `frames` maps the names that lines may use to frames. `announce` is called when a fault begins or ends.
+        `mounted` contains the slider that each drive actually moves and its counts per metre, if these differ from the
+        drive's own slider and `counts_per_metre`. A line names a drive by the slider that it actually moves.
         """
         self.announce = announce
         self._mounted = (
@@ -82,7 +82,7 @@ class Faults:
         )
         self._drive_of = {each.slider: index for index, each in enumerate(self._mounted)}
         self.carriages = Carriages([drive.servo for drive in drives], [each.counts_per_metre for each in self._mounted])
-        """True positions of the sliders."""
+        """Actual positions of the sliders."""
         for index, each in enumerate(self._mounted):
             self.carriages.couple(index, each.slider, 1.0)
         self._drives = drives
@@ -98,7 +98,7 @@ class Faults:
         self._emit: Callable[[int, bytes], None] = _to_nobody
 
     def connect(self, emit: Callable[[int, bytes], None], clock: Clock) -> None:
-        """Set the receiver of injected frames (identifier with flags, data) and the clock [s]."""
+        """Set the clock [s], and the receiver of injected frames, which takes an identifier with flags and the data."""
         self._emit = emit
         self._clock = clock
 
@@ -132,7 +132,7 @@ class Faults:
         self._active.append(_ActiveFault(fault, self._now))
 
     def _with_drive_indices(self, fault: Fault) -> Fault:
-        """Return the fault with the indices of drives instead of those of the sliders on which they are mounted."""
+        """Return the fault with the indices of drives instead of the indices of the sliders that they move."""
         condition, drives = fault.condition, fault.drives
         if fault.name not in OF_SLIDERS:
             drives = tuple(self._drive_of.get(index, index) for index in drives)
@@ -225,7 +225,8 @@ class Faults:
         fault = active.fault
         if self._now - active.since < fault.delay or (fault.condition and not self._holds(fault.condition)):
             return False
-        # For faults of frames, a chance applies to each frame; otherwise to each second, of which this is a part.
+        # For a fault of frames, the chance applies to each frame. Otherwise it applies to each second; `elapsed` is the
+        # part of a second that has passed since the last poll.
         return bool(fault.chance == 1.0 or self._strikes_frames(fault)) or (
             self._random.random() < 1.0 - (1.0 - fault.chance) ** elapsed
         )
@@ -294,7 +295,7 @@ class Faults:
     # Effects of faults.
 
     def _break_drives(self) -> None:
-        """Apply the active faults to every drive, and restore drives without faults."""
+        """Apply the active faults to every drive, and restore the drives that have no faults."""
         begun = [active.fault for active in self._active if active.begun]
         wired = {round(each.value): slider for each in begun if each.name == "node" for slider in each.drives}
         counted = {slider: each.value for each in begun if each.name == "counts" for slider in each.drives}
@@ -323,8 +324,7 @@ class Faults:
 
     @staticmethod
     def _encoder(fault: Mapping[str, Fault], rising: float) -> tuple[float, float]:
-        """Return the fractions of the travel that a drive's encoder counts while its counts increase and while they
-        decrease.
+        """Return the fractions of the travel that a drive's encoder counts, for increasing and for decreasing counts.
 
         `rising` is negative if the counts decrease as the slider position increases.
         """
@@ -332,7 +332,7 @@ class Faults:
             return 0.0, 0.0
         if "slips" not in fault:
             return INTACT
-        held = 1.0 - fault["slips"].value  # while the slider's position rises
+        held = 1.0 - fault["slips"].value  # while the slider position increases
         return (held, 1.0) if rising > 0.0 else (1.0, held)
 
     def _emergencies(self, fault: Fault) -> list[Emergencies]:

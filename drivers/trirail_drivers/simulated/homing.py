@@ -1,4 +1,4 @@
-"""Homing by the drive itself (CiA 402-2, homing mode), to the edge of a switch or at the current position."""
+"""Homing mode of a simulated drive (CiA 402-2): home is the edge of a switch, or the current position."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Final
 from trirail_drivers.simulated.servo import Servo
 
 EDGES: Final = {17: 1, 18: -1, 19: -1, 20: 1, 21: 1, 22: -1}
-"""Methods 6098h without index pulse, and the direction in which each one finally crosses the edge of its switch."""
+"""Homing methods (6098h) without index pulse, and the direction in which each method finally crosses the switch's edge.
+"""
 STANDING: Final = (35, 37)
-"""Methods that take the current position as home."""
+"""Homing methods with which the current position becomes home."""
 
 
 class Phase(Enum):
@@ -24,7 +25,7 @@ class Phase(Enum):
     APPROACH = auto()
     """Slow motion across the edge; home is where the axis crosses it."""
     HALT = auto()
-    """Braking beyond the edge."""
+    """Braking after the edge has been crossed."""
 
 
 class HomingMode:
@@ -48,7 +49,7 @@ class HomingMode:
         return self.phase is not Phase.IDLE
 
     def forget(self) -> None:
-        """Reset phase and result, as when entering the mode."""
+        """Reset the phase and the result, as at a change of mode."""
         self.attained = self.failed = False
         self.phase = Phase.IDLE
 
@@ -65,7 +66,7 @@ class HomingMode:
             self.failed = True
 
     def interrupt(self) -> None:
-        """Abandon homing; braking is left to the drive."""
+        """Abandon homing. The drive itself then has to brake."""
         self.phase = Phase.IDLE
 
     def move(self, step: float, halted: bool) -> None:
@@ -92,11 +93,11 @@ class HomingMode:
                 return 0.0
 
     def _beyond(self) -> bool:
-        """Whether the axis is on the side of the edge that it reaches in the final direction."""
+        """Whether the axis is on the side of the edge that it reaches when it moves in the final direction."""
         return self.switch is not None and self._direction * (self._servo.position - self.switch) >= 0.0
 
     def _refer(self, home: float) -> None:
-        """Reference the position to `home` [counts] and finish homing."""
+        """Shift the positions so that `home` [counts] gets the position `offset`, and finish homing."""
         shift = self._offset - home
         self._servo.shift(shift)
         if self.switch is not None:

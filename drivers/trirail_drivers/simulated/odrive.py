@@ -1,4 +1,4 @@
-"""Simulated ODrive on CANSimple with its axis, without a thread of its own."""
+"""Simulated ODrive on CANSimple with its axis, without a thread."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _SENT_CYCLIC: Final = tuple(
     (name, f"{CAN}.{name}_msg_rate_ms", command)
     for name, command in (("heartbeat", cansimple.HEARTBEAT), *_CYCLIC.items())
 )
-"""Cyclic messages: name, setting that contains the period [ms], and command."""
+"""Cyclic messages that are sent: name, setting with the period [ms], and command number."""
 _UNSENT_CYCLIC: Final = ("iq", "temperature", "bus_voltage", "torques", "powers")
-"""Other cyclic messages, which no client reads: their settings are stored and reported, but nothing is sent."""
+"""Other cyclic messages. Their settings are stored and reported, but they are not sent, since no client reads them."""
 _REQUESTS: Final = (
     cansimple.GET_VERSION,
     cansimple.GET_ERROR,
@@ -47,11 +47,11 @@ def _discard(can_id: int, data: bytes) -> None:
 
 
 class SimulatedOdrive:
-    """ODrive axis. Its owner passes frames and the time to it with `receive` and `poll`.
+    """Simulated ODrive axis. Its owner passes frames and the time to it by calling `receive` and `poll`.
 
-    The axis moves with time and follows each setpoint from its arrival. When disarmed, it coasts: no brake holds it,
-    and `friction` [turns/s²] brings it to rest. The watchdog disarms it after `watchdog` seconds without a message. The
-    axis sends heartbeats and the cyclic messages that its settings enable.
+    The axis moves with time and follows each setpoint as soon as it arrives. A disarmed axis coasts, since it has no
+    brake; `friction` [turns/s²] brings it to rest. The watchdog disarms the axis after `watchdog` seconds without a
+    message. The axis sends heartbeats and the cyclic messages that its settings enable.
     """
 
     def __init__(
@@ -65,11 +65,11 @@ class SimulatedOdrive:
         self.disarm_reason = Error(0)
         self.result = ProcedureResult.SUCCESS
         self.calibrated = True
-        """Whether the axis is calibrated; otherwise it refuses closed-loop control."""
+        """Whether the axis is calibrated. An axis that is not calibrated refuses closed-loop control."""
         self.silent = False
         """Whether the wire is cut: the drive receives and sends nothing, but keeps running."""
         self.modes = (VELOCITY_CONTROL, cansimple.PASSTHROUGH)
-        """Control mode and input mode; initially those that another client left behind."""
+        """Control mode and input mode. The initial modes are wrong, as if another client had set them."""
         self.version = Version(HARDWARE, FIRMWARE)
         self.serial = 0x3664_0000_0000 + node
         self.settings: dict[str, float] = {
@@ -80,7 +80,7 @@ class SimulatedOdrive:
             **{f"{CAN}.{name}_msg_rate_ms": 0 for name in (*_CYCLIC, *_UNSENT_CYCLIC)},
             "axis0.pos_vel_mapper.status": 0,
         }
-        """Settings by path. Endpoints are numbered as in the drive's firmware."""
+        """Settings by path. Their endpoint numbers are those of the drive's firmware."""
         self._input = (servo.position, 0.0)
         self._friction = friction
         self._fed = self._moved_at = 0.0
@@ -99,13 +99,13 @@ class SimulatedOdrive:
 
     @property
     def state(self) -> str:
-        """Axis state, and the reason for disarming, for people."""
+        """Axis state and disarm reason, for people."""
         name = cansimple.state_name(self.axis_state)
         return f"{name}, {cansimple.error_names(self.disarm_reason)}" if self.disarm_reason else name
 
     @property
     def power(self) -> PowerState:
-        """Power state of the drive in terms of CiA 402."""
+        """State of CiA 402 that corresponds to the axis state and the errors."""
         if self._armed:
             return PowerState.OPERATION_ENABLED
         return PowerState.FAULT if self._error_bits else PowerState.SWITCH_ON_DISABLED
@@ -157,7 +157,7 @@ class SimulatedOdrive:
             if now >= self._due[name] and (period := self.settings[setting] / 1000.0):
                 self._answer(command)
                 self._due[name] += period
-                if self._due[name] <= now:  # the next one is overdue as well: skip it
+                if self._due[name] <= now:  # the next message is overdue as well, so it is skipped
                     self._due[name] = now + period
 
     @property
@@ -169,7 +169,7 @@ class SimulatedOdrive:
         """Do nothing, since CANSimple does not report switches."""
 
     def fail(self, errors: int) -> None:
-        """Disarm with these errors."""
+        """Report the given errors, and disarm the axis."""
         self.errors |= Error(errors)
         if self._armed:
             self.disarm_reason |= Error(errors)
@@ -210,7 +210,7 @@ class SimulatedOdrive:
         self._send(command, data)
 
     def _sdo(self, data: bytes) -> None:
-        """Read or write a setting (RxSdo). Endpoint numbers of other firmware versions get no answer."""
+        """Read or write a setting (RxSdo). There is no answer to endpoint numbers of other firmware versions."""
         opcode, number, _ = cansimple.SDO.unpack_from(data)
         table = next((table.endpoints for table in KNOWN_TABLES if table.matches(self.version)), {})
         for path, endpoint in table.items():

@@ -1,4 +1,4 @@
-"""Process data objects: mapping rules, packing, and the time at which they take effect (CiA 301, PDO)."""
+"""Process data objects of a simulated device: mapping rules, packing, and times of transmission (CiA 301, PDO)."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _RESTRICTED = (
 """CAN-IDs forbidden for PDOs (CiA 301, restricted CAN-IDs)."""
 _MOST_BYTES = 8
 _ON_EVENT = 255
-"""Transmission type: event-driven, as the device profile defines."""
+"""Transmission type of event-driven PDOs, whose events the device profile defines."""
 
 
 class Pdo(ABC):
-    """Common part of both directions: communication parameters, mapping, and the rules for changing them."""
+    """PDO in either direction: communication parameters, mapping, and the rules for changing both."""
 
     def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         self.number = communication % 0x200 + 1
@@ -76,17 +76,17 @@ class Pdo(ABC):
 
     @property
     def synchronous(self) -> bool:
-        """Whether SYNC triggers it (transmission types 0 to 240)."""
+        """Whether the PDO is sent or applied at a SYNC (transmission types 0 to 240)."""
         return self._type.value <= 240
 
     def refresh(self) -> None:
-        """Compute the packing from the mapping in advance, for use in the cycle."""
+        """Compute the packing from the mapping, so that this need not be done in each cycle."""
         self.entries = tuple(self._mapped(value) for value in self._values())
         self.layout = Struct("<" + "".join(entry.format for entry in self.entries))
         self._plain = all(entry.plain for entry in self.entries)
 
     def power_on(self) -> None:
-        """Apply the mapping of the EDS. If that mapping is not one that could be written, nothing is mapped."""
+        """Apply the mapping of the EDS. If the device would refuse to write this mapping, nothing is mapped."""
         try:
             self.refresh()
         except SdoAbortedError:
@@ -101,14 +101,14 @@ class Pdo(ABC):
         """Discard received or sent data."""
 
     def _values(self) -> list[int]:
-        """Return the mapped values up to the count, which at power-on exceeds the mapping in some drives."""
+        """Return the mapping parameters up to the count. In some EDS files, the count exceeds the mapping."""
         values = [self._objects[self._mapping, n].value for n in range(1, min(self._count.value, self._most) + 1)]
         return values[: (*values, 0).index(0)]
 
     def _mapped(self, value: int) -> ObjectEntry:
-        """Return the entry that a mapping parameter names by index, subindex and length in bits.
+        """Return the entry that a mapping parameter names by index, subindex and length [bits].
 
-        Raises SdoAbortedError.
+        Raises SdoAbortedError if there is no such entry, or if it must not be mapped.
         """
         index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
         if not value:
@@ -119,7 +119,10 @@ class Pdo(ABC):
         return entry
 
     def _mapping_written(self, entry: ObjectEntry, old: int) -> None:
-        """Check the order of writes: PDO off, count 0, the entries, the count (CiA 301, 1600h and 1A00h)."""
+        """Check that a mapping is written in the prescribed order (CiA 301, 1600h and 1A00h).
+
+        The order is: switch the PDO off, set the count to 0, write the entries, write the count.
+        """
         count = old if entry.subindex == 0 else self._count.value
         if self.valid or (entry.subindex and count):
             raise SdoAbortedError(UNSUPPORTED_ACCESS)
@@ -153,7 +156,7 @@ class Pdo(ABC):
 
 
 class ReceivePdo(Pdo):
-    """RPDO, applied at the SYNC after its arrival (types 0 to 240) or on arrival (254, 255)."""
+    """RPDO, which is applied at the next SYNC (transmission types 0 to 240) or when it arrives (254, 255)."""
 
     _latched: tuple[int | bytes, ...] | None = None
 
@@ -166,13 +169,13 @@ class ReceivePdo(Pdo):
         self._latched = None
 
     def receive(self, data: bytes) -> None:
-        """Receive a frame of sufficient length."""
+        """Receive a frame, which must contain all mapped bytes."""
         self._latched = self.layout.unpack_from(data)
         if not self.synchronous:
             self.write_latched()
 
     def write_latched(self) -> None:
-        """Write the latched values, skipping any value that its object refuses as it would refuse an SDO."""
+        """Write the latched values. A value that the object would also refuse from an SDO is skipped."""
         values, self._latched = self._latched, None
         if values is None:
             return
@@ -187,7 +190,7 @@ class ReceivePdo(Pdo):
 
 
 class TransmitPdo(Pdo):
-    """TPDO, sent on every n-th SYNC, on a SYNC after a change (type 0), or on a change (254, 255)."""
+    """TPDO, sent at every n-th SYNC (type n), at a SYNC after a change (type 0), or on a change (254, 255)."""
 
     def __init__(self, objects: Dictionary, communication: int, mapping: int, changed: Callable[[], None]) -> None:
         super().__init__(objects, communication, mapping, changed)
@@ -212,7 +215,7 @@ class TransmitPdo(Pdo):
         return b"".join([entry.encode() for entry in self.entries])
 
     def at_sync(self) -> bytes | None:
-        """Return the data to send on this SYNC, if any."""
+        """Return the data to send at this SYNC, or None."""
         if self._type.value:
             self._syncs += 1
             if self._syncs < self._type.value:
@@ -226,8 +229,9 @@ class TransmitPdo(Pdo):
         return data
 
     def on_event(self, now: float) -> bytes | None:
-        """Return the data to send at time `now` [s], if any: on a change or by event timer, unless the inhibit time
-        blocks it.
+        """Return the data to send at time `now` [s], or None.
+
+        Data are sent on a change, or when the event timer has elapsed, but not within the inhibit time.
         """
         data = self.pack()
         if self._sent is not None:

@@ -16,7 +16,7 @@ FAULT_REACTION_ACTIVE = PowerState.FAULT_REACTION_ACTIVE
 FAULT = PowerState.FAULT
 
 FAULT_RESET = 0x80
-"""Bit 7 of the controlword; its rising edge is the command."""
+"""Bit 7 of the controlword. A change from 0 to 1 is the command."""
 
 STATUS: Final = {
     PowerState.NOT_READY_TO_SWITCH_ON: 0x0000,
@@ -36,7 +36,7 @@ class ControlwordCommand(Enum):
 
     SHUTDOWN = auto()
     SWITCH_ON = auto()
-    """Switch on; in OPERATION ENABLED the same bits are "disable operation"."""
+    """Command "switch on". In OPERATION ENABLED, the same bits mean "disable operation"."""
     ENABLE_OPERATION = auto()
     DISABLE_VOLTAGE = auto()
     QUICK_STOP = auto()
@@ -49,7 +49,7 @@ _CODING: Final = (
     (0x8F, 0x07, ControlwordCommand.SWITCH_ON),
     (0x8F, 0x0F, ControlwordCommand.ENABLE_OPERATION),
 )
-"""Mask, value under the mask, and command; bits outside the mask are ignored."""
+"""Mask, value of the masked bits, and command. Bits outside the mask are ignored."""
 
 _TRANSITIONS: Final = {
     (SWITCH_ON_DISABLED, ControlwordCommand.SHUTDOWN): READY_TO_SWITCH_ON,  # 2
@@ -68,7 +68,7 @@ _TRANSITIONS: Final = {
     (QUICK_STOP_ACTIVE, ControlwordCommand.DISABLE_VOLTAGE): SWITCH_ON_DISABLED,  # 12
     (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION): OPERATION_ENABLED,  # 16
 }
-"""Transitions by command. The drive performs 0, 1, 13 and 14 by itself; 15 is the fault reset."""
+"""New state by state and command. The drive makes the transitions 0, 1, 13 and 14 by itself; 15 is the fault reset."""
 
 
 def command(controlword: int) -> ControlwordCommand | None:
@@ -80,7 +80,7 @@ def command(controlword: int) -> ControlwordCommand | None:
 
 
 def commanded(state: PowerState, controlword: int, resumes: bool) -> PowerState:
-    """Return the state after `controlword`. 605Ah determines whether a quick stop `resumes` (transition 16)."""
+    """Return the state after `controlword`. `resumes`: 605Ah allows a return from a quick stop (transition 16)."""
     order = command(controlword)
     if order is None or (state, order, resumes) == (QUICK_STOP_ACTIVE, ControlwordCommand.ENABLE_OPERATION, False):
         return state

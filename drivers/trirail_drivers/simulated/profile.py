@@ -1,4 +1,4 @@
-"""CiA 402 objects that a simulated drive uses, converted from their units to counts and seconds."""
+"""CiA 402 objects of a simulated drive, with their values converted to counts and seconds."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from trirail_drivers.simulated.servo import Servo
 TECHNOSOFT: Final = 0x1A3
 NANOTEC: Final = 0x26C
 LINEAR: Final = 1 << 8
-"""Bit 8 of Technosoft's 208Eh, auxiliary settings register."""
+"""Bit 8 of Technosoft's auxiliary settings register 208Eh, which selects linear interpolation."""
 _MILLISECONDS: Final = -3
 
 
 class MakersRules:
-    """Deviations of a manufacturer from CiA 402; drives of vendors that are not listed here have none."""
+    """Deviations of some manufacturers from CiA 402. Drives of all other manufacturers do not deviate."""
 
     def __init__(self, objects: Dictionary) -> None:
         vendor = objects.internal(0x1018, 1).value
@@ -36,13 +36,13 @@ class MakersRules:
 
         Source: Technosoft, iPOS CANopen Programming (P091.063), section 9.2.1, as quoted in issues 198 and 222 of
         roboticslab-uc3m/yarp-devices. Bit 8 of 208Eh selects linear interpolation without a buffer. Otherwise, 60C0h =
-        0 selects PT mode, which buffers points with their time in 60C1h:02, so that a position alone moves nothing.
+        0 selects PT mode, which buffers points with their time in 60C1h:02, so that a position alone has no effect.
         """
         return not self._technosoft or bool(self._auxiliary.value & LINEAR)
 
     @property
     def shows_mode_with_power_alone(self) -> bool:
-        """Whether 6061h takes the value of 6060h only in OPERATION ENABLED.
+        """Whether 6061h shows the mode that was written to 6060h only in OPERATION ENABLED.
 
         Source: Technosoft, the same manual of 2019, 6061h, as quoted in issue 215 of yarp-devices.
         """
@@ -50,7 +50,7 @@ class MakersRules:
 
 
 def _in_milliseconds(entry: ObjectEntry, _old: int) -> None:
-    """Refuse exponents other than -3, milliseconds (Nanotec, manual of the PD4-C, 60C2h:02)."""
+    """Refuse every exponent except -3, milliseconds (Nanotec, manual of the PD4-C, 60C2h:02)."""
     if entry.subindex == 2 and entry.value != _MILLISECONDS:
         raise SdoAbortedError(INVALID_VALUE)
 
@@ -65,10 +65,10 @@ CYCLIC_SYNCHRONOUS_POSITION: Final = 8
 _MODES: Final = (HOMING, INTERPOLATED_POSITION, CYCLIC_SYNCHRONOUS_POSITION)
 """Modes that 6060h accepts if 6502h lists them."""
 _INTERPOLATE: Final = 1 << 4
-"""Bit 4 of the controlword, as mode 7 defines it."""
+"""Bit 4 of the controlword in mode 7, which enables interpolation."""
 
 _STOP_AND_DISABLE, _STOP_AND_STAY = 2, 6
-"""Values of 605Ah: quick-stop ramp followed by SWITCH ON DISABLED, or by staying in QUICK STOP ACTIVE."""
+"""Values of 605Ah: after the quick-stop ramp, the drive enters SWITCH ON DISABLED, or stays in QUICK STOP ACTIVE."""
 _STAY_OPTIONS: Final = (5, 6, 7, 8)
 """Values of 605Ah with which the drive stays in QUICK STOP ACTIVE."""
 
@@ -76,7 +76,7 @@ _WINDOW_OFF: Final = 0xFFFFFFFF
 
 
 class Profile:
-    """CiA 402 objects, with defaults for missing ones: 6007h is 0, 605Ah is 2, 6065h is no window, 60B1h is 0."""
+    """CiA 402 objects of a drive. Missing objects have defaults: 6007h is 0, 605Ah is 2, 6065h is off, 60B1h is 0."""
 
     def __init__(self, objects: Dictionary, mechanics: Mechanics, mode_changed: Callable[[], None]) -> None:
         self._mode_changed = mode_changed
@@ -120,15 +120,16 @@ class Profile:
             self._mode_display.value = self.mode.value
 
     def change(self, *, enabled: bool) -> None:
-        """Set whether the drive is in OPERATION ENABLED, with power."""
+        """Record whether the drive is in OPERATION ENABLED, and show the mode if it is."""
         self._enabled = enabled
         if enabled:
             self._mode_display.value = self.mode.value
 
     @property
     def follows_setpoints(self) -> bool:
-        """Whether the drive follows setpoints, given its mode and controlword; mode 7 does while bit 4 is set (CiA
-        402-2).
+        """Whether the mode and the controlword let the drive follow setpoints.
+
+        In mode 7, bit 4 of the controlword must be set for this (CiA 402-2).
         """
         if self.mode.value == INTERPOLATED_POSITION:
             return bool(self.controlword.value & _INTERPOLATE) and self._makers.interpolates_linearly
@@ -173,13 +174,13 @@ class Profile:
 
     @property
     def homing(self) -> tuple[int, float, float, float, int]:
-        """Homing method, speeds towards the switch and the zero, acceleration, and the position at home, in counts."""
+        """Homing method, speed towards the switch, speed towards zero, acceleration and home position, in counts."""
         fast, slow = (speed.value * self.units.velocity for speed in self._homing_speeds)
         acceleration = self._homing_acceleration.value * self.units.acceleration
         return self._homing_method.value, fast, slow, acceleration, round(self._home_offset.value * self.units.position)
 
     def update_actual(self, servo: Servo) -> None:
-        """Update the actual values."""
+        """Update the actual position, velocity and following error."""
         units = self.units
         self._position.store(servo.position / units.position)
         self._velocity.store(servo.velocity / units.velocity)

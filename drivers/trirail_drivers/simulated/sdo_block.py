@@ -1,4 +1,4 @@
-"""Server side of SDO block transfers: segments without individual answers, and one CRC (CiA 301, SDO block)."""
+"""Server side of SDO block transfers, which have no answer to each segment, and one CRC (CiA 301, SDO block)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _END, _ACKNOWLEDGED, _START = 1, 2, 3
 """Subcommands, in the two lowest bits."""
 _ABORT: Final = 0x80
 CRC_WANTED: Final = 0x04
-"""Bit of the command that begins a transfer: the client (or, in the answer, the server) supports the CRC."""
+"""Bit of the first frame of a transfer: the client (or, in the answer, the server) supports the CRC."""
 
 
 class BlockUpload:
-    """Read by the client: the server sends blocks of segments, each of which is acknowledged, and then the CRC."""
+    """Block upload: the server sends blocks of segments, the client acknowledges each block, and a CRC follows."""
 
     def __init__(self, content: bytes, request: bytes) -> None:
         self.over = False
@@ -53,7 +53,7 @@ class BlockUpload:
         return []
 
     def _acknowledged(self, last: int, size: int) -> list[bytes]:
-        """Continue after the last segment that arrived, in blocks of the size that the client now requests."""
+        """Continue after the segment that the client has received last, with the block size that it now requests."""
         if last > self._size:
             raise SdoAbortedError(INVALID_SEQUENCE)
         self._sent = min(self._sent + last * _SEGMENT, max(len(self._content), 1))
@@ -83,7 +83,7 @@ class BlockUpload:
 
 
 class BlockDownload:
-    """Write by the client: the server acknowledges each block of segments, and then checks the CRC."""
+    """Block download: the client sends blocks of segments, the server acknowledges each block and checks the CRC."""
 
     def __init__(self, request: bytes, longest: int) -> None:
         self.over = False

@@ -1,4 +1,4 @@
-"""SDO server of a simulated device: that of python-canopen plus the block transfers that it lacks (CiA 301, SDO)."""
+"""SDO server of a simulated device: python-canopen's server, extended by block transfers (CiA 301, SDO)."""
 
 from __future__ import annotations
 
@@ -83,15 +83,15 @@ class SdoServer(CanopenServer):
         self._respond(bytes(response))
 
     def abort(self, abort_code: int = UNKNOWN_COMMAND) -> None:
-        """End the current transfer and send the reason. A segment without a transfer is an unknown command."""
+        """End the current transfer and send the abort code; the default is that of a segment without a transfer."""
         super().abort(abort_code)  # type: ignore[no-untyped-call]
         self.reset()
 
     def init_download(self, request: bytes) -> None:
-        """Refuse an impossible write before its first segment, and take the length from the dictionary.
+        """Begin a download. Refuse an impossible write before its first segment.
 
-        python-canopen's server refuses it only after the last segment, and assumes four bytes if a request states no
-        size.
+        python-canopen's server would refuse the write only after the last segment. If a request states no size, the
+        size of the object in the dictionary is used; python-canopen's server would assume four bytes.
         """
         entry = self._writable(request)
         command, index, subindex, payload = _HEADER.unpack(request)
@@ -107,7 +107,7 @@ class SdoServer(CanopenServer):
     def init_upload(self, request: bytes) -> None:
         """Begin an upload.
 
-        An empty object, which python-canopen's server refuses, is answered by a segment without data.
+        The answer for an empty object is a segment without data; python-canopen's server would refuse the request.
         """
         self._name(request)
         content = self.get_data(self._index, self._subindex, check_readable=True)
@@ -127,7 +127,7 @@ class SdoServer(CanopenServer):
         self._uploads = bool(self._buffer)
 
     def segmented_download(self, command: int, request: bytes) -> None:
-        """Accept the next segment; it is refused without a transfer, or if it exceeds the length of the object."""
+        """Accept the next segment. Refuse a segment without a transfer, or one that exceeds the object's length."""
         if not self._longest:
             raise SdoAbortedError(UNKNOWN_COMMAND)
         in_turn = command & _TOGGLE == self._toggle
@@ -157,7 +157,7 @@ class SdoServer(CanopenServer):
         self._answer(0xA0 | data[0] & CRC_WANTED, bytes([block.size]))
 
     def _name(self, request: bytes) -> None:
-        """Store the object that a request names, because an abort names it too."""
+        """Store the object that a request names, because an abort must name the object, too."""
         _, self._index, self._subindex, _ = _HEADER.unpack(request)
 
     def _writable(self, request: bytes) -> ObjectEntry:

@@ -9,7 +9,7 @@ from trirail_drivers import config
 from trirail_drivers.driver.ramp import brake
 
 INTACT: Final = (1.0, 1.0)
-"""Fractions of the travel that an intact encoder counts, forwards and backwards."""
+"""Fractions of the travel that an intact encoder counts, in forward and backward motion."""
 
 
 class Servo:
@@ -20,10 +20,10 @@ class Servo:
 
         dx/dt = w + (r - x) / time_constant.
 
-    The following error e = r - x therefore obeys de/dt = (dr/dt - w) - e / time_constant: it decays, and only the error
-    of the feed-forward drives it. With exact feed-forward there is no lag; without feed-forward the lag is
+    The following error e = r - x therefore obeys de/dt = (dr/dt - w) - e / time_constant: it decays, unless an error of
+    the feed-forward sustains it. With exact feed-forward there is no lag; without feed-forward the lag is
     dr/dt · time_constant. `feed_forward_gain` is the fraction of the feed-forward that this servo uses. With
-    time_constant = 0 the servo is ideal: it is on the target at the end of each step. The resulting velocity is then
+    time_constant = 0 the servo is ideal: at the end of each step it has reached the target. Finally, the velocity is
     limited so that the servo can still brake in time, and to `max_velocity` and `max_acceleration`.
     """
 
@@ -45,21 +45,22 @@ class Servo:
         self.limited = False
         """Whether a limit was active in the last step."""
         self.forced_velocity: float | None = None
-        """Defect: velocity that the slider has whatever its setpoint [counts/s], until its brake holds it."""
+        """Defect: velocity of the slider, whatever its setpoint is, until the brake stops the slider [counts/s]."""
         self.encoder = INTACT
-        """Defect: fractions of the travel that the encoder counts, forwards and backwards; (0, 0) if the encoder is
-        loose.
+        """Defect: fractions of the travel that the encoder counts, in forward and backward motion.
+
+        A loose encoder counts none of it: (0, 0).
         """
         self.motor = 1.0
-        """Defect: -1 if the motor turns against its encoder, as with two swapped phases."""
+        """Defect: -1 if the motor and its encoder turn in opposite directions, as with two swapped phases; else 1."""
         self.travelled = 0.0
-        """Travel of the motor since power-on, whatever the encoder counts [counts]."""
+        """Actual travel of the motor since power-on, even if the encoder counts a different travel [counts]."""
         self.play = 0.0
         """Defect: backlash, the distance that a reversing motor travels before the slider follows [counts]."""
         self.driven = 0.0
-        """Travel of the slider since power-on, which differs from that of the motor by the backlash [counts]."""
+        """Travel of the slider since power-on [counts]. Because of backlash, the travel of the motor may differ."""
         self.lag: float | None = None
-        """Defect: lag behind the setpoint [s]; feed-forward then has no effect."""
+        """Defect: time by which the slider lags behind its setpoint [s]; feed-forward then has no effect."""
         self._feed_forward = 0.0
         self._feed_forward_gain = feed_forward_gain
         self._time_constant = time_constant
@@ -88,7 +89,7 @@ class Servo:
         return self.setpoint - self.position
 
     def hold(self) -> None:
-        """Stop immediately by the brake."""
+        """Stop immediately, held by the brake."""
         self.velocity = self._feed_forward = 0.0
         self.setpoint = self.position
         self.limited = False
@@ -116,11 +117,10 @@ class Servo:
         self.setpoint, self._feed_forward = target, feed_forward
 
     def chase(self, target: float, feed_forward: float, step: float) -> None:
-        """Move for `step` seconds towards a `target` [counts] that has jumped and is now constant, as is the
-        feed-forward.
+        """Move for `step` seconds towards a constant `target` [counts] with a constant feed-forward [counts/s].
 
-        A drive that follows each setpoint from its arrival moves like this: dx/dt = w + (r - x) / time_constant with
-        constant r and w, limited to `max_velocity` and `max_acceleration`.
+        This is the motion of a drive that follows each setpoint as soon as it arrives: dx/dt = w + (r - x) /
+        time_constant with constant r and w, limited to `max_velocity` and `max_acceleration`.
         """
         feed_forward *= self._feed_forward_gain if self.lag is None else 0.0
         time_constant = self._time_constant if self.lag is None else self.lag
@@ -160,7 +160,7 @@ class Servo:
         self.setpoint, self._feed_forward = self.position, 0.0
 
     def run(self, velocity: float, acceleration: float, step: float) -> None:
-        """Accelerate to `velocity` [counts/s] with `acceleration` [counts/s²] for `step` seconds; ignore setpoints."""
+        """Accelerate towards `velocity` [counts/s] with `acceleration` [counts/s²] for `step` seconds."""
         change = acceleration * step
         before = self.velocity
         self.velocity = max(before - change, min(velocity, before + change))
@@ -184,11 +184,11 @@ class Servo:
         self.setpoint = self.position
 
     def _drive(self, by: float) -> None:
-        """Turn by the motor's own force by `by` [counts]; the direction is reversed if that is the motor's defect."""
+        """Turn the motor under power by `by` [counts]. If the motor has that defect, the direction is reversed."""
         self.turn(by if self.forced_velocity is not None else self.motor * by)
 
     def turn(self, by: float) -> None:
-        """Turn the motor by `by` [counts]; the encoder counts its fraction of the travel."""
+        """Turn the motor by `by` [counts]. The slider follows with backlash; the encoder counts its fraction."""
         forwards, backwards = self.encoder
         self.travelled += by
         half = abs(self.play) / 2.0
