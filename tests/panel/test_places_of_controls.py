@@ -80,6 +80,7 @@ def test_no_control_moves_because_of_a_state(browser: Page, size: str, role: Rol
         page = browser.another()
         page.open(panel.url)
         page.resize(width, height, phone=phone)
+        page.until("document.body.dataset.contact === 'yes'")  # its script listens to the choice of a language
         for code in ("de", "en"):
             page.choose("#language", code)
             page.until(f"document.documentElement.lang === {code!r} && document.body.dataset.contact === 'yes'")
