@@ -282,7 +282,9 @@ def assert_stops_until_reset(rig: FaultRig, case: Case, begun: Begin) -> None:
     if case.lasts:
         answer = rig.command("reset")
         assert isinstance(answer, Refused)
-        assert "the cause is still there" in answer.message or "by its last statusword" in answer.message
+        assert (
+            "the cause of the fault persists" in answer.message or "according to the last statusword" in answer.message
+        )
         assert rig.faulty()
     rig.mend()
     rig.cycles(LONG)

@@ -152,12 +152,12 @@ def test_reset_is_refused_with_drive_and_progress(rig: RecoveryRig) -> None:
     assert expected is not None
     assert expected.objects >= asked
     assert expected.expected > number
-    assert f"the cause is still there: drive B restarted: {work} (" in answer.message
+    assert f"the cause of the fault persists: drive B restarted: {work} (" in answer.message
     assert f" of {expected.expected} {counted})" in answer.message
     rig.recover()
     assert rig.said(f"drive B restarted: {work}") == [f"drive B restarted: {work}", *rig.said("reset refused")]
     assert rig.said("drive B is configured") == [
-        "drive B is configured, as all drives are now: send reset, then enable"
+        "drive B is configured, and so are the others: send reset, then enable"
     ]
 
 
@@ -302,7 +302,7 @@ def test_an_odrive_whose_position_is_relative_is_not_homed() -> None:
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
     assert rig.said("drive A: axis0.pos_vel_mapper.status is 9, relative")
-    assert rig.said("slider A: position unknown since its drive was off")
+    assert rig.said("slider A: the position is unknown because the drive was off")
     rig.bus.shutdown()
 
 
@@ -346,7 +346,7 @@ def test_an_incremental_encoder_makes_the_robot_not_homed() -> None:
     answer = rig.goal("g", 0.01, 0.0, 0.0)
     assert isinstance(answer, Refused)
     assert answer.code is RefusalCode.NOT_HOMED
-    assert rig.said("slider A: position unknown since its drive was off: send home")
+    assert rig.said("slider A: the position is unknown because the drive was off; send home")
     assert isinstance(rig.command("home"), CommandDone)
     rig.goal("g2", 0.01, 0.0, 0.0)
     rig.until(lambda: ("g2", "done") in rig.outcomes())

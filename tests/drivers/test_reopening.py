@@ -267,7 +267,7 @@ def test_reset_is_refused_with_the_reason_until_the_bus_is_back(rig: BusRig) -> 
     rig.cycles(1)
     answer = rig.command("reset")
     assert isinstance(answer, Refused)
-    assert 'the cause is still there: CAN bus can0 is down: there is no CAN interface "can0"' in answer.message
+    assert 'the cause of the fault persists: CAN bus can0 is down: there is no CAN interface "can0"' in answer.message
     rig.until(lambda: rig.pending is not None)
     rig.finish()
     rig.recover()

@@ -314,7 +314,7 @@ def test_the_commands(service: Service) -> None:
     assert "holding" in call("status").stdout
     out = call("goto", 0.5, 0, 0)
     assert out.returncode == 1
-    assert "platform x: position 500 mm is beyond its limit 150 mm" in out.stderr
+    assert "platform x: position 500 mm is beyond the limit of 150 mm" in out.stderr
     assert call("reset").returncode == 1
     assert call("goto", "nan", 0, 0).returncode == 2
     assert call("goto", 1, 2).returncode == 2
@@ -585,7 +585,7 @@ def test_done_is_said_when_the_robot_is_measured_to_be_there(tmp_path: Path) -> 
             until(robot, lambda state: state.settled)
             far = trirail("goto", 0.006, -0.004, 0.02, "--wait", locator=lagging.locator)
             assert far.returncode == 1
-            assert "unsettled: not in position 0.3 s after the end of its path; residuals: slider A " in far.stdout
+            assert "unsettled: not in position 0.3 s after the end of the path; residuals: slider A " in far.stdout
             said = json.loads(trirail("goto", 0.05, 0.0, 0.0, "--wait", "--json", locator=lagging.locator).stdout)
             assert (said["outcome"], said["settle"]) == ("unsettled", None)
             assert max(np.abs(said["residual"]["pose"]) / windows.pose) > 1.0

@@ -60,7 +60,7 @@ def test_outputs_are_set_by_client_and_command_line(service: Service, robot: Rob
     robot.disable()
     until(robot, lambda state: state.mode == "disabled")
     with pytest.raises(
-        RefusedError, match="output 'valve' keeps its safe value, off, while the robot is disabled"
+        RefusedError, match="output 'valve' stays at its safe value, off, while the robot is disabled"
     ) as refused:
         robot.set_output("valve", True)
     assert refused.value.code is RefusalCode.NOT_ENABLED
