@@ -158,7 +158,7 @@ def test_what_is_not_there_is_one_line_and_with_json_one_object(line: str, said:
 @pytest.mark.parametrize(
     ("line", "code", "said"),
     [
-        ("goto ../../etc", 1, "pose '../../etc' is not a valid name; use letters, digits, - and _, at most 64"),
+        ("goto ../../etc", 1, "pose '../../etc' is not a valid name; use at most 64 letters, digits, - and _"),
         ("goto a/b", 1, "letters, digits, - and _"),
         ("goto 5mm", 2, "goto takes X, Y and PHI, or the NAME of a pose"),
         ("goto 5mm 0", 2, "goto takes X, Y and PHI: here are X = 5mm and Y = 0.000 mm, and PHI is missing, the angle"),

@@ -388,7 +388,7 @@ def test_bad_commands(shared: tuple[Service, Robot, zenoh.Session]) -> None:
     _, robot, session = shared
     (reply,) = session.get("trirail/demo/cmd/eve/dance")
     assert reply.err is not None
-    assert "no such command; there are enable" in reply.err.payload.to_string()
+    assert "use one of enable" in reply.err.payload.to_string()
     (reply,) = session.get("trirail/demo/cmd/*/stop")
     assert reply.err is not None
     assert "contains a wildcard" in reply.err.payload.to_string()
@@ -735,7 +735,7 @@ def test_a_planner_that_is_lost_costs_a_goal_and_no_more(service: Service, harm:
     assert service.end() == 0
     assert_stopped_smoothly(service.frames())
     log = service.log.read_text()
-    assert "the motion under way continues, new goals are refused; starting it again" in log
+    assert "the motion in progress continues, and new goals are refused; restarting it" in log
     assert "Traceback" not in log
 
 
@@ -799,12 +799,12 @@ def test_a_recorder_that_cannot_begin_again_never_ends_the_service(service: Serv
         folder.write_bytes(b"")
         os.kill(service.child("recorder"), signal.SIGKILL)
         assert until(robot, lambda state: state.mode == "holding").pose[0] == pytest.approx(0.1, abs=1e-5)
-        service.wait_said("the recorder has died (exit code 78): the robot is not affected; starting it again")
+        service.wait_said("the recorder has died (exit code 78): the robot is not affected; restarting it")
         folder.unlink()
         assert robot.move_to(x=0.0, y=0.0, phi=0.0).wait(WITHIN).outcome == "done"
         said = (event.message for event in robot.events(history=True, timeout=WITHIN) if "record" in event.message)
         begun, gone, back = itertools.islice(said, 3)
-    assert gone == "the recorder has gone: nothing is recorded until it is back"
+    assert gone == "the recorder has died: nothing is recorded until it has restarted"
     assert begun.startswith(f"recording to {folder}/")
     assert back.startswith(f"recording to {folder}/")
     assert service.end() == 0
@@ -902,7 +902,9 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdogs(tmp_path: Path) -> N
             in_motion(robot)
             os.kill(service.child("loop"), signal.SIGKILL)
         assert service.process.wait(END_WITHIN) == 1
-        assert "the loop is dead (killed by SIGKILL): the drives stop by their own watchdogs" in service.log.read_text()
+        assert (
+            "the loop has died (killed by SIGKILL): the drives stop by their own watchdogs" in service.log.read_text()
+        )
         stopped: dict[str, str] = {}
         while len(stopped) < 3:
             line = drives.stdout.readline().decode()

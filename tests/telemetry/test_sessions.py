@@ -249,7 +249,7 @@ def test_a_recorder_that_cannot_write_beside_its_recording_says_so_and_records(t
     sidecar(recording.path).mkdir()
     recording.records(made.records(0.1).tobytes())
     recording.close()
-    assert ["cannot be written, trirail sessions reads the recording" in words for words in told] == [True]
+    assert ["cannot be written, so trirail sessions reads the recording" in words for words in told] == [True]
     assert read_contents(recording.path).cycles == 100
 
 

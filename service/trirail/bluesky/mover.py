@@ -124,7 +124,7 @@ class Mover:
         With `success`, the sets end as if they had arrived: a plan that pauses repeats them.
         """
         unsent, self._unsent, self._gathered = self._unsent, [], []
-        end_all(unsent, None if success else TrirailError("stopped before its goal was sent"))
+        end_all(unsent, None if success else TrirailError("the motion was stopped before its goal was sent"))
         async with self._sending:  # a goal that is being sent is first accepted
             motion = self._motion
         if motion is None or motion.goal.result is not None:

@@ -64,7 +64,7 @@ def _point_of(n: int, row: TrajectoryPoint | Iterable[float]) -> TrajectoryPoint
 def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
     """Return a function that returns, for an id, the goal to the first pose of a trajectory."""
     if not points:
-        raise RefusedError(RefusalCode.MALFORMED, f"points: there are none; expected {POINTS_FORMAT}")
+        raise RefusedError(RefusalCode.MALFORMED, f"points: the list is empty; expected {POINTS_FORMAT}")
     x, y, phi = points[0].x, points[0].y, points[0].phi
     return lambda name: PoseGoal(x=x, y=y, phi=phi, id=name)
 
@@ -72,7 +72,7 @@ def first_pose(points: Sequence[TrajectoryPoint]) -> Callable[[str], PoseGoal]:
 def check_arrived(result: Result) -> None:
     """Raise RefusedError if the goal to a trajectory's first point was not done."""
     if result.outcome != "done":
-        text = f"the robot is not at the first point of the trajectory, which was not sent: {result.message}"
+        text = f"the trajectory was not sent, because the robot did not reach its first point: {result.message}"
         raise RefusedError(RefusalCode.WRONG_START, text)
 
 
@@ -86,7 +86,9 @@ def parse(name: Path | str, text: str) -> list[TrajectoryPoint]:
     path = Path(name)
     points = _points(path, text)
     if len(points) < MIN_POINTS:
-        raise TrirailError(f"{path}: {'one point' if points else 'no points'}: a trajectory has {MIN_POINTS} at least")
+        raise TrirailError(
+            f"{path}: {'one point' if points else 'no points'}: a trajectory needs at least {MIN_POINTS}"
+        )
     if why := too_many(len(points)):
         raise TrirailError(f"{path}: {why}")
     return points
@@ -115,7 +117,11 @@ def _from_csv(path: Path, text: str) -> list[TrajectoryPoint]:
         raise TrirailError(
             f"{path}: line 1: columns {quoted(', '.join(names)) or 'none'}; expected {', '.join(COLUMNS)}, "
             f"and if known {', '.join(VELOCITY)} and {', '.join(ACCELERATION)}, each once"
-            + ("; commas separate columns, and numbers have a point" if ";" in "".join(names) else "")
+            + (
+                "; separate columns with commas, and write numbers with a decimal point"
+                if ";" in "".join(names)
+                else ""
+            )
         )
     points = []
     for row in rows:
@@ -144,7 +150,7 @@ def _numbers(where: str, names: Sequence[str], row: Sequence[str]) -> dict[str, 
         try:
             values[name] = number_in(cell)
         except ValueError as error:
-            what = f"{where}, column {name}: {error}; a CSV has bare metres, radians and seconds"
+            what = f"{where}, column {name}: {error}; write numbers without units, in metres, radians and seconds"
             raise TrirailError(what) from error
     return values
 
