@@ -217,7 +217,7 @@ def test_what_begins_in_motion_is_refused(recording: Recording, config: Config) 
     moving = int(np.flatnonzero(np.any(recording.records["commanded_velocity"] != 0.0, axis=1))[0])
     late = recording._replace(records=recording.records[moving:])
     # What is advised must be possible: the file of a recorder that was restarted has none before it.
-    with pytest.raises(ServiceError, match=r"in mode moving; a replay needs .* begins disabled.*restarted.*report"):
+    with pytest.raises(ServiceError, match=r"in mode moving; a replay needs .* mode disabled.*restarted.*report"):
         replay_session(late, config, simulated=False)
 
 

@@ -248,7 +248,7 @@ def test_a_bus_that_is_lost_comes_back(rig: BusRig, seed: int) -> None:
             rig.cycles(draw.randrange(400))  # of the configuration
     rig.recover()
     assert rig.said("CAN bus can0 is down: ")
-    assert rig.said("CAN bus can0 is back")
+    assert rig.said("CAN bus can0 is up again")
     assert len(rig.opened) >= 2
 
 
@@ -308,7 +308,7 @@ def test_a_full_queue_of_python_cans_is_no_flicker(rig: BusRig) -> None:
         rig.cycles(100)
         assert rig.down
     assert len(rig.said("CAN bus can0 is down: ")) == 1
-    assert not rig.said("CAN bus can0 is back")
+    assert not rig.said("CAN bus can0 is up again")
     rig.supply(0, 1, 2)
     rig.recover()
 

@@ -232,7 +232,9 @@ def test_an_override_that_is_none_is_refused_in_a_line(shared: tuple[Service, Ro
             robot.override(percent)
     refused = trirail("override", 0.5, locator=service.locator)
     assert refused.returncode == 2
-    assert refused.stderr.startswith("trirail: Invalid value for PERCENT: '0.5' is no override: 0, or 1 to 200 %")
+    assert refused.stderr.startswith(
+        "trirail: Invalid value for PERCENT: '0.5' is not an override: use 0, or 1 to 200 %"
+    )
 
 
 # ---------------------------------------------------------------------- each is answered once

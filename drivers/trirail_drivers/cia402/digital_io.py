@@ -73,6 +73,7 @@ def _refuse_differing(drive: Differences, key: Key, held: int | None, wanted: in
         return
     names = ", ".join(str(bit) for bit in range(32) if differing >> bit & 1)
     raise DriveError(
-        f"drive {drive.remote.name}: {title(key)} stays {shown(*key, held)}, expected {shown(*key, wanted)}: its maker "
-        f"reserves bit {names}; use other bits in [outputs], from its maker's manual"
+        f"drive {drive.remote.name}: {title(key)} stays {shown(*key, held)}, expected {shown(*key, wanted)}: the "
+        "manufacturer "
+        f"reserves bit {names}; use other bits in [outputs], as in the manufacturer's manual"
     )

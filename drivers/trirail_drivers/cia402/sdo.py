@@ -234,7 +234,9 @@ class Remote:
         except NoAnswerError as error:
             raise DriveTimeout(self.name, f"answer for {called}", self.client.timeout) from error
         except BootedError as error:
-            raise RestartedError(f"drive {self.name}: restarted during its set-up; check its power supply") from error
+            raise RestartedError(
+                f"drive {self.name}: the drive restarted during its set-up; check its power supply"
+            ) from error
         except SdoCommunicationError as error:
             raise DriveError(f"drive {self.name}: cannot {attempt} {called}: {error}") from error
         except (can.CanError, OSError) as error:

@@ -199,7 +199,7 @@ class _FaultLineReader:
 
     def next_word(self, after: str, wants: str, example: str) -> str:
         if not self.left:
-            raise FaultSyntaxError(f"after {after} comes {wants}, as in: {example}")
+            raise FaultSyntaxError(f"{after} must be followed by {wants}, as in: {example}")
         return self.left.pop(0)
 
     def value(self, after: str, wants: str, example: str, read: Callable[[str], float]) -> float:
@@ -207,7 +207,7 @@ class _FaultLineReader:
         try:
             return read(word)
         except ValueError:
-            raise FaultSyntaxError(f"{after} {word}: after {after} comes {wants}, as in: {example}") from None
+            raise FaultSyntaxError(f"{after} {word}: {after} must be followed by {wants}, as in: {example}") from None
 
 
 def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
@@ -232,7 +232,7 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
         raise FaultSyntaxError(_unknown("fault", name, known))
     kind = _KINDS[name]
     if bool(drives) is (name in _OF_BUS):
-        right = "the bus: name no drive" if drives else f"a drive: name it, as in: A {name}"
+        right = "the bus: do not name a drive" if drives else f"a drive: name the drive, as in: A {name}"
         raise FaultSyntaxError(f"{name} is a fault of {right}")
     who = "A " if drives else ""
     value = words.value(name, kind.wants, f"{who}{name} {kind.example}", kind.read) if kind.read else 0.0
@@ -240,7 +240,7 @@ def parse(line: str, known_frames: Mapping[str, Frames]) -> Fault:
     while words.left and not words.next_is("for"):
         word = words.left.pop(0)
         if name not in _OF_FRAMES:
-            raise FaultSyntaxError(f'"{word}" after {name}: only for can follow, as in: {who}{name} for 0.5')
+            raise FaultSyntaxError(f'"{word}" after {name}: only "for" may follow, as in: {who}{name} for 0.5')
         chosen.append(_frames(word, {**known_frames, **EITHER}))
     duration, number = _lasting(words, name, kind.momentary)
     return Fault(line, name, drives, value, tuple(chosen), delay, condition, chance, duration, number)
@@ -250,7 +250,7 @@ def _condition(words: _FaultLineReader) -> Condition:
     example = "when B moving A silent"
     drive = words.next_word("when", "A, B, C or any", example)
     if drive not in (*NAMES, "any"):
-        raise FaultSyntaxError(f"when {drive}: after when comes A, B, C or any, as in: {example}")
+        raise FaultSyntaxError(f"when {drive}: when must be followed by A, B, C or any, as in: {example}")
     state = words.next_word(f"when {drive}", ", ".join(CONDITIONS), example)
     if state not in CONDITIONS:
         raise FaultSyntaxError(_unknown("condition", state, CONDITIONS))
@@ -278,7 +278,7 @@ def _lasting(words: _FaultLineReader, name: str, momentary: bool) -> tuple[float
     if not words.left:
         return value, None
     if name not in _OF_FRAMES or words.left not in (["frames"], ["frame"]) or value != round(value) or value < 1:
-        raise FaultSyntaxError(f'"{" ".join(words.left)}" after for {value:g}: a line ends as in: {example}')
+        raise FaultSyntaxError(f'"{" ".join(words.left)}" after for {value:g}: the line must end as in: {example}')
     return math.inf, round(value)
 
 

@@ -63,7 +63,7 @@ def calibrate_by_moves(
     yield LookReport("calibration", first)
     # Checked after the first look, which shows the names of the marks, and before any move.
     if views is not None and (unknown := sorted(set(first.marks) - set(views))):
-        text = f"marks without a view: {', '.join(unknown)}; name one for each, views names {', '.join(views)}"
+        text = f"marks without a view: {', '.join(unknown)}; give each mark a view; views has {', '.join(views)}"
         yield LookReport("calibration", end=AlignmentFault.MISSING, words=text)
         raise AlignmentError(AlignmentFault.MISSING, text)
     for move in moves:

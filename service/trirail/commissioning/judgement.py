@@ -71,7 +71,7 @@ def judge_switches(name: str, rest: int, changed: int, confirmed: bool, labels: 
         return Judgement(
             "wrong",
             (*words, f"slider {label(name, labels)} has other switches than these"),
-            f"check their wiring, and the functions of the inputs of drive {name} (its maker's tool)",
+            f"check their wiring, and the functions of the inputs of drive {name} (with the manufacturer's tool)",
         )
     return Judgement("ok", words)
 
