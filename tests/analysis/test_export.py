@@ -97,7 +97,7 @@ def test_every_number_comes_back(suffix: str, recording: Recording, tmp_path: Pa
 def test_a_file_is_never_written_over_and_its_name_says_its_format(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("mine")
-    with pytest.raises(ServiceError, match="already exists: name another file"):
+    with pytest.raises(ServiceError, match="already exists: choose another file"):
         export.write(recording, path)
     assert path.read_text() == "mine"
     with pytest.raises(ServiceError, match=r"must end in .csv, .parquet or .npy"):

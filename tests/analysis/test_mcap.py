@@ -116,7 +116,7 @@ def test_velocities_are_those_of_the_positions(recording: Recording) -> None:
 def test_a_file_is_never_written_over(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "session.mcap"
     path.write_text("mine")
-    with pytest.raises(ServiceError, match="already exists: name another file"):
+    with pytest.raises(ServiceError, match="already exists: choose another file"):
         mcap.write(recording, path)
     assert path.read_text() == "mine"
     with pytest.raises(ServiceError, match="needs the configuration"):

@@ -223,7 +223,7 @@ def test_what_begins_in_motion_is_refused(recording: Recording, config: Config) 
 
 def test_another_rate_is_refused(recording: Recording, config: Config) -> None:
     slower = msgspec.structs.replace(config, loop=msgspec.structs.replace(config.loop, rate_hz=500))
-    with pytest.raises(ServiceError, match="500 Hz, but the recording has 1000 cycles a second"):
+    with pytest.raises(ServiceError, match="500 Hz, but the recording has 1000 cycles per second"):
         replay_session(recording, slower, simulated=True)
 
 

@@ -186,7 +186,7 @@ def test_pictures_that_are_not_taken_anew_or_are_none_are_named(
     (tmp_path / "left.png").write_bytes(b"cut off")
     with (
         mark_source.folder(tmp_path, MarkShape("cross", 50.0), 0.0) as (look, _),
-        pytest.raises(TrirailError, match=r"write it as \.left\.png and rename it"),
+        pytest.raises(TrirailError, match=r"write it as \.left\.png, then rename it"),
     ):
         look()
 

@@ -100,9 +100,9 @@ def test_ctrl_c_ends_it_and_the_report_stays(
 
 def test_what_cannot_be_is_refused_before_anything_is_asked(robot: str, tmp_path: Path) -> None:
     (tmp_path / "precious.toml").write_text("precious")
-    with pytest.raises(ConfigError, match=r"precious\.toml already exists; name another file with --out"):
+    with pytest.raises(ConfigError, match=r"precious\.toml already exists; choose another file with --out"):
         run(robot, "--out", "precious.toml")
-    with pytest.raises(FileError, match=r"precious\.toml already exists; name another file with --report"):
+    with pytest.raises(FileError, match=r"precious\.toml already exists; choose another file with --report"):
         run(robot, "--report", "precious.toml")
     with pytest.raises(FaultSyntaxError, match="did you mean reversed"):
         run(robot, "--yes", "--fault", "A reverse", "--report", "a.json")

@@ -412,7 +412,7 @@ def run_a_little(config: Config) -> str:
         (
             "counts_per_metre = 1e7",
             'counts_per_metre = 1e7\nvelocity_unit = "1e400 counts/s"',
-            'drives.A.velocity_unit = "1e400 counts/s" is not a unit of velocities; use one such as',
+            'drives.A.velocity_unit = "1e400 counts/s" is not a unit of velocities; use a unit such as',
         ),
         (
             "feed_forward_gain = 0.95",

@@ -93,7 +93,10 @@ class UnixBus(can.BusABC):
     def _listen(self) -> socket.socket:
         with contextlib.suppress(OSError):
             _connect(self._path).close()
-            raise BusError(f"{self.channel_info}: another process listens there; stop it or use another path")
+            raise BusError(
+                f"{self.channel_info}: another process already listens on this socket; stop that process or use "
+                "another path"
+            )
         if self._path.is_socket():
             self._path.unlink()  # left behind by a process that died
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)

@@ -59,7 +59,7 @@ async def _write(drive: Differences, key: Key, value: int, bits: int, why: str) 
     try:
         await remote.write(*key, value)
     except SdoRefused as refusal:
-        raise DriveError(f"{refusal}; it is needed for [outputs] of drive {remote.name}") from refusal
+        raise DriveError(f"{refusal}; this is needed for [outputs] of drive {remote.name}") from refusal
     drive.note(key, current, value, why)
     if key == MASK:
         held, _ = await remote.wait_until(key, lambda held: held == value)

@@ -158,7 +158,7 @@ class Remote:
         if not size or not -1 << 8 * size - 1 <= value < 1 << 8 * size:
             raise SdoRefused(
                 f"drive {self.name}: cannot write {shown(*key, value)} to {self._called(key)}: "
-                f"it has {8 * size} bits; expected the standard's {8 * width(key)}",
+                f"it has {8 * size} bits, but {8 * width(key)} bits in the standard",
                 TOO_LONG,
             )
         return (value & (1 << 8 * size) - 1).to_bytes(size, "little")

@@ -148,7 +148,7 @@ def parse_unit(key: str, text: str, power: int) -> Unit:
         if power == 1
         else ("accelerations", '"counts/s2", "rpm/s", "rev/s2", "deg/s2", "rad/s2", "mm/s2"')
     )
-    raise DriveError(f'{key} = "{text}" is not a unit of {kind}; use one such as {shown}')
+    raise DriveError(f'{key} = "{text}" is not a unit of {kind}; use a unit such as {shown}')
 
 
 def check(name: str, drive: Drive, key: Literal["velocity_unit", "acceleration_unit"]) -> None:

@@ -75,7 +75,7 @@ def _write(path: Path, make: Callable[[], pa.Table]) -> int:
         with path.open("xb") as file:
             _WRITERS[path.suffix](rows, file)
     except FileExistsError as error:
-        raise ServiceError(f"{path} already exists: name another file") from error
+        raise ServiceError(f"{path} already exists: choose another file") from error
     except OSError as error:
         raise ServiceError(f"cannot write {path}: {error.strerror or error}") from error
     return len(rows)

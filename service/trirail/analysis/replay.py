@@ -212,7 +212,8 @@ def _check_recording(recording: Recording, records: NDArray[np.void], config: Co
     rate = round(1.0 / float(np.median(np.diff(recording.t[:1000])))) if len(recording.t) > 1 else 0
     if rate and rate != config.loop.rate_hz:
         raise ServiceError(
-            f"loop.rate_hz: {config.loop.rate_hz} Hz, but the recording has {rate} cycles a second; set it to {rate}"
+            f"loop.rate_hz: {config.loop.rate_hz} Hz, but the recording has {rate} cycles per second; set loop.rate_hz "
+            f"to {rate}"
         )
 
 

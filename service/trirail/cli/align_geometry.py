@@ -80,7 +80,7 @@ def geometry(
 
     settings = load(config)
     if out is not None and out.exists():
-        raise ConfigError(f"{out} already exists; name another file with --out")
+        raise ConfigError(f"{out} already exists; choose another file with --out")
     way = approach[0], approach[1], notation.radians(approach[2], False)
     with source.open_source() as (look, known), service.open() as robot:
         _check_same(settings, config, robot)

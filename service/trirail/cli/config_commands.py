@@ -64,7 +64,7 @@ def copy(name: str, dest: Path | None = None, /, *, json: Json = False) -> int:
         with target.open("xb") as file, source.open("rb") as original:
             shutil.copyfileobj(original, file)
     except FileExistsError:
-        raise ConfigError(f"{target} already exists: name another file") from None
+        raise ConfigError(f"{target} already exists: choose another file") from None
     except OSError as error:
         raise ConfigError(f"{target}: {error.strerror}") from error
     if json:

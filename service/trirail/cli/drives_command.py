@@ -101,7 +101,7 @@ def save(
     paths: dict[str, Path] = {name: folder / f"drive-{name}.dcf" for name in sorted(set(drive))}
     for path in paths.values():
         if path.exists():
-            raise FileError(f"{path} already exists: name another folder")
+            raise FileError(f"{path} already exists: choose another folder")
     if not folder.is_dir():
         what = "a file, not a folder; give a configuration with --config" if folder.is_file() else "no such folder"
         raise FileError(f"{folder}: {what}")

@@ -160,7 +160,9 @@ def folder(
             whole_by = time.monotonic() + WRITE_TIMEOUT_S
             while (grey := cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) is None:
                 if time.monotonic() > whole_by:
-                    raise TrirailError(f"{file}: no picture that OpenCV reads; write it as .{file.name} and rename it")
+                    raise TrirailError(
+                        f"{file}: OpenCV cannot read this picture; write it as .{file.name}, then rename it"
+                    )
                 time.sleep(POLL_S)
             used.add(file)
             if codes is not None:

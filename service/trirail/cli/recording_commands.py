@@ -177,7 +177,7 @@ def urdf(config: Path | None = None, /, *, out: Path | None = None, json: Json =
             with out.open("x", encoding="utf-8") as file:
                 file.write(text)
         except FileExistsError as error:
-            raise ServiceError(f"{out} already exists: name another file") from error
+            raise ServiceError(f"{out} already exists: choose another file") from error
         except OSError as error:
             raise ServiceError(f"cannot write {out}: {error.strerror or error}") from error
     if json:

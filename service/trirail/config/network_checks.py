@@ -95,7 +95,7 @@ def _check_endpoint(name: str, endpoint: str, zenoh: Zenoh) -> None:
         raise ConfigError(f"{key}: {fault}")
     if zenoh.tls is not None and by is not ReachableBy.CERTIFICATE:
         raise ConfigError(
-            f"{key}: with [zenoh.tls] every endpoint must be tls/ADDRESS:PORT, else it bypasses the certificates"
+            f"{key}: with [zenoh.tls] every endpoint must be tls/ADDRESS:PORT, because others bypass the certificates"
         )
     if zenoh.tls is not None and "#" in endpoint:
         raise ConfigError(f"{key}: settings after # would bypass [zenoh.tls]; remove them")
