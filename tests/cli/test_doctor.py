@@ -273,7 +273,7 @@ def test_protections_that_drives_may_lack_are_listed_once_each_with_their_drives
     )
     found = bad(doctor.examine(config, GOOD))
     assert {name: check.found for name, check in found.items()} == {
-        "lacking 1006": "drives A, C may lack 1006, its watch on SYNC; without: it continues without SYNC",
+        "lacking 1006": "drives A, C may lack 1006, its monitoring of SYNC; without: it continues without SYNC",
         "lacking 6041": "drives C may lack 6041, its report that it follows setpoints; without: that is not checked",
     }
     assert {check.verdict for check in found.values()} == {"warning"}

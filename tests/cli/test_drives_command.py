@@ -37,7 +37,7 @@ def test_differences_are_written_when_that_is_asked_for(capsys: pytest.CaptureFi
     assert run("drives", str(SIM), "--apply") == 0
     words = capsys.readouterr().out
     assert "drive C, node 3" in words
-    assert "written: 1017:00 Producer heartbeat time: 0 -> 100, for this service's watch on it" in words
+    assert "written: 1017:00 Producer heartbeat time: 0 -> 100, for monitoring by this service" in words
 
 
 @pytest.mark.parametrize("simulated", [True, False])

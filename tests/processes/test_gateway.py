@@ -324,7 +324,7 @@ def test_info_tells_what_the_drives_do_without(rig: Rig, monkeypatch: pytest.Mon
     """The loop says so in its welcome, before anybody can ask."""
     said: list[object] = []
     monkeypatch.setattr(rig.gateway._replies, "send", lambda _incoming, content: said.append(content))
-    missing = (MissingProtection("A", "1006", "its watch on SYNC"), MissingProtection("C", "6007", "its stop"))
+    missing = (MissingProtection("A", "1006", "its monitoring of SYNC"), MissingProtection("C", "6007", "its stop"))
     rig.hear(Welcome((), 0.5, missing))
     rig.gateway._handle(came("info", "trirail/demo/info", b""))
     (info,) = said
@@ -337,7 +337,7 @@ def test_info_follows_drives_that_are_set_up_later_and_nothing_is_declared_twice
 ) -> None:
     said: list[object] = []
     monkeypatch.setattr(rig.gateway._replies, "send", lambda _incoming, content: said.append(content))
-    missing = (MissingProtection("A", "1006", "its watch on SYNC"),)
+    missing = (MissingProtection("A", "1006", "its monitoring of SYNC"),)
     rig.hear(Welcome((), 0.5))
     declared = list(rig.gateway._inbox._declared)
     rig.hear(Welcome((), 0.5, missing))

@@ -287,7 +287,7 @@ def test_what_a_drive_does_without_stands_in_every_place_where_one_looks(tmp_pat
     lines = f'\neds = "{eds}"\naccept_without = ["1006"]\n'
     with Service(tmp_path, **{f"[drives.{name}]\n": f"[drives.{name}]{lines}" for name in "BC"}) as service:
         service.wait_up()
-        words = "its watch on SYNC; without: it continues without SYNC"
+        words = "its monitoring of SYNC; without: it continues without SYNC"
         said = trirail("doctor", tmp_path / "robot.toml", "--quick").stdout
         assert f"drives B, C may lack 1006, {words}" in said
         assert f"drive B, drive C: 1006, {words}" in trirail("status", locator=service.locator).stdout

@@ -134,7 +134,7 @@ _CLASSES = {
     0x87: "SYNC",
     0x90: "external error",
     0xF0: "additional function",
-    0xFF: "the maker's own",
+    0xFF: "manufacturer-specific",
 }
 """Error classes by the code's upper byte, or by its first digit if the byte is not listed."""
 

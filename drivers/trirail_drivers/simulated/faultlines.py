@@ -20,34 +20,34 @@ HELP: Final = """\
 [at SECONDS] [when DRIVE CONDITION] [with CHANCE] [DRIVE] FAULT [VALUE] [FRAMES ...] [for SECONDS | for N frames]
   at 2.5 A silent for 0.5        when B moving B emcy 4310        with 0.01 C drop tpdo2
 
-faults of frames, to and from a drive (FRAMES: all where none are named):
+faults of frames, to and from a drive (all frames if no FRAMES are named):
   drop · duplicate · corrupt (one bit) · delay SECONDS · dlc LENGTH
   FRAMES  to the drive: to, nmt sync rpdo1 rpdo2 rpdo3 sdo-request; from it: from, heartbeat, emcy tpdo1 tpdo2 tpdo3
           sdo-answer; an ODrive: set_axis_state set_controller_mode set_input_pos clear_errors position-request rxsdo;
           from it: get_version get_error get_encoder_estimates txsdo; or an identifier: 0x181
 faults of a drive:
-  silent            nothing is heard or sent      emcy CODE     an emergency, without more (hexadecimal)
+  silent            receives and sends nothing    emcy CODE     sends an emergency only (hexadecimal)
   fault CODE        breaks down with an EMCY      reboot        loses its supply and its set-up
-  stuck             the slider does not move      lag SECONDS   the slider is so far behind
-  runaway SPEED     the slider moves with SPEED [m/s] whatever it is told, until it has no power
+  stuck             the slider does not move      lag SECONDS   the slider follows late
+  runaway SPEED     the slider moves at SPEED [m/s] regardless of setpoints, until the drive has no power
 faults of its digital outputs and inputs, by their BIT in 60FEh and 60FDh:
   output-stuck BIT  keeps its state         input-bounces BIT  for 5 ms after each edge
-  reserves BIT      is the maker's: it cannot be switched, and is not in the mask that is read back
-faults of its mechanics and wiring, as a rule beside the rail shows them:
-  reversed          the slider goes the other way         scale RATIO    it goes RATIO times as far as counted
-  swapped DRIVE     it moves that drive's slider          loose          its encoder does not turn with it
-  node ID           DRIVE's slider is moved by the drive of that node id, whatever is configured
-  counts NUMBER     what moves DRIVE's slider counts that per metre, below 0 where they fall as it rises, likewise
-  slips SHARE       its encoder misses that share of the way while the slider's position rises
-  against           its encoder counts against its motor: with power it runs away
+  reserves BIT      the manufacturer reserves BIT: it cannot be switched, and is clear in the mask when read back
+faults of its mechanics and wiring, as a ruler along the rail shows them:
+  reversed          the slider moves backwards            scale RATIO    it moves RATIO times as far as counted
+  swapped DRIVE     it moves the slider of DRIVE          loose          its encoder does not turn with the motor
+  node ID           the slider of DRIVE is moved by the drive with this node id, whatever is configured
+  counts NUMBER     the drive that moves the slider of DRIVE counts NUMBER per metre; below 0 if counts fall as it rises
+  slips SHARE       its encoder misses this share of the travel while the position of the slider rises
+  against           its encoder counts against its motor: when it has power, it runs away
   play METRES       between drive and slider: backlash
 faults of the bus (no DRIVE):
-  bus-off           the master's controller leaves the bus        error-passive   ... is about to
-  babble ID         a node sends this identifier without pause; what has a higher one does not get through
-DRIVE is A, B, C or all, by the sliders of [can.simulated] built, where that is there.
-CONDITION is enabled, moving, stopping or fault; DRIVE before it may be any.
-at     seconds after the line is read        for   how long; else until clear (emcy, fault, reboot: at once over)
-with   chance for each frame; for faults of a drive or the bus, for each second
+  bus-off           the master's controller leaves the bus        error-passive   the controller is close to bus-off
+  babble ID         a node sends this identifier without pause; frames with higher identifiers are blocked
+DRIVE is A, B, C or all; with [can.simulated] built, the letters are those of its sliders.
+CONDITION is enabled, moving, stopping or fault; the DRIVE before it may be any.
+at     seconds after the line is read        for   duration; else until clear (emcy, fault, reboot: momentary)
+with   chance per frame, or per second for faults of a drive or the bus
 Commands: list · clear (ends all faults) · help"""
 
 

@@ -81,7 +81,7 @@ class Feed:
     def find_obstacle(self, goal: PoseGoal) -> Obstacle | None:
         """Return the obstacle between the measured pose and a goal, as in path_check.find_obstacle."""
         if self._pose is None:
-            return Obstacle("nobody knows where the robot is", code="unknown")
+            return Obstacle("the position of the robot is unknown", code="unknown")
         end = (goal.x, goal.y, goal.phi)
         return path_check.find_obstacle(self._robot_drawing, self._pose, end, goal.tool, goal.frame)
 
