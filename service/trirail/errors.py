@@ -109,8 +109,7 @@ class RefusalCode(StrEnum):
     WILDCARD = "wildcard", "a key for more than one robot or user", "name one robot and one user"
     BAD_NAME = (
         "bad_name",
-        "the name has characters other than letters, digits, - and _, or the name of a pose reads as a quantity, as "
-        "5mm does",
+        "characters other than letters, digits, - and _ in the name, or a pose named as a quantity: 5mm",
         "use another name",
     )
     UNKNOWN_COMMAND = "unknown_command", "unknown command", "send one of the commands in the message"
